@@ -1,0 +1,9 @@
+from .contact import signals_quantized as signals_quantized
+from .curves import crossings as crossings
+from .curves import flatten as flatten
+from .errors import InputError as InputError
+from .morphology import Morphology as Morphology
+from .objective import published_objective as published_objective
+from .search import search as search
+from .settings import Contact as Contact
+from .settings import Spec as Spec

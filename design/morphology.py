@@ -1,0 +1,187 @@
+"""The morphology of a pad: the knots its fibres run through.
+
+A pad of M x M grid units carries 2M fibres in two families. Horizontal fibre i is a curve y(x) from (0, i) to
+(M+1, i), vertical fibre i a curve x(y) from (i, 0) to (i, M+1), i = 1..M; between knots both are PCHIP curves.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .files import read_json, write_json
+
+FORMAT = "padforge-morphology/1"
+MARGIN = 1e-3
+"""Least distance of a free knot to the pad's edge, grid units, as in the published optimiser."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Morphology:
+    """The fibres of a pad.
+
+    Attributes:
+        knots: (2M, N+2, 2) x and y in grid units, 0..M+1: horizontals bottom to top, then verticals left to right;
+            each fibre's knots ascend along its travel axis (x for horizontals, y for verticals), its ends are fixed.
+        pitch_mm: distance of neighbouring fibre ends, mm.
+        provenance: where the morphology came from; free JSON.
+
+    Raises:
+        InputError: knots of the wrong shape, not finite, outside the pad, not ascending, or with ends moved.
+    """
+
+    knots: Array
+    pitch_mm: float = 11.25
+    provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
+
+    def __post_init__(self) -> None:
+        knots = np.array(self.knots, dtype=np.float64)
+        _validate(knots)
+        if not (np.isfinite(self.pitch_mm) and 0 < self.pitch_mm <= 1000):
+            raise InputError(f"pitch_mm is {self.pitch_mm!r}, allowed is 0 < pitch_mm <= 1000")
+        knots.setflags(write=False)
+        object.__setattr__(self, "knots", knots)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Morphology):
+            return NotImplemented
+        return self.pitch_mm == other.pitch_mm and np.array_equal(self.knots, other.knots)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def grid(self) -> int:
+        """M, the number of fibres per family."""
+        return len(self.knots) // 2
+
+    @property
+    def size_mm(self) -> float:
+        """Side of the square pad from fibre end to fibre end, mm."""
+        return (self.grid + 1) * self.pitch_mm
+
+    @classmethod
+    def straight(cls, grid: int, pitch_mm: float = 11.25) -> "Morphology":
+        """The square grid: M straight fibres per family, N = 0."""
+        return cls(assemble(np.empty((2 * grid, 0, 2))), pitch_mm)
+
+    @classmethod
+    def random(
+        cls, grid: int, knots: int, seed: int | np.random.Generator = 0, pitch_mm: float = 11.25
+    ) -> "Morphology":
+        """Knots drawn uniformly over the pad, as the published search starts from."""
+        rng = np.random.default_rng(seed)
+        inner = rng.uniform(MARGIN, grid + 1 - MARGIN, (2 * grid, knots, 2))
+        return cls(assemble(inner), pitch_mm)
+
+    @classmethod
+    def from_parameters(cls, parameters: ArrayLike, pitch_mm: float = 11.25) -> "Morphology":
+        """From the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals, their y."""
+        para = np.asarray(parameters, dtype=np.float64)
+        if para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
+            raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
+        columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
+        inner = columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2)
+        return cls(assemble(inner), pitch_mm)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Morphology":
+        """Read a `morphology.json` or a published `.mat`.
+
+        Raises:
+            InputError: the file is missing, torn, of another kind, or its knots break the rules of the class.
+        """
+        path = Path(path)
+        if path.suffix == ".mat":
+            from .published import load_morphology
+
+            return load_morphology(path)
+        document = read_json(path, FORMAT)
+        try:
+            knots = np.array(document["knots"], dtype=np.float64)
+            pad = cls(knots, float(document["pitch_mm"]), document.get("provenance", {}))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path}: no valid morphology ({error!r})") from error
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
+        if document.get("grid", pad.grid) != pad.grid:
+            raise InputError(f"{path}: grid is {document['grid']}, but there are {len(knots)} fibres")
+        return pad
+
+    def save(self, path: str | Path) -> None:
+        """Write a `morphology.json`, atomically; reading it back gives the same knots to the last bit."""
+        document = {
+            "format": FORMAT,
+            "grid": self.grid,
+            "pitch_mm": self.pitch_mm,
+            "knots": self.knots.tolist(),
+            "provenance": dict(self.provenance),
+        }
+        write_json(Path(path), document)
+
+    def to_mm(self, places: ArrayLike) -> Array:
+        """Grid units to mm with the origin at the pad's centre, the frame presses are recorded in."""
+        return (np.asarray(places, dtype=np.float64) - (self.grid + 1) / 2) * self.pitch_mm
+
+    def to_grid(self, places_mm: ArrayLike) -> Array:
+        """mm from the pad's centre to grid units."""
+        return np.asarray(places_mm, dtype=np.float64) / self.pitch_mm + (self.grid + 1) / 2
+
+
+def assemble(inner: Array) -> Array:
+    """Whole fibres from free knots: sort along the travel axis, keep knots apart, add the fixed ends.
+
+    Args:
+        inner: (..., 2M, N, 2) knots in any order, grid units within 0..M+1.
+
+    Returns:
+        (..., 2M, N+2, 2) knots that satisfy `Morphology`. Knots at the same travel coordinate are moved apart by
+        the least step that keeps the curve a graph (1e-9 grid units, far below any printer).
+    """
+    grid = inner.shape[-3] // 2
+    knots = np.empty((*inner.shape[:-2], inner.shape[-2] + 2, 2))
+    order = np.arange(1, grid + 1)
+    for family, (travel, cross) in enumerate(((0, 1), (1, 0))):
+        rows = slice(family * grid, (family + 1) * grid)
+        fibres = inner[..., rows, :, :]
+        rank = np.argsort(fibres[..., travel], axis=-1, kind="stable")[..., None]
+        knots[..., rows, 1:-1, :] = np.take_along_axis(fibres, rank, axis=-2)
+        knots[..., rows, 0, travel], knots[..., rows, -1, travel] = 0, grid + 1
+        knots[..., rows, 0, cross] = knots[..., rows, -1, cross] = order
+        _separate(knots[..., rows, :, travel])
+    return knots
+
+
+def _separate(travel: Array, step: float = 1e-9) -> None:
+    """Move ascending coordinates (..., N+2) apart in place, the first and last staying where they are."""
+    if (np.diff(travel, axis=-1) >= step).all():
+        return
+    for k in range(1, travel.shape[-1] - 1):
+        travel[..., k] = np.maximum(travel[..., k], travel[..., k - 1] + step)
+    for k in range(travel.shape[-1] - 2, 0, -1):
+        travel[..., k] = np.minimum(travel[..., k], travel[..., k + 1] - step)
+
+
+def _validate(knots: Array) -> None:
+    if knots.ndim != 3 or knots.shape[2] != 2 or knots.shape[0] < 2 or knots.shape[0] % 2 or knots.shape[1] < 2:
+        raise InputError(f"knots have shape {knots.shape}, expected (2 M, N + 2, 2)")
+    if not np.isfinite(knots).all():
+        raise InputError("knots hold NaN or infinity, expected finite grid units")
+    grid = len(knots) // 2
+    if knots.min() < 0 or knots.max() > grid + 1:
+        worst = knots.min() if knots.min() < 0 else knots.max()
+        raise InputError(f"a knot lies at {worst:g}, allowed is 0 to {grid + 1} grid units")
+    for family, name in enumerate(("horizontal", "vertical")):
+        fibres = knots[family * grid : (family + 1) * grid]
+        travel, cross = fibres[..., family], fibres[..., 1 - family]
+        if (np.diff(travel, axis=1) <= 0).any():
+            fibre = int(np.argmax((np.diff(travel, axis=1) <= 0).any(axis=1))) + 1
+            raise InputError(f"{name} fibre {fibre}: knots do not ascend along its travel axis")
+        ends = np.stack([travel[:, 0], travel[:, -1] - grid - 1])
+        if ends.any() or (cross[:, [0, -1]] != np.arange(1, grid + 1)[:, None]).any():
+            raise InputError(f"{name} fibres must run from (0, i) to ({grid + 1}, i) along their travel axis, i = 1..M")

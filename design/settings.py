@@ -1,0 +1,171 @@
+"""`pad.toml`: reading, validating and writing settings, and the sections that design owns.
+
+Each package declares its sections as `Section` models; this module reads one file for all of them.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+
+from .errors import InputError
+
+SECTIONS = ("pad", "contact", "search", "rules", "mould", "printer", "rig", "localizer")
+"""Every section a `pad.toml` may have, whichever package owns it."""
+
+
+class Section(BaseModel):
+    """One table of `pad.toml`: immutable, no unknown keys, no NaN; a field's description is its comment."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+class Pad(Section):
+    """`[pad]`: what the pad is."""
+
+    grid: int = Field(4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
+    pitch_mm: float = Field(11.25, gt=0, le=1000, description="distance of neighbouring fibre ends, mm")
+    fibre_diameter_mm: float = Field(0.3, gt=0, le=10, description="diameter of the laid fibre, mm")
+    deep_family: Literal["horizontal", "vertical"] = Field(
+        "horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
+    )
+
+
+def _circle(value: object) -> object:
+    return None if value == "circle" else value
+
+
+Sides = Annotated[
+    Annotated[int, Field(ge=3, le=4096)] | None,
+    BeforeValidator(_circle),
+    PlainSerializer(lambda sides: "circle" if sides is None else sides),
+]
+
+
+class Contact(Section):
+    """`[contact]`: what a press deforms, a regular polygon or circle around its centre, and how a fibre answers.
+
+    The signal of a fibre is the integral of `weight` over its length inside the shape (paper, formulas (1), (2)).
+    Lengths are in grid units; `d` is the distance to the press centre.
+
+    Attributes:
+        radius: circumradius K of the shape, > 0.
+        sides: D >= 3, or None for a circle ("circle" in pad.toml).
+        weight: "uniform" (1), "inverse_square" (1 / (K + d^2)) or "inverse" (1 / max(d, K / 100), which is the
+            paper's 1 / d kept finite within a hundredth of the radius).
+        length: "manhattan" (|dx| + |dy|, as the published code has it) or "euclidean".
+    """
+
+    radius: float = Field(0.6, gt=0, le=1e4, description="object radius K, grid units")
+    sides: Sides = Field(30, description='sides D of the object, or "circle"')
+    weight: Literal["uniform", "inverse_square", "inverse"] = Field(
+        "uniform", description="weight of a fibre element: 1, 1/(K + d^2) or 1/d"
+    )
+    length: Literal["manhattan", "euclidean"] = Field(
+        "manhattan", description="length of a fibre element: |dx| + |dy| as published, or euclidean"
+    )
+
+
+class Search(Section):
+    """`[search]`: how the fibres are found."""
+
+    method: Literal["descent", "genetic"] = Field("descent", description="gradient search, or the published one")
+    knots: int = Field(5, ge=1, le=64, description="inner knots per fibre (N)")
+    starts: int = Field(4, ge=1, le=10_000, description="random starts of the gradient search")
+    steps: int = Field(400, ge=1, le=1_000_000, description="steps of a start, or generations of the genetic search")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random choice")
+    lost: int = Field(2, ge=0, le=8, description="design for up to this many failed fibres")
+
+
+class Rules(Section):
+    """`[rules]`: what makes a pad buildable; each rule is a penalty in the search and an exact check after it."""
+
+    enforce: bool = Field(True, description="false drops every rule: an explicit choice to design the unbuildable")
+    min_bend_radius_mm: float = Field(1.0, ge=0, description="least bend radius of a fibre, mm")
+    min_gap_mm: float = Field(0.8, ge=0, description="least gap between centre lines of a family, mm")
+    same_family_crossings: int = Field(0, ge=0, description="crossings allowed between fibres of one family")
+    border_mm: float = Field(2.0, ge=0, description="least distance of a fibre to the pad's border, mm")
+    max_length_mm: float = Field(500.0, gt=0, description="greatest length of a fibre, mm")
+
+
+MODELS: dict[str, type[Section]] = {"pad": Pad, "contact": Contact, "search": Search, "rules": Rules}
+
+
+class Spec:
+    """The content of a `pad.toml`: `spec.section(Pad)` is that section, validated, with defaults filled in."""
+
+    def __init__(self, tables: Mapping[str, Mapping[str, Any]], source: str = "built-in defaults") -> None:
+        unknown = [name for name in tables if name not in SECTIONS]
+        if unknown:
+            raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(SECTIONS)}")
+        for name, table in tables.items():
+            if not isinstance(table, Mapping):
+                raise InputError(f"{source}: {name} is {table!r}, expected a section [{name}]")
+        self.source = source
+        self._tables = tables
+
+    @classmethod
+    def load(cls, path: Path | None) -> "Spec":
+        """Read a TOML file; None stands for the defaults.
+
+        Raises:
+            InputError: the file is missing, is no TOML, or has an unknown section.
+        """
+        if path is None:
+            return cls({})
+        try:
+            tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: not a TOML file ({error})") from error
+        return cls(tables, str(path))
+
+    def section(self, model: type[AnySection], **overrides: Any) -> AnySection:
+        """The section `model` stands for; `overrides` that are not None win over the file.
+
+        Raises:
+            InputError: an unknown key or a value out of range, naming the key, the value and what is allowed.
+        """
+        name = model.__name__.lower()
+        given = {key: value for key, value in overrides.items() if value is not None}
+        return validated(model, {**self._tables.get(name, {}), **given}, f"{self.source}: [{name}]")
+
+
+def validated(model: type[AnySection], values: Mapping[str, Any], where: str) -> AnySection:
+    """`model(**values)`, with pydantic's findings as one InputError line that begins with `where`."""
+    try:
+        return model.model_validate(dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
+        if first["type"] == "extra_forbidden":
+            allowed = ", ".join(model.model_fields)
+            raise InputError(f"{where} {first['loc'][0]}: no such key, allowed are {allowed}") from error
+        raise InputError(f"{where} {key}: got {first['input']!r}, {first['msg'].lower()}") from error
+
+
+def commented_toml(models: Mapping[str, type[Section]]) -> str:
+    """A `pad.toml` that states every default, with each field's description as its comment."""
+    lines = ["# padforge settings. Every key is optional; what stands here is the default."]
+    for name, model in models.items():
+        lines += ["", f"[{name}]"]
+        defaults = model().model_dump()
+        for key, field in model.model_fields.items():
+            lines.append(f"{key} = {_toml_value(defaults[key])}".ljust(36) + f"# {field.description}")
+    return "\n".join(lines) + "\n"
+
+
+def _toml_value(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml_value, value)) + "]"
+    return repr(value)

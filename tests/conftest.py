@@ -1,0 +1,15 @@
+"""Fixtures shared by all tests."""
+
+from pathlib import Path
+
+import pytest
+
+PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
+
+
+@pytest.fixture(scope="session")
+def published() -> Path:
+    """Folder of the published study's files; tests that need it skip where it is absent."""
+    if not PUBLISHED.is_dir():
+        pytest.skip("the published data are not here")
+    return PUBLISHED
