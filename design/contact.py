@@ -75,4 +75,4 @@ def boustrophedon(grid: int, side: int, jitter: float = 0.0, seed: int = 214) ->
     line = np.linspace(1, grid, side)
     x = np.where(np.arange(side)[:, None] % 2 == 0, line, line[::-1])
     places = np.column_stack([x.ravel(), np.repeat(line, side)])
-    return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter  # noqa: NPY002
+    return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter

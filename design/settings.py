@@ -28,11 +28,11 @@ AnySection = TypeVar("AnySection", bound=Section)
 class Pad(Section):
     """`[pad]`: what the pad is."""
 
-    grid: int = Field(4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
-    pitch_mm: float = Field(11.25, gt=0, le=1000, description="distance of neighbouring fibre ends, mm")
-    fibre_diameter_mm: float = Field(0.3, gt=0, le=10, description="diameter of the laid fibre, mm")
+    grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
+    pitch_mm: float = Field(default=11.25, gt=0, le=1000, description="distance of neighbouring fibre ends, mm")
+    fibre_diameter_mm: float = Field(default=0.3, gt=0, le=10, description="diameter of the laid fibre, mm")
     deep_family: Literal["horizontal", "vertical"] = Field(
-        "horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
+        default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
     )
 
 
@@ -61,36 +61,42 @@ class Contact(Section):
         length: "manhattan" (|dx| + |dy|, as the published code has it) or "euclidean".
     """
 
-    radius: float = Field(0.6, gt=0, le=1e4, description="object radius K, grid units")
-    sides: Sides = Field(30, description='sides D of the object, or "circle"')
+    radius: float = Field(default=0.6, gt=0, le=1e4, description="object radius K, grid units")
+    sides: Sides = Field(default=30, description='sides D of the object, or "circle"')
     weight: Literal["uniform", "inverse_square", "inverse"] = Field(
-        "uniform", description="weight of a fibre element: 1, 1/(K + d^2) or 1/d"
+        default="uniform", description="weight of a fibre element: 1, 1/(K + d^2) or 1/d"
     )
     length: Literal["manhattan", "euclidean"] = Field(
-        "manhattan", description="length of a fibre element: |dx| + |dy| as published, or euclidean"
+        default="manhattan", description="length of a fibre element: |dx| + |dy| as published, or euclidean"
     )
 
 
 class Search(Section):
     """`[search]`: how the fibres are found."""
 
-    method: Literal["descent", "genetic"] = Field("descent", description="gradient search, or the published one")
-    knots: int = Field(5, ge=1, le=64, description="inner knots per fibre (N)")
-    starts: int = Field(4, ge=1, le=10_000, description="random starts of the gradient search")
-    steps: int = Field(400, ge=1, le=1_000_000, description="steps of a start, or generations of the genetic search")
-    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random choice")
-    lost: int = Field(2, ge=0, le=8, description="design for up to this many failed fibres")
+    method: Literal["descent", "genetic"] = Field(
+        default="descent", description="gradient search, or the published one"
+    )
+    knots: int = Field(default=5, ge=1, le=64, description="inner knots per fibre (N)")
+    starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
+    steps: int = Field(
+        default=400, ge=1, le=1_000_000, description="steps of a start, or generations of the genetic search"
+    )
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
+    lost: int = Field(default=2, ge=0, le=8, description="design for up to this many failed fibres")
 
 
 class Rules(Section):
     """`[rules]`: what makes a pad buildable; each rule is a penalty in the search and an exact check after it."""
 
-    enforce: bool = Field(True, description="false drops every rule: an explicit choice to design the unbuildable")
-    min_bend_radius_mm: float = Field(1.0, ge=0, description="least bend radius of a fibre, mm")
-    min_gap_mm: float = Field(0.8, ge=0, description="least gap between centre lines of a family, mm")
-    same_family_crossings: int = Field(0, ge=0, description="crossings allowed between fibres of one family")
-    border_mm: float = Field(2.0, ge=0, description="least distance of a fibre to the pad's border, mm")
-    max_length_mm: float = Field(500.0, gt=0, description="greatest length of a fibre, mm")
+    enforce: bool = Field(
+        default=True, description="false drops every rule: an explicit choice to design the unbuildable"
+    )
+    min_bend_radius_mm: float = Field(default=1.0, ge=0, description="least bend radius of a fibre, mm")
+    min_gap_mm: float = Field(default=0.8, ge=0, description="least gap between centre lines of a family, mm")
+    same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
+    border_mm: float = Field(default=2.0, ge=0, description="least distance of a fibre to the pad's border, mm")
+    max_length_mm: float = Field(default=500.0, gt=0, description="greatest length of a fibre, mm")
 
 
 MODELS: dict[str, type[Section]] = {"pad": Pad, "contact": Contact, "search": Search, "rules": Rules}
