@@ -1,8 +1,156 @@
-"""`padforge design`: the edge where files come in and results go out."""
+"""`padforge design`: the edge where settings come in and morphologies go out."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from .console import json_option, load_spec, progress, seed_option, show_result, spec_option
 
-@click.group()
-def design() -> None:
-    """Optimise the course of the fibres."""
+if TYPE_CHECKING:
+    from .search import SearchResult
+    from .settings import Spec
+
+morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
+
+
+@click.group(invoke_without_command=True)
+@spec_option
+@click.option("--method", type=click.Choice(["descent", "genetic"]), help="Gradient search, or the published one.")
+@click.option("--knots", type=int, help="Inner knots per fibre.")
+@click.option("--starts", type=int, help="Random starts of the gradient search.")
+@seed_option
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (required).")
+@json_option
+@click.pass_context
+def design(
+    context: click.Context,
+    spec: Path | None,
+    method: str | None,
+    knots: int | None,
+    starts: int | None,
+    seed: int | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Optimise the course of the fibres, or look at a finished morphology.
+
+    \b
+    padforge design --out out/pad                     with the settings of pad.toml or the defaults
+    padforge design --knots 8 --seed 1 --out out/pad
+    padforge design check out/pad/morphology.json     exit 1 if a rule is broken
+
+    Writes morphology.json, design.json, design.svg and design.png. Exit 1 if the best pad breaks a rule.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    if out is None:
+        raise click.UsageError("design: --out DIR is missing")
+    overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed}
+    document, result = run_search(load_spec(spec), out, overrides)
+    show_result(document, summary(result, out), as_json)
+    context.exit(1 if result.violations else 0)
+
+
+def run_search(spec: "Spec", out: Path, overrides: dict[str, Any]) -> tuple[dict[str, Any], "SearchResult"]:
+    """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result."""
+    from .files import provenance, write_json
+    from .morphology import Morphology
+    from .plan import draw_plan, save_figure
+    from .search import search
+    from .settings import Contact, Pad, Rules, Search
+
+    pad, contact, rules = spec.section(Pad), spec.section(Contact), spec.section(Rules)
+    settings = spec.section(Search, **overrides)
+    with progress() as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(run: str, done: int, total: int, objective: float) -> None:
+            if run not in tasks:
+                tasks[run] = bar.add_task(run, total=total, note="")
+            bar.update(tasks[run], completed=done, note=f"objective {objective:.4f}")
+
+        result = search(pad, contact, settings, rules, report)
+    origin = provenance("padforge design", settings.seed, packages=("torch", "pymoo"))
+    used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
+    origin["settings"] = {name: section.model_dump() for name, section in used.items()}
+    Morphology(result.morphology.knots, pad.pitch_mm, origin).save(out / "morphology.json")
+    document = {
+        "format": "padforge-design/1",
+        "terms": result.terms,
+        "violations": [asdict(violation) for violation in result.violations],
+        "history": result.history,
+        "seconds": round(result.seconds, 3),
+        "provenance": origin,
+    }
+    figure = draw_plan(result.morphology, contact, result.violations)
+    save_figure(figure, out / "design.svg")
+    save_figure(figure, out / "design.png")
+    write_json(out / "design.json", document)
+    return document, result
+
+
+def summary(result: "SearchResult", out: Path) -> list[str]:
+    """What a person wants to know of a search, in a few lines."""
+    spread = [v for name, v in result.terms.items() if name.startswith("ambiguity")]
+    lost = " / ".join(f"{value:.3f}" for value in spread)
+    broken = [f"  broken  {violation}" for violation in result.violations[:10]]
+    more = len(result.violations) - len(broken)
+    return [
+        f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}",
+        f"  expected error {lost} grid units with {' / '.join(map(str, range(len(spread))))} fibres lost",
+        *(broken or ["  all rules hold"]),
+        *([f"  ... and {more} more"] if more > 0 else []),
+    ]
+
+
+@design.command()
+@morphology_argument
+@spec_option
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="Picture to write, .svg or .png.")
+def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
+    """Draw the plan: fibres, crossings, broken rules and the contact to scale."""
+    from .errors import InputError
+    from .morphology import Morphology
+    from .plan import draw_plan, save_figure
+    from .rules import check as check_rules
+    from .settings import Contact, Rules
+
+    settings, pad = load_spec(spec), Morphology.load(morphology)
+    path = out or Path(f"{morphology.stem}.svg")
+    if path.suffix not in (".svg", ".png"):
+        raise InputError(f"--out is {path}, allowed are .svg and .png")
+    save_figure(draw_plan(pad, settings.section(Contact), check_rules(pad, settings.section(Rules))), path)
+    click.echo(f"plan -> {path}")
+
+
+@design.command()
+@morphology_argument
+@spec_option
+@json_option
+@click.pass_context
+def check(context: click.Context, morphology: Path, spec: Path | None, as_json: bool) -> None:
+    """Check every rule on the exact curves; exit 1 if one is broken."""
+    from .morphology import Morphology
+    from .rules import check as check_rules
+    from .settings import Rules
+
+    found = check_rules(Morphology.load(morphology), load_spec(spec).section(Rules))
+    lines = [str(violation) for violation in found] or ["all rules hold"]
+    show_result({"violations": [asdict(violation) for violation in found]}, lines, as_json)
+    context.exit(1 if found else 0)
+
+
+@design.command()
+@morphology_argument
+@spec_option
+def score(morphology: Path, spec: Path | None) -> None:
+    """Print every term of the objective as JSON."""
+    from .morphology import Morphology
+    from .search import score as score_terms
+    from .settings import Contact, Search
+
+    settings = load_spec(spec)
+    terms = score_terms(Morphology.load(morphology), settings.section(Contact), settings.section(Search).lost)
+    show_result({"terms": terms}, [], as_json=True)

@@ -121,3 +121,16 @@ def quantized_signals(
                     total += run * weigh(dt * dt + dv * dv, radius, weight)
             out[p, q, f] = total
     return out
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def sample_curves(knots: Any, samples: int) -> Any:
+    """Cross coordinates (P, 2M, samples) of the fibres `knots` (P, 2M, N+2, 2), uniform along the travel axis."""
+    population, fibres = knots.shape[:2]
+    step = (fibres // 2 + 1) / (samples - 1)
+    out = np.empty((population, fibres, samples))
+    for index in prange(population * fibres):
+        p, f = index // fibres, index % fibres
+        travel = 0 if f < fibres // 2 else 1
+        pchip_sample(knots[p, f, :, travel].copy(), knots[p, f, :, 1 - travel].copy(), step, out[p, f])
+    return out

@@ -79,9 +79,9 @@ class Search(Section):
     )
     knots: int = Field(default=5, ge=1, le=64, description="inner knots per fibre (N)")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
-    steps: int = Field(
-        default=400, ge=1, le=1_000_000, description="steps of a start, or generations of the genetic search"
-    )
+    steps: int = Field(default=300, ge=1, le=1_000_000, description="steps of a start of the gradient search")
+    population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
+    generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
     lost: int = Field(default=2, ge=0, le=8, description="design for up to this many failed fibres")
 
