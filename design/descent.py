@@ -30,7 +30,7 @@ DENSER = 3
 NOISE = (0.30, 0.06)  # sigma, grid units of signal, annealed from first to last step
 SOFTNESS = (0.15, 0.04)  # width of the press's edge, annealed likewise
 RATE = 0.06
-PENALTY = (1.0, 30.0)  # weight of the rules, raised from first to last step
+PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def bend_radius(line: Array, window_mm: float) -> tuple[float, int]:
     after = turned[np.minimum(last, len(turned) - 1)]
     angle = after - before
     worst = int(np.argmax(angle))
-    return (window_mm / angle[worst] if angle[worst] > 0 else np.inf), worst
+    return (window_mm / float(angle[worst]) if angle[worst] > 0 else np.inf), worst
 
 
 def _bends(lines: list[Array], limit: float) -> list[Violation]:
@@ -86,7 +86,7 @@ def _gaps(lines: list[Array], limit: float) -> list[Violation]:
     tree = shapely.STRtree(shapes)
     found = []
     for first, second in _family_pairs(len(lines), tree.query(shapes, predicate="dwithin", distance=limit).T):
-        gap = shapes[first].distance(shapes[second])
+        gap = float(shapes[first].distance(shapes[second]))
         if gap < limit:
             nearest = shapely.shortest_line(shapes[first], shapes[second])
             place = _place(np.mean(nearest.coords, axis=0))
@@ -111,7 +111,7 @@ def _borders(pad: Morphology, lines: list[Array], limit: float) -> list[Violatio
         distance = pad.size_mm / 2 - np.abs(cross)
         worst = int(np.argmin(distance))
         if distance[worst] < limit:
-            found.append(Violation("border_mm", (fibre + 1,), distance[worst], limit, _place(line[worst])))
+            found.append(Violation("border_mm", (fibre + 1,), float(distance[worst]), limit, _place(line[worst])))
     return found
 
 

@@ -1,0 +1,103 @@
+"""Morphologies: construction, files, refusals."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design import InputError, Morphology
+from design.morphology import assemble
+
+
+@given(grid=st.integers(1, 5), knots=st.integers(0, 6), seed=st.integers(0, 2**32 - 1))
+def test_random_morphologies_hold_the_invariants_and_depend_on_the_seed_alone(grid, knots, seed):
+    pad = Morphology.random(grid, knots, seed)
+    assert pad.knots.shape == (2 * grid, knots + 2, 2)
+    assert pad == Morphology.random(grid, knots, np.random.default_rng(seed))
+    for fibre, points in enumerate(pad.knots):
+        axis = 0 if fibre < grid else 1
+        assert (np.diff(points[:, axis]) > 0).all()
+        assert tuple(points[[0, -1], axis]) == (0, grid + 1)
+
+
+def test_saving_and_loading_keeps_every_bit(tmp_path):
+    pad = Morphology.random(3, 4, seed=1, pitch_mm=7.3)
+    pad.save(tmp_path / "pad.json")
+    assert Morphology.load(tmp_path / "pad.json") == pad
+
+
+def test_knots_at_one_travel_coordinate_are_moved_apart():
+    inner = np.full((2, 5, 2), 0.7)
+    pad = Morphology(assemble(inner))
+    assert (np.diff(pad.knots[0, :, 0]) > 0).all()
+    assert np.abs(pad.knots[0, 1:-1] - 0.7).max() < 1e-8
+
+
+def test_knots_heaped_at_the_far_edge_stay_inside_it():
+    pad = Morphology(assemble(np.full((2, 4, 2), 2.0)))
+    assert pad.knots.max() == 2.0
+    assert (np.diff(pad.knots[1, :, 1]) > 0).all()
+
+
+def test_knots_cannot_be_changed_afterwards():
+    with pytest.raises(ValueError, match="read-only"):
+        Morphology.straight(2).knots[0, 0, 0] = 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda k: k[:3], r"shape \(3, 3, 2\), expected \(2 M, N \+ 2, 2\)"),
+        (lambda k: k * np.nan, "NaN"),
+        (lambda k: k + 0.1, "allowed is 0 to 3"),
+        (lambda k: k[:, [0, 2, 1]], "do not ascend"),
+        (lambda k: np.where(np.arange(3)[:, None] == 0, k + 0.1, k), "must run from"),
+    ],
+)
+def test_wrong_knots_are_refused_by_name(change, message):
+    knots = Morphology.random(2, 1, seed=0).knots
+    with pytest.raises(InputError, match=message):
+        Morphology(change(knots))
+
+
+@pytest.mark.parametrize("pitch", [0, -1, np.nan, np.inf, 1e9])
+def test_an_impossible_pitch_is_refused(pitch):
+    with pytest.raises(InputError, match="pitch_mm"):
+        Morphology.straight(2, pitch)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"format": "other/1"}', '{"format": "padforge-morphology/1"}', "\x00\xff"]
+)
+def test_files_that_hold_no_morphology_are_refused_on_one_line(tmp_path, text):
+    path = tmp_path / "pad.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"pad\.json") as refusal:
+        Morphology.load(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_frames_convert_both_ways():
+    pad = Morphology.straight(4)
+    assert pad.to_mm([2.5, 2.5]) == pytest.approx([0, 0])
+    assert pad.to_grid(pad.to_mm([[1.0, 4.0]])) == pytest.approx(np.array([[1.0, 4.0]]))
+
+
+@pytest.mark.parametrize(("name", "knots"), [("1para", 1), ("5para_dis", 5), ("20para", 20), ("square_grid_cir", 0)])
+def test_published_files_load_and_the_square_grid_is_recognised(published, name, knots):
+    pad = Morphology.load(published / f"{name}.mat")
+    assert pad.knots.shape == (8, knots + 2, 2)
+    assert pad.pitch_mm == 11.25
+
+
+def test_a_torn_published_file_is_refused(published, tmp_path):
+    torn = tmp_path / "torn.mat"
+    torn.write_bytes((published / "5para_dis.mat").read_bytes()[:20_000])
+    with pytest.raises(InputError, match=r"torn\.mat") as refusal:
+        Morphology.load(torn)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_recording_is_no_morphology(published):
+    with pytest.raises(InputError, match="no variable para"):
+        Morphology.load(published / "para5_long_first4500.mat")
