@@ -1,29 +1,206 @@
-"""padforge: the front door. One command; `run` chains design, fabricate and sense."""
+"""padforge: the front door. One command; `run` chains design, fabricate and sense, `report` shows what they made."""
 
+import shutil
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from design.cli import design
+from design.console import load_spec, out_option, seed_option, spec_option
 from design.errors import InputError
+from fabricate.cli import fabricate
+from sense.cli import sense
+
+if TYPE_CHECKING:
+    from design.settings import Section, Spec
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="padforge")
 def cli() -> None:
-    """From an idea to a calibrated soft strain-sensor pad: fibres, mould, calibration."""
+    """From an idea to a calibrated soft strain-sensor pad.
+
+    \b
+    padforge run                                     all of it, on built-in defaults, into out/pad
+    padforge design --out out/pad                    optimise the fibres
+    padforge fabricate out/pad/morphology.json       make the mould
+    padforge sense calibrate out/pad/recording       learn places from presses
+    """
 
 
 cli.add_command(design)
+cli.add_command(fabricate)
+cli.add_command(sense)
+
+
+@cli.command()
+@click.argument("path", type=click.Path(dir_okay=False, path_type=Path), default="pad.toml")
+def init(path: Path) -> None:
+    """Write a settings file, pad.toml, with every default and a comment a key."""
+    from design.files import write_text
+    from design.settings import commented_toml
+
+    if path.exists():
+        raise InputError(f"{path}: exists already; choose another name or move it away")
+    write_text(path, commented_toml(_sections()))
+    click.echo(f"settings -> {path}")
+
+
+@cli.command()
+@spec_option
+@seed_option
+@out_option("out/pad")
+@click.pass_context
+def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) -> None:
+    """Do the whole job: optimise, mould, record presses on the simulated rig, calibrate, report.
+
+    Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
+    """
+    settings = load_spec(spec)
+    for model in _sections().values():  # a mistake in any section shows before minutes of work
+        settings.section(model)
+    sound = _run_stages(settings, seed, out)
+    path = write_report(out)
+    click.echo(f"report: {path}")
+    context.exit(0 if sound else 1)
+
+
+@cli.command()
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path), default="out/pad")
+def report(folder: Path) -> None:
+    """Write report.html for the pad in FOLDER: whatever its stages have left there, on one page."""
+    click.echo(f"report: {write_report(folder)}")
+
+
+def _sections() -> "dict[str, type[Section]]":
+    from design.settings import MODELS as DESIGN
+    from fabricate.settings import MODELS as FABRICATE
+    from sense.settings import MODELS as SENSE
+
+    return DESIGN | FABRICATE | SENSE
+
+
+def _run_stages(spec: "Spec", seed: int | None, out: Path) -> bool:
+    """All stages into `out`, each with its summary on stdout; whether every rule and check holds."""
+    from design.cli import run_search
+    from design.cli import summary as design_summary
+    from fabricate import Settings, build
+    from fabricate.cli import summary as mould_summary
+    from sense.cli import run_calibration, run_recording
+    from sense.cli import summary as calibration_summary
+
+    seeds = {"seed": seed}
+    recorded = out / "recording"
+    _make_way(recorded)
+    _, found = run_search(spec, out, seeds)
+    click.echo("\n".join(design_summary(found, out)))
+    written = [out / "morphology.json"]
+    mould = build(found.morphology, out, settings=Settings.from_spec(spec), inputs=written)
+    click.echo("\n".join(mould_summary(mould, out)))
+    recording = run_recording(spec, found.morphology, recorded, seeds, written)
+    click.echo(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {recorded}")
+    calibration = run_calibration(spec, recording, out, seeds)
+    click.echo("\n".join(f"  {line}" for line in calibration_summary(calibration)))
+    return not found.violations and all(finding["status"] != "fail" for finding in mould["findings"])
+
+
+def _make_way(recorded: Path) -> None:
+    """Remove an earlier simulated recording, which the same seed gives again; one of a real pad is never touched."""
+    from sense import Recording
+
+    if not recorded.exists():
+        return
+    kind = Recording.open(recorded).source.get("kind")
+    if kind != "simulated":
+        raise InputError(f"{recorded}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
+    shutil.rmtree(recorded)
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` from the files in `folder`; stages that have left none are left out."""
+    from design.files import read_json, write_text
+    from design.page import page, tiles
+
+    key_figures: list[tuple[str, str]] = []
+    body: list[str] = []
+    for name, section in (("design", _design), ("fabrication", _mould), ("calibration", _calibration)):
+        path = folder / f"{name}.json"
+        if path.exists():
+            figures, pieces = section(folder, read_json(path, f"padforge-{name}/1"))
+            key_figures += figures
+            body += pieces
+    if not body:
+        raise InputError(f"{folder}: no design.json, fabrication.json or calibration.json to report on")
+    lead = "Fibres, mould and calibration of one soft strain-sensor pad."
+    write_text(folder / "report.html", page(f"Pad report: {folder.name}", lead, [tiles(key_figures), *body]))
+    return folder / "report.html"
+
+
+Pieces = tuple[list[tuple[str, str]], list[str]]
+
+
+def _design(folder: Path, document: dict[str, Any]) -> Pieces:
+    from design.page import figures, heading, paragraph, table
+
+    spread = {int(name[-1]): value for name, value in document["terms"].items() if name.startswith("ambiguity")}
+    broken = [[v["rule"], ", ".join(map(str, v["fibres"])), v["measured"], v["limit"]] for v in document["violations"]]
+    holds = f"{len(broken)} broken" if broken else "all hold"
+    return [(holds, "design rules"), (f"{spread[0]:.3f}", "expected error, grid units")], [
+        heading("Fibres"),
+        figures(
+            [(folder / "design.svg", "The plan: horizontal and vertical fibres, their crossings, and the contact.")]
+        ),
+        table(["fibres lost", "expected error (grid units)"], list(spread.items())),
+        paragraph("Rules: " + ("broken as listed." if broken else "every rule of [rules] holds on the exact curves.")),
+        *([table(["rule", "fibres", "measured", "limit"], broken)] if broken else []),
+    ]
+
+
+def _mould(folder: Path, document: dict[str, Any]) -> Pieces:
+    from design.page import figures, heading, table
+
+    worst = max((f["status"] for f in document["findings"]), key=["pass", "warn", "fail"].index)
+    size = " x ".join(f"{side:g}" for side in document["size_mm"])
+    return [(worst, "mould checks"), (f"{document['silicone_volume_ml']:.1f} ml", "silicone to cast")], [
+        heading("Mould"),
+        figures([(folder / "mould.png", f"The mould, {size} mm, shaded by height.")]),
+        table(["check", "verdict", "finding"], [[f["name"], f["status"], f["message"]] for f in document["findings"]]),
+        heading("Fibres to cut"),
+        table(["fibre", "in the pad (mm)", "cut (mm)"], [list(fibre.values()) for fibre in document["fibres"]]),
+    ]
+
+
+def _calibration(folder: Path, document: dict[str, Any]) -> Pieces:
+    from design.page import figures, heading, paragraph, table
+
+    names = ("lost", "subsets", "mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
+    errors = [[row[name] for name in names] for row in document["errors"]]
+    return [
+        (f"{errors[0][2]:.2f} mm", "mean error, all fibres"),
+        (f"{errors[-1][2]:.2f} mm", f"{errors[-1][0]} lost"),
+    ], [
+        heading("Calibration"),
+        paragraph(
+            f"Errors on {document['test_presses']} presses never trained on ({document['split']} split); "
+            "one network serves every loss."
+        ),
+        figures(
+            [
+                (folder / "error_map.png", "Where presses were, and how far off they were found."),
+                (folder / "error_by_loss.png", "Error by number of lost fibres."),
+            ]
+        ),
+        table(["lost", "subsets", "mean (mm)", "std (mm)", "worst subset (mm)", "median (mm)", "95 % (mm)"], errors),
+    ]
 
 
 def main() -> None:
     """Run the command line; a user's own mistake is one line on stderr and exit 2."""
     try:
         code = cli.main(standalone_mode=False)
-    except click.exceptions.Abort:
-        code = _fail("interrupted; what was finished is kept", 130)
-    except KeyboardInterrupt:
+    except (click.exceptions.Abort, KeyboardInterrupt):
         code = _fail("interrupted; what was finished is kept", 130)
     except click.ClickException as error:
         code = _fail(error.format_message(), 2)

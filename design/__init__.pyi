@@ -1,3 +1,4 @@
+from .contact import signals as signals
 from .contact import signals_quantized as signals_quantized
 from .curves import crossings as crossings
 from .curves import flatten as flatten

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .console import json_option, load_spec, progress, seed_option, show_result, spec_option
+from .console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
 
 if TYPE_CHECKING:
     from .search import SearchResult
@@ -21,7 +21,7 @@ morphology_argument = click.argument("morphology", type=click.Path(path_type=Pat
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
 @seed_option
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (required).")
+@out_option("out/pad")
 @json_option
 @click.pass_context
 def design(
@@ -31,13 +31,13 @@ def design(
     knots: int | None,
     starts: int | None,
     seed: int | None,
-    out: Path | None,
+    out: Path,
     as_json: bool,
 ) -> None:
     """Optimise the course of the fibres, or look at a finished morphology.
 
     \b
-    padforge design --out out/pad                     with the settings of pad.toml or the defaults
+    padforge design                                   into out/pad, with the settings of pad.toml or the defaults
     padforge design --knots 8 --seed 1 --out out/pad
     padforge design check out/pad/morphology.json     exit 1 if a rule is broken
 
@@ -45,8 +45,6 @@ def design(
     """
     if context.invoked_subcommand is not None:
         return
-    if out is None:
-        raise click.UsageError("design: --out DIR is missing")
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed}
     document, result = run_search(load_spec(spec), out, overrides)
     show_result(document, summary(result, out), as_json)

@@ -22,14 +22,13 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 seed_option = click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice.")
 
 
-def out_option(default: str | None = None) -> Callable[..., Any]:
-    """`--out DIR`, the folder results go to; required where there is no default."""
+def out_option(default: str) -> Callable[..., Any]:
+    """`--out DIR`, the folder results go to."""
     return click.option(
         "--out",
         type=click.Path(file_okay=False, path_type=Path),
-        required=default is None,
         default=default,
-        show_default=default is not None,
+        show_default=True,
         help="Folder for the results.",
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from .kernels import pchip_slopes
+from .kernels.pchip import pchip_slopes
 from .morphology import Morphology
 
 Array = NDArray[np.float64]

@@ -96,7 +96,7 @@ def ambiguity(signals: Tensor, presses: Tensor, kept: Tensor, sigma: float) -> T
 
 
 def penalty(curve: Tensor, slope: Tensor, step: float, pad: Pad, rules: Rules) -> Tensor:
-    """How far sampled fibres break the rules on gap, bend and length: 0 where all hold with a small margin.
+    """How far sampled fibres break the rules on gap, bend, border and length: 0 where all hold with a small margin.
 
     Args:
         curve, slope: (2M, F) cross coordinates and slopes at travel 0, step, ...; grid units.
@@ -112,8 +112,10 @@ def penalty(curve: Tensor, slope: Tensor, step: float, pad: Pad, rules: Rules) -
     arc = step * (stretch[:, 1:] + stretch[:, :-1]) / 2
     radius = 1.15 * rules.min_bend_radius_mm / pad.pitch_mm
     bend = torch.relu(turn * radius / arc - 1)
+    zone = max(1, round(rules.border_mm / pad.pitch_mm / step))  # by its own wall a fibre leaves at 45 degrees or less
+    hugging = torch.relu(torch.cat([slope[:, :zone], slope[:, -zone:]], dim=1).abs() - 1)
     length = torch.relu((step * stretch).sum(dim=1) * pad.pitch_mm / rules.max_length_mm - 1)
-    return closeness.mean() + (closeness**2).mean() * 10 + bend.mean() + length.mean()
+    return closeness.mean() + (closeness**2).mean() * 10 + bend.mean() + hugging.mean() / 10 + length.mean()
 
 
 def descend(

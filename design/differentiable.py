@@ -7,7 +7,7 @@ from torch import Tensor
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
     """PCHIP slopes (..., n) of values v at ascending t, both (..., n); differentiable almost everywhere.
 
-    The same rule as `kernels.pchip_slopes`, to rounding.
+    The same rule as `kernels.pchip.pchip_slopes`, to rounding.
     """
     h = t.diff(dim=-1)
     m = v.diff(dim=-1) / h

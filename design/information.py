@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import sample_curves
+from .kernels.pchip import sample_curves
 
 LEVELS = 4096
 """Levels of the published 12-bit converter."""

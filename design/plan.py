@@ -11,10 +11,9 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from .curves import crossings, flatten
 from .files import atomic
 from .morphology import Morphology
+from .palette import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
 from .rules import Violation
 from .settings import Contact
-
-HORIZONTAL, VERTICAL, ALARM, INK = "#0b6e99", "#d9730d", "#c4161c", "#37352f"
 
 
 def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation] = ()) -> Figure:
@@ -25,7 +24,7 @@ def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation]
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     half = pad.size_mm / 2
-    axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor="#f7f6f3", edgecolor="#d3d1cb"))
+    axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor=PAPER, edgecolor=FAINT))
     for fibre, points in enumerate(flatten(pad, 1e-3)):
         horizontal = fibre < pad.grid
         x, y = pad.to_mm(points).T

@@ -1,0 +1,8 @@
+"""Sense with soft strain-sensor pads: recordings, presses and the localizer that turns readings into places.
+
+Names load on first use, so importing the package costs next to nothing.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

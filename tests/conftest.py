@@ -1,8 +1,13 @@
 """Fixtures shared by all tests."""
 
+import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("padforge", deadline=None, derandomize="CI" in os.environ)
+settings.load_profile("padforge")
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
 

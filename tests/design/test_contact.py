@@ -65,7 +65,7 @@ contacts = st.builds(
 
 
 @given(contacts, st.integers(1, 4), st.integers(0, 8), st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_culled_sums_equal_the_full_scan(contact, grid, knots, seed):
     rng = np.random.default_rng(seed)
     pad = Morphology.random(grid, knots, rng)

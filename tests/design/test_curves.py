@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Morphology, crossings, flatten
 from design.curves import beziers, lengths, slopes
 from design.differentiable import pchip_sample
-from design.kernels import sample_curves
+from design.kernels.pchip import sample_curves
 
 pads = st.builds(
     Morphology.random, st.integers(1, 4), st.integers(0, 12), st.integers(0, 2**32 - 1).map(np.random.default_rng)
@@ -30,7 +30,6 @@ def test_slopes_are_scipys(pad):
 
 
 @given(pads)
-@settings(deadline=None)
 def test_sampled_curves_are_scipys(pad):
     at = np.linspace(0, pad.grid + 1, 200)
     compiled = sample_curves(pad.knots[None], 200)[0]
@@ -62,7 +61,6 @@ def test_bezier_spans_lie_on_the_curve(pad):
 
 
 @given(pads, st.sampled_from([1e-2, 1e-3, 1e-4]))
-@settings(deadline=None)
 def test_flattened_fibres_stay_within_the_tolerance(pad, tolerance):
     for coarse, fine in zip(flatten(pad, tolerance), flatten(pad, tolerance / 100), strict=True):
         start, end = coarse[:-1], coarse[1:]

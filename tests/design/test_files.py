@@ -10,11 +10,16 @@ from design.files import atomic, read_json, sha256, write_json
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
     path = tmp_path / "result.json"
     write_json(path, {"format": "x/1"})
-    with pytest.raises(RuntimeError, match="halfway"), atomic(path) as temporary:
-        temporary.write_text("half a fi")
-        raise RuntimeError("halfway")
+
+    def fail_halfway():
+        with atomic(path) as temporary:
+            temporary.write_text("half a fi")
+            raise RuntimeError("halfway")
+
+    with pytest.raises(RuntimeError, match="halfway"):
+        fail_halfway()
     assert read_json(path, "x/1") == {"format": "x/1"}
-    assert os.listdir(tmp_path) == ["result.json"]
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_nan_is_refused_before_anything_is_replaced(tmp_path):

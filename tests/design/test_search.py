@@ -7,7 +7,7 @@ import torch
 from design import Contact, Morphology, search
 from design.descent import ambiguity
 from design.differentiable import smooth_signals
-from design.kernels import sample_curves
+from design.kernels.pchip import sample_curves
 from design.search import score
 from design.settings import Pad, Rules, Search
 

@@ -1,0 +1,78 @@
+"""PCHIP curves: slopes and samples. Arrays in grid units."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, error_model="numpy")
+def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
+    """Slope at an end knot from the two spans next to it: three-point rule, kept shape-preserving."""
+    d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
+    if d * m0 <= 0:
+        return 0.0
+    if m0 * m1 <= 0 and abs(d) > 3 * abs(m0):
+        return 3 * m0
+    return d
+
+
+@njit(cache=True, error_model="numpy")
+def pchip_slopes(t: Any, v: Any, d: Any) -> None:
+    """Fritsch-Butland slopes of the PCHIP through (t, v), both (n,) with t ascending, into d (n,)."""
+    n = len(t)
+    if n == 2:
+        d[0] = d[1] = (v[1] - v[0]) / (t[1] - t[0])
+        return
+    for k in range(1, n - 1):
+        h0, h1 = t[k] - t[k - 1], t[k + 1] - t[k]
+        m0, m1 = (v[k] - v[k - 1]) / h0, (v[k + 1] - v[k]) / h1
+        if m0 * m1 <= 0:
+            d[k] = 0.0
+        else:
+            w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+            d[k] = (w0 + w1) / (w0 / m0 + w1 / m1)
+    h0, h1 = t[1] - t[0], t[2] - t[1]
+    d[0] = _end_slope(h0, h1, (v[1] - v[0]) / h0, (v[2] - v[1]) / h1)
+    h0, h1 = t[n - 1] - t[n - 2], t[n - 2] - t[n - 3]
+    d[n - 1] = _end_slope(h0, h1, (v[n - 1] - v[n - 2]) / h0, (v[n - 2] - v[n - 3]) / h1)
+
+
+@njit(cache=True, error_model="numpy")
+def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
+    """Values of the PCHIP through (t, v) at 0, step, 2 step, ... into out; the last sample is the last knot."""
+    d = np.empty(len(t))
+    pchip_slopes(t, v, d)
+    j = 0
+    for i in range(len(out) - 1):
+        x = i * step
+        while j < len(t) - 2 and x >= t[j + 1]:
+            j += 1
+        h = t[j + 1] - t[j]
+        m = (v[j + 1] - v[j]) / h
+        s = (x - t[j]) / h
+        out[i] = v[j] + h * s * (d[j] + s * ((3 * m - 2 * d[j] - d[j + 1]) + s * (d[j] + d[j + 1] - 2 * m)))
+    out[-1] = v[-1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sample_curves(knots: Any, samples: int) -> Any:
+    """Cross coordinates (P, 2M, samples) of the fibres `knots` (P, 2M, N+2, 2), uniform along the travel axis."""
+    population, fibres = knots.shape[:2]
+    step = (fibres // 2 + 1) / (samples - 1)
+    out = np.empty((population, fibres, samples))
+    for index in range(population * fibres):
+        p, f = index // fibres, index % fibres
+        travel = 0 if f < fibres // 2 else 1
+        pchip_sample(knots[p, f, :, travel].copy(), knots[p, f, :, 1 - travel].copy(), step, out[p, f])
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def population_slopes(travel: Any, cross: Any) -> Any:
+    """Slopes (P, 2M, n) of the PCHIP curves through knots `travel`, `cross`, both (P, 2M, n)."""
+    out = np.empty_like(cross)
+    for p in range(len(travel)):
+        for f in range(travel.shape[1]):
+            pchip_slopes(travel[p, f], cross[p, f], out[p, f])
+    return out

@@ -1,0 +1,25 @@
+"""Spreading compiled work over the cores: the kernels let go of the interpreter while they run."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+
+Result = TypeVar("Result")
+
+
+def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:
+    """Results of work(begin, end) over chunks that make up 0..count, in order, one thread a core.
+
+    Args:
+        grain: items below which a chunk is not worth a thread; work that small runs where it is.
+    """
+    chunks = max(1, min(os.cpu_count() or 1, count // grain))
+    if chunks == 1:
+        return [work(0, count)]
+    edges = np.linspace(0, count, chunks + 1).astype(int).tolist()
+    with ThreadPoolExecutor(chunks) as pool:
+        return list(pool.map(lambda ends: work(*ends), pairwise(edges)))

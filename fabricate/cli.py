@@ -1,0 +1,104 @@
+"""`padforge fabricate`: the edge where morphologies come in and moulds go out."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from design.console import json_option, load_spec, show_result, spec_option
+
+MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
+
+
+class BuildByDefault(click.Group):
+    """A group whose first word may be left out: what names no command is for `build`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put `build` in front of arguments that begin with no command and no call for help."""
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["build", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(cls=BuildByDefault, subcommand_metavar="[build] MORPHOLOGY | check MESH_OR_MORPHOLOGY  [OPTIONS]")
+def fabricate() -> None:
+    """Turn a morphology into the printable mould of its pad, or check one.
+
+    \b
+    padforge fabricate MORPHOLOGY                     writes the mould
+    padforge fabricate check MESH_OR_MORPHOLOGY       exit 1 when a check fails
+
+    A MORPHOLOGY is a morphology.json or a published .mat; a mesh is a .stl or .3mf.
+    """
+
+
+@fabricate.command()
+@click.argument("morphology", type=click.Path(path_type=Path))
+@click.option(
+    "--formats", default="stl,step,svg,png", show_default=True, help="Which to write, of stl, 3mf, step, svg and png."
+)
+@spec_option
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for the files (default: beside a morphology.json, out/NAME for NAME.mat).",
+)
+@json_option
+def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, as_json: bool) -> None:
+    """Write the mould of MORPHOLOGY; `build` may be left out."""
+    from design.morphology import Morphology
+
+    from .export import build as build_files
+    from .settings import Settings
+
+    settings = Settings.from_spec(load_spec(spec))
+    pad = Morphology.load(morphology)
+    folder = out or (Path("out") / morphology.stem if morphology.suffix == ".mat" else morphology.parent)
+    wanted = [name.strip() for name in formats.split(",") if name.strip()]
+    document = build_files(pad, folder, wanted, settings, [path for path in (morphology, spec) if path])
+    show_result(document, summary(document, folder), as_json)
+
+
+def summary(document: dict[str, Any], out: Path) -> list[str]:
+    """What a person wants to know of a mould, in a few lines: where it is, and what to look at."""
+    size = " x ".join(f"{side:g}" for side in document["size_mm"])
+    remarks = [finding for finding in document["findings"] if finding["status"] != "pass"]
+    passed = len(document["findings"]) - len(remarks)
+    return [
+        f"mould: {size} mm, {document['silicone_volume_ml']:.1f} ml of silicone -> {out / document['files'][0]}"
+        if document["files"]
+        else f"mould: {size} mm -> {out / 'fabrication.json'}",
+        f"  {passed} checks pass" + ("" if remarks else ", none to look at"),
+        *(f"  {_line(finding)}" for finding in remarks),
+    ]
+
+
+@fabricate.command()
+@click.argument("mesh_or_morphology", type=click.Path(path_type=Path))
+@spec_option
+@json_option
+@click.pass_context
+def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, as_json: bool) -> None:
+    """Check a mesh, or the mould of a morphology; exit 1 when a check fails."""
+    from design.morphology import Morphology
+
+    from . import printability
+    from .settings import Settings
+
+    settings = Settings.from_spec(load_spec(spec))
+    if mesh_or_morphology.suffix.lower() in (".stl", ".3mf"):
+        findings = printability.check_mesh(mesh_or_morphology, settings.printer)
+    else:
+        findings = printability.check(Morphology.load(mesh_or_morphology), settings)
+    passed = all(finding.status != "fail" for finding in findings)
+    documents = [finding.document() for finding in findings]
+    show_result({"passed": passed, "findings": documents}, list(map(_line, documents)), as_json)
+    ctx.exit(0 if passed else 1)
+
+
+def _line(finding: dict[str, Any]) -> str:
+    """A finding for people: its verdict and, of its places, the first three."""
+    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["places_mm"]]
+    more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
+    where = f" at {' '.join(places[:3])}{more}" if places else ""
+    return f"{MARKS[finding['status']]} {finding['name']}: {finding['message']}{where}"

@@ -1,0 +1,11 @@
+from .calibration import calibrate as calibrate
+from .calibration import evaluate as evaluate
+from .calibration import locate as locate
+from .exchange import export_csv as export_csv
+from .exchange import import_csv as import_csv
+from .exchange import import_mat as import_mat
+from .localizer import Localizer as Localizer
+from .recording import Recorder as Recorder
+from .recording import Recording as Recording
+from .rig.simulated import simulate as simulate
+from .settings import Rig as Rig

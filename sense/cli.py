@@ -1,0 +1,215 @@
+"""`padforge sense`: the edge where recordings come in and places go out."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from design.console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
+
+if TYPE_CHECKING:
+    from design.morphology import Morphology
+    from design.settings import Spec
+
+    from .recording import Recording
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+_FOLDER = click.Path(path_type=Path, file_okay=False)
+
+recording_argument = click.argument("recording", type=_FOLDER)
+recording_out_option = click.option(
+    "--out", type=_FOLDER, required=True, help="Folder of the recording; must be new or empty."
+)
+model_option = click.option("--model", type=_FOLDER, required=True, help="Folder that calibrate wrote.")
+
+
+class _Numbers(click.ParamType):
+    """Whole numbers with commas between them, as `0,3`."""
+
+    name = "N,N,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            return tuple(int(part) for part in value.split(",") if part.strip())
+        except ValueError:
+            self.fail(f"got {value!r}, expected whole numbers with commas between them", param, ctx)
+
+
+@click.group()
+def sense() -> None:
+    """Record presses, learn places from them and find new ones."""
+
+
+@sense.command()
+@click.option("--rig", type=click.Choice(["simulated"]), default="simulated", show_default=True)
+@click.option(
+    "--morphology", type=_FILE, help="morphology.json or published .mat (default: the straight grid of [pad])."
+)
+@click.option("--presses", type=int, help="Presses to record.")
+@seed_option
+@spec_option
+@recording_out_option
+def record(
+    rig: str, morphology: Path | None, presses: int | None, seed: int | None, spec: Path | None, out: Path
+) -> None:
+    """Record presses at random places; only the simulated rig is there yet."""
+    from design.morphology import Morphology
+    from design.settings import Pad
+
+    settings = load_spec(spec)
+    of_pad = settings.section(Pad)
+    pad = Morphology.load(morphology) if morphology else Morphology.straight(of_pad.grid, of_pad.pitch_mm)
+    inputs = [path for path in (morphology, spec) if path is not None]
+    recording = run_recording(settings, pad, out, {"presses": presses, "seed": seed}, inputs)
+    click.echo(_describe(recording, out))
+
+
+def run_recording(
+    spec: "Spec", pad: "Morphology", out: Path, overrides: Mapping[str, Any], inputs: Sequence[Path] = ()
+) -> "Recording":
+    """Record presses on the simulated rig with the settings of `spec` into the run directory `out`."""
+    from design.files import provenance
+    from design.settings import Contact
+
+    from .recording import refuse_existing
+    from .rig.simulated import simulate
+    from .settings import Rig
+
+    refuse_existing(out)
+    options = spec.section(Rig, **overrides)
+    recording = simulate(pad, options, spec.section(Contact))
+    recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
+    return recording
+
+
+@sense.command("import")
+@click.argument("file", type=_FILE)
+@recording_out_option
+def import_(file: Path, out: Path) -> None:
+    """Make a recording of FILE, a published .mat or a .csv.
+
+    \b
+    The CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two hold
+    the place pressed while the probe is down and are empty on all other lines.
+    """
+    from design.errors import InputError
+    from design.files import provenance
+
+    from .exchange import import_csv, import_mat
+    from .recording import refuse_existing
+
+    readers = {".mat": import_mat, ".csv": import_csv}
+    if file.suffix.lower() not in readers:
+        raise InputError(f"{file}: ends in {file.suffix!r}, allowed are {', '.join(readers)}")
+    refuse_existing(out)
+    recording = readers[file.suffix.lower()](file)
+    recording.save(out, provenance("padforge sense import", inputs=[file]))
+    click.echo(_describe(recording, out))
+
+
+@sense.command()
+@recording_argument
+@click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
+@seed_option
+@spec_option
+@out_option()
+@json_option
+def calibrate(
+    recording: Path, test_split: str | None, seed: int | None, spec: Path | None, out: Path, as_json: bool
+) -> None:
+    """Learn places from RECORDING and test on presses held back.
+
+    Writes localizer.safetensors, localizer.json, calibration.json, error_map.png and error_by_loss.png.
+    """
+    document = run_calibration(load_spec(spec), _open(recording), out, {"split": test_split, "seed": seed})
+    show_result(document, summary(document), as_json)
+
+
+def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Calibrate with the settings of `spec`, write all results to `out`, and return `calibration.json`."""
+    from design.files import write_json
+
+    from .calibration import calibrate as learn
+    from .figures import draw_error_by_loss, draw_error_map
+    from .settings import Localizer
+
+    options = spec.section(Localizer, **overrides)
+    with progress() as bar:
+        task = bar.add_task("training", total=options.epochs, note="")
+
+        def report(done: int, total: int) -> None:
+            bar.update(task, completed=done, note=f"epoch {done} of {total}")
+
+        localizer, document = learn(recording, options, progress=report)
+    localizer.save(out)
+    write_json(out / "calibration.json", document)
+    draw_error_map(document, out / "error_map.png")
+    draw_error_by_loss(document, out / "error_by_loss.png")
+    return document
+
+
+@sense.command()
+@model_option
+@recording_argument
+@click.option("--lost", type=_Numbers(), help="How many fibres to lose (default: 0 to 3, as far as one is left).")
+@json_option
+def evaluate(model: Path, recording: Path, lost: tuple[int, ...] | None, as_json: bool) -> None:
+    """Errors on RECORDING for every set of lost fibres.
+
+    Of the recording the model was trained on, only the presses that were held back count.
+    """
+    from .calibration import evaluate as test
+    from .localizer import Localizer
+
+    localizer = Localizer.load(model)
+    levels = range(min(4, localizer.fibres)) if lost is None else lost
+    document = test(localizer, _open(recording), levels)
+    show_result(document, summary(document), as_json)
+
+
+@sense.command()
+@model_option
+@recording_argument
+@click.option("--mask", type=_Numbers(), default=(), help="Fibres to leave out, counted from 0.")
+@click.option("--out", type=_FILE, required=True, help="CSV file for the places: press, x_mm, y_mm.")
+def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path) -> None:
+    """Find the place of every press of RECORDING."""
+    from .calibration import locate as find
+    from .exchange import write_places
+    from .localizer import Localizer
+
+    found = find(Localizer.load(model), _open(recording), mask)
+    write_places(found, out)
+    click.echo(f"{len(found)} places -> {out}")
+
+
+def _open(path: Path) -> "Recording":
+    from .recording import Recording
+
+    recording = Recording.open(path)
+    if recording.torn_presses:
+        click.echo(f"{path}: the end is torn off, its last {recording.torn_presses} presses are left out", err=True)
+    return recording
+
+
+def _describe(recording: "Recording", out: Path) -> str:
+    return (
+        f"{len(recording.presses_mm)} presses, {len(recording.readings)} readings of {recording.fibres} fibres "
+        f"at {recording.rate_hz:.1f} Hz -> {out}"
+    )
+
+
+def summary(document: Mapping[str, Any]) -> list[str]:
+    """The errors of a calibration document as a table for people."""
+    return [
+        f"error in mm on {document['test_presses']} presses (split: {document['split']})",
+        "lost  sets   mean    std    max  median    p95",
+        *(
+            f"{row['lost']:4d} {row['subsets']:5d} {row['mean_mm']:6.2f} {row['std_mm']:6.2f} "
+            f"{row['max_mm']:6.2f}  {row['median_mm']:6.2f} {row['p95_mm']:6.2f}"
+            for row in document["errors"]
+        ),
+    ]

@@ -1,0 +1,1 @@
+"""Rigs: what presses a pad and reads its fibres."""

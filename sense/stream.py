@@ -1,0 +1,139 @@
+"""An append-only stream of readings in blocks, each of which proves itself whole.
+
+A file is a run of blocks of one size. A block is a header (magic, sequence number, index of its first reading, count
+of readings, checksum), `count` rows of float64 (time in s, then one voltage per fibre) and zeros up to the size; the
+CRC-32 covers all of the block but itself. A writer that dies leaves at worst a torn last block, which a reader cuts
+off; damage before an intact block cannot come from that and is an error.
+"""
+
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.errors import InputError
+
+Array = NDArray[np.float64]
+
+_MAGIC = b"PFB1"
+_UNIT = 256
+_CRC_OFFSET = 20
+_HEADER = 24
+
+
+def block_dtype(fibres: int) -> np.dtype[np.void]:
+    """The layout of a block of rows of 1 + `fibres` numbers: little-endian, at least four rows, n x 256 bytes."""
+    row = 8 * (1 + fibres)
+    size = -(-(_HEADER + 4 * row) // _UNIT) * _UNIT
+    rows = (size - _HEADER) // row
+    return np.dtype(
+        {
+            "names": ["magic", "sequence", "first", "count", "crc", "rows"],
+            "formats": ["S4", "<u4", "<u8", "<u4", "<u4", ("<f8", (rows, 1 + fibres))],
+            "offsets": [0, 4, 8, 16, _CRC_OFFSET, _HEADER],
+            "itemsize": size,
+        }
+    )
+
+
+class BlockWriter:
+    """Appends rows to an open stream. Rows reach the file a full block at a time, or at `flush`."""
+
+    def __init__(self, file: BinaryIO, fibres: int) -> None:
+        self._file = file
+        self._dtype = block_dtype(fibres)
+        self._rows = self._dtype["rows"].shape[0]
+        self._waiting = np.empty((0, 1 + fibres))
+        self._sequence = 0
+        self._first = 0
+
+    def append(self, rows: Array) -> None:
+        """Add (n, 1 + C) rows of time and volts."""
+        rows = np.concatenate([self._waiting, rows])
+        whole = len(rows) // self._rows * self._rows
+        self._write(rows[:whole])
+        self._waiting = rows[whole:]
+
+    def flush(self) -> None:
+        """Hand what waits to the operating system as a block that is not full."""
+        self._write(self._waiting)
+        self._waiting = self._waiting[:0]
+        self._file.flush()
+
+    def _write(self, rows: Array) -> None:
+        blocks = np.zeros(-(-len(rows) // self._rows), self._dtype)
+        starts = np.arange(len(blocks)) * self._rows
+        blocks["magic"] = _MAGIC
+        blocks["sequence"] = self._sequence + np.arange(len(blocks))
+        blocks["first"] = self._first + starts
+        blocks["count"] = np.minimum(self._rows, len(rows) - starts)
+        payload = np.zeros((len(blocks) * self._rows, rows.shape[1]))
+        payload[: len(rows)] = rows
+        blocks["rows"] = payload.reshape(blocks["rows"].shape)
+        blocks["crc"] = _checksums(blocks)
+        self._file.write(blocks.tobytes())
+        self._sequence += len(blocks)
+        self._first += len(rows)
+
+
+def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
+    """All intact rows of a stream.
+
+    Returns:
+        (R, 1 + C) rows, and whether a torn tail was cut off behind them.
+
+    Raises:
+        InputError: the file is missing, or a block is damaged although intact ones follow.
+    """
+    dtype = block_dtype(fibres)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    blocks = np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
+    sound = _sound(blocks)
+    end = len(blocks) if sound.all() else int(np.argmin(sound))
+    tail = content[end * dtype.itemsize :]
+    if _holds_block(tail, dtype):
+        raise InputError(
+            f"{path}: block {end} (byte {end * dtype.itemsize}) is damaged although intact blocks follow, "
+            "allowed is a torn end of the file only"
+        )
+    blocks = blocks[:end]
+    kept = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
+    return blocks["rows"][kept], bool(tail)
+
+
+def _sound(blocks: NDArray[np.void]) -> NDArray[np.bool_]:
+    """(B,) whether each block has its magic and checksum and stands where it was written."""
+    counts = blocks["count"].astype(np.int64)
+    return (
+        (blocks["magic"] == _MAGIC)
+        & (blocks["crc"] == _checksums(blocks))
+        & (blocks["sequence"] == np.arange(len(blocks)))
+        & (blocks["first"] == np.cumsum(counts) - counts)
+    )
+
+
+def _holds_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
+    """Whether an intact block lies anywhere in `content`, at whatever offset."""
+    start = content.find(_MAGIC)
+    while 0 <= start <= len(content) - dtype.itemsize:
+        block = np.frombuffer(content, dtype, count=1, offset=start)
+        if block["crc"][0] == _checksums(block)[0]:
+            return True
+        start = content.find(_MAGIC, start + 1)
+    return False
+
+
+def _checksums(blocks: NDArray[np.void]) -> NDArray[np.uint32]:
+    """(B,) CRC-32 of every block without its checksum field."""
+    view = memoryview(blocks.tobytes())
+    size = blocks.dtype.itemsize
+    crcs = np.empty(len(blocks), np.uint32)
+    for i in range(len(blocks)):
+        block = view[i * size : (i + 1) * size]
+        crcs[i] = zlib.crc32(block[_CRC_OFFSET + 4 :], zlib.crc32(block[:_CRC_OFFSET]))
+    return crcs

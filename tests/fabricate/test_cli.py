@@ -1,0 +1,119 @@
+import json
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from design.errors import InputError
+from design.morphology import Morphology
+from fabricate.cli import fabricate
+
+from .planted import level_pad
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path_factory, monkeypatch):
+    """Run in an empty folder, since a pad.toml in the current one is taken for the settings."""
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+
+
+@pytest.fixture
+def morphology(tmp_path):
+    path = tmp_path / "morphology.json"
+    Morphology.straight(2).save(path)
+    return path
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(fabricate, [str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("words", [[], ["build"]])
+def test_build_is_the_default_command(morphology, tmp_path, words):
+    result = invoke(*words, "--formats", "stl,svg", "--out", tmp_path / "out", morphology, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["files"] == ["mould.stl", "tracks.svg"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"mould.stl", "tracks.svg", "fabrication.json"}
+
+
+def test_people_get_a_summary_with_what_to_look_at(tmp_path):
+    level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
+    result = invoke(tmp_path / "crossed.json", "--formats", "svg")
+    assert result.exit_code == 0
+    assert "ml of silicone" in result.output
+    assert "FAIL same_family_crossings: 2 crossings" in result.output
+    assert (tmp_path / "tracks.svg").exists()
+
+
+def test_check_of_a_morphology(morphology):
+    result = invoke("check", morphology)
+    assert result.exit_code == 0
+    assert all(line.startswith("ok") for line in result.stdout.splitlines())
+
+
+def test_check_exits_1_when_a_check_fails(tmp_path):
+    level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
+    result = invoke("check", tmp_path / "crossed.json", "--json")
+    assert result.exit_code == 1
+    document = json.loads(result.stdout)
+    assert not document["passed"]
+    assert "same_family_crossings" in [f["name"] for f in document["findings"] if f["status"] == "fail"]
+
+
+def test_check_of_a_mesh_with_the_printer_of_a_spec(morphology, tmp_path):
+    invoke(morphology, "--formats", "stl", "--out", tmp_path)
+    (tmp_path / "pad.toml").write_text("[printer]\nbed_mm = [30, 30, 100]\n", encoding="utf-8")
+    assert invoke("check", tmp_path / "mould.stl").exit_code == 0
+    result = invoke("check", tmp_path / "mould.stl", "--spec", tmp_path / "pad.toml")
+    assert result.exit_code == 1
+    assert "FAIL bed: 37.75 x 37.75 x 8 mm to print on a bed of 30 x 30 x 100 mm" in result.stdout
+
+
+def test_the_spec_shapes_the_mould(morphology, tmp_path):
+    (tmp_path / "pad.toml").write_text("[mould]\nborder_mm = 1.5\n", encoding="utf-8")
+    result = invoke(morphology, "--formats", "svg", "--out", tmp_path, "--spec", tmp_path / "pad.toml", "--json")
+    document = json.loads(result.stdout)
+    assert document["size_mm"][0] == 3 * 11.25 + 2 * (1.5 + 2)
+    assert set(document["provenance"]["inputs"]) == {"morphology.json", "pad.toml"}
+
+
+def test_bad_input_is_an_input_error(tmp_path):
+    for arguments in ([tmp_path / "absent.json", "--out", tmp_path], ["check", tmp_path / "absent.stl"]):
+        error = invoke(*arguments).exception
+        assert isinstance(error, InputError)
+        assert "absent" in str(error)
+        assert "\n" not in str(error)
+
+
+def test_help_shows_both_forms():
+    result = invoke("--help")
+    assert result.exit_code == 0
+    for words in ("fabricate MORPHOLOGY", "fabricate check MESH_OR_MORPHOLOGY", "exit 1"):
+        assert words in result.output
+    assert "--formats" in invoke("build", "--help").output
+
+
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("fabricate", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "shapely", "matplotlib", "pydantic"]),
+        ("fabricate.cli", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
+        ("fabricate.settings", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "shapely", "numpy"]),
+        ("fabricate.export", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "matplotlib"]),
+    ],
+)
+def test_imports_stay_light(module, heavy):
+    code = f"import sys, {module}; print(*(name for name in {heavy} if name in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == []
+
+
+def test_a_build_without_step_and_png_loads_neither_cad_nor_plots(morphology, tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from design.morphology import Morphology; import fabricate;"
+        f"fabricate.build(Morphology.load({str(morphology)!r}), Path({str(tmp_path)!r}), ['stl', '3mf', 'svg']);"
+        "print(*(name for name in ('build123d', 'OCP', 'torch', 'matplotlib') if name in sys.modules))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == []

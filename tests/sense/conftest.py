@@ -1,0 +1,26 @@
+"""A simulated recording and a quickly trained localizer, shared by the tests of sense."""
+
+import pytest
+
+from design import Morphology
+from sense import Localizer, Recording, calibrate
+from sense import settings as sense_settings
+from sense.rig.simulated import simulate
+
+QUICK = sense_settings.Localizer(members=2, hidden=48, layers=2, epochs=60, batch=64)
+
+
+@pytest.fixture(scope="session")
+def recording() -> Recording:
+    """300 presses on a pad whose fibres wind."""
+    return simulate(Morphology.random(2, knots=3, seed=5), sense_settings.Rig(presses=300, seed=1))
+
+
+@pytest.fixture(scope="session")
+def calibrated(recording: Recording) -> tuple[Localizer, dict]:
+    return calibrate(recording, QUICK)
+
+
+@pytest.fixture(scope="session")
+def localizer(calibrated: tuple[Localizer, dict]) -> Localizer:
+    return calibrated[0]

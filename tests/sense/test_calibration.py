@@ -1,0 +1,133 @@
+"""Calibration: the test share is never learnt from, and what is learnt is worth something."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.errors import InputError
+from sense import Localizer, Recording, calibrate, evaluate, import_mat, locate
+from sense.calibration import lost_subsets, split_presses
+from sense.settings import Localizer as Options
+
+SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
+
+
+@given(
+    presses=st.integers(3, 3000),
+    share=st.floats(0.01, 0.6),
+    split=st.sampled_from(["random", "chronological"]),
+    seed=st.integers(0, 99),
+)
+def test_a_split_holds_back_a_share_and_uses_the_rest(presses: int, share: float, split: str, seed: int) -> None:
+    if not 1 <= round(share * presses) <= presses - 2:
+        with pytest.raises(InputError, match="holds"):
+            split_presses(presses, split, share, np.random.default_rng(seed))
+        return
+    training, test = split_presses(presses, split, share, np.random.default_rng(seed))
+    assert len(test) == round(share * presses)
+    assert np.array_equal(np.sort(np.concatenate([training, test])), np.arange(presses))
+    assert split == "random" or training.max() < test.min()
+
+
+@pytest.mark.parametrize("split", ["random", "chronological"])
+def test_presses_held_back_leave_no_trace_in_the_localizer(recording: Recording, split: str) -> None:
+    plain, _ = calibrate(recording, SHORT, split=split)
+    test = np.array(plain.test)
+    readings, places = np.array(recording.readings), np.array(recording.presses_mm)
+    places[test] = 1e6 + np.arange(len(test))[:, None]
+    for press in test:  # while the probe is down, readings belong to one press alone
+        readings[recording.begun[press] : recording.lifted[press]] = 77.0
+    spoilt, _ = calibrate(replace(recording, readings=readings, presses_mm=places), SHORT, split=split)
+    assert spoilt.test == plain.test
+    assert all(np.array_equal(spoilt.weights[name], weight) for name, weight in plain.weights.items())
+    assert np.array_equal(spoilt.scaling.spread, plain.scaling.spread)
+
+
+def test_training_presses_do_leave_a_trace(recording: Recording) -> None:
+    plain, _ = calibrate(recording, SHORT)
+    places = np.array(recording.presses_mm)
+    places[sorted(set(range(len(places))) - set(plain.test))[0]] *= 0.5
+    changed, _ = calibrate(replace(recording, presses_mm=places), SHORT)
+    assert not np.array_equal(changed.weights["last.w"], plain.weights["last.w"])
+
+
+def test_the_same_seed_gives_the_same_result(recording: Recording) -> None:
+    first, document = calibrate(recording, SHORT, seed=7)
+    again, same = calibrate(recording, SHORT, seed=7)
+    assert document == same
+    assert all(np.array_equal(again.weights[name], weight) for name, weight in first.weights.items())
+    assert calibrate(recording, SHORT, seed=8)[0].test != first.test
+
+
+def test_it_beats_the_guess_that_knows_no_reading(calibrated: tuple[Localizer, dict], recording: Recording) -> None:
+    localizer, document = calibrated
+    test = np.array(localizer.test)
+    guess = np.median(np.delete(recording.presses_mm, test, axis=0), axis=0)
+    trivial = np.hypot(*(recording.presses_mm[test] - guess).T).mean()
+    assert document["errors"][0]["mean_mm"] < 0.5 * trivial
+    assert document["errors"][1]["mean_mm"] < 0.8 * trivial
+
+
+def test_the_document_says_what_was_measured(calibrated: tuple[Localizer, dict], recording: Recording) -> None:
+    localizer, document = calibrated
+    assert document["format"] == "padforge-calibration/1"
+    assert document["split"] == "random"
+    assert document["test_presses"] == 45
+    assert document["training_presses"] == 255
+    assert [(row["lost"], row["subsets"]) for row in document["errors"]] == [(0, 1), (1, 4), (2, 6), (3, 4)]
+    assert set(document["errors"][0]) == {"lost", "subsets", "mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm"}
+    assert localizer.errors == document["errors"]
+    test = np.array(localizer.test)
+    means = [
+        np.hypot(*(locate(localizer, recording, [fibre]) - recording.presses_mm)[test].T).mean() for fibre in range(4)
+    ]
+    row = document["errors"][1]
+    assert row["mean_mm"] == pytest.approx(np.mean(means))
+    assert row["std_mm"] == pytest.approx(np.std(means))
+    assert row["max_mm"] == pytest.approx(np.max(means))
+    assert document["errors"][0]["std_mm"] == 0
+
+
+def test_evaluation_counts_held_back_presses_of_its_own_recording_and_all_of_another(
+    calibrated: tuple[Localizer, dict], recording: Recording
+) -> None:
+    localizer, document = calibrated
+    own = evaluate(localizer, recording, [0, 2])
+    assert own["errors"] == [document["errors"][0], document["errors"][2]]
+    assert own["split"] == "random"
+    other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
+    assert other["test_presses"] == 300
+    assert other["split"] == "none"
+    with pytest.raises(InputError, match="lost is 4, allowed is 0 to 3"):
+        evaluate(localizer, recording, [4])
+
+
+@given(fibres=st.integers(1, 40), lost=st.integers(0, 3))
+def test_lost_fibres_come_in_different_sets_of_the_size(fibres: int, lost: int) -> None:
+    subsets = lost_subsets(fibres, min(lost, fibres))
+    assert len(set(subsets)) == len(subsets) <= 256
+    assert all(len(set(subset)) == min(lost, fibres) and max(subset, default=0) < fibres for subset in subsets)
+
+
+def test_options_out_of_range_are_refused(recording: Recording) -> None:
+    with pytest.raises(InputError, match=r"\[localizer\] split: got 'alphabetical'"):
+        calibrate(recording, SHORT, split="alphabetical")
+    with pytest.raises(InputError, match="holds 0 back"):
+        calibrate(recording, SHORT.model_copy(update={"test_share": 1e-4}))
+
+
+def test_published_inputs_can_be_learnt_from_too(recording: Recording) -> None:
+    localizer, document = calibrate(recording, SHORT.model_copy(update={"features": "published"}))
+    assert localizer.scaling.centre.shape == (4, 3)
+    assert np.isfinite(document["errors"][0]["mean_mm"])
+
+
+def test_a_short_training_on_the_published_recording_is_already_near(published: Path) -> None:
+    recording = import_mat(published / "para5_long_first4500.mat")
+    _, document = calibrate(recording, Options(members=1, hidden=96, epochs=25, lost=1))
+    assert document["test_presses"] == 675
+    assert document["errors"][0]["mean_mm"] < 2.4

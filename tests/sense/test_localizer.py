@@ -1,0 +1,138 @@
+"""The network and the localizer: NumPy says what torch says, masks hide, files keep every bit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.errors import InputError
+from sense import Localizer, Recording, network, training
+from sense import settings as sense_settings
+from sense.localizer import Scaling
+from sense.training import draw_alive, one_cycle
+
+
+@given(seed=st.integers(0, 2**32 - 1), members=st.integers(1, 3), layers=st.integers(1, 4))
+def test_numpy_and_torch_agree(seed: int, members: int, layers: int) -> None:
+    options = sense_settings.Localizer(members=members, layers=layers, hidden=24)
+    generator = torch.Generator().manual_seed(seed)
+    weights = training.initial(3 * 5 + 3, options, generator)
+    inputs = torch.randn(members, 7, 3, 5, generator=generator)
+    alive = torch.rand(members, 7, 3, generator=generator) < 0.6
+    expected = training.forward(weights, training.masked(inputs, alive)).detach().numpy()
+    plain = {name: weight.detach().numpy() for name, weight in weights.items()}
+    for member in range(members):
+        found = network.forward(plain, network.masked(inputs[member].numpy(), alive[member].numpy()))
+        assert found.dtype == np.float32
+        assert np.allclose(found[member], expected[member], atol=2e-5)
+
+
+@given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
+def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed: int) -> None:
+    lost = min(lost, fibres - 1)
+    alive = draw_alive(2, 400, fibres, lost, torch.Generator().manual_seed(seed))
+    gone = (~alive).sum(dim=2)
+    assert gone.max() <= lost
+    assert set(gone.unique().tolist()) == set(range(lost + 1))
+
+
+def test_the_rate_rises_once_and_ends_at_nothing() -> None:
+    rates = np.array([one_cycle(share) for share in np.linspace(0, 1, 101)])
+    assert rates.max() == 1
+    assert rates[-1] == pytest.approx(0)
+    peak = int(rates.argmax())
+    assert (np.diff(rates[: peak + 1]) > 0).all()
+    assert (np.diff(rates[peak:]) < 0).all()
+
+
+def test_a_masked_fibre_changes_nothing(localizer: Localizer, recording: Recording) -> None:
+    inputs = localizer.inputs(recording)
+    spoilt = inputs.copy()
+    spoilt[:, 1] = np.nan
+    assert np.array_equal(localizer.places(spoilt, [1]), localizer.places(inputs, [1]))
+    assert not np.array_equal(localizer.places(inputs, [1]), localizer.places(inputs))
+
+
+def test_a_press_is_located_alone_as_among_others(localizer: Localizer, recording: Recording) -> None:
+    inputs = localizer.inputs(recording)
+    assert np.allclose(localizer.places(inputs[17:18]), localizer.places(inputs)[17:18], atol=1e-4)
+    assert localizer.places(inputs[:0]).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("lost", "message"), [([4], "lost fibre 4: no such fibre"), ([-1], "lost fibre -1"), ([0, 1, 2, 3], "all 4 fibres")]
+)
+def test_masks_that_cannot_be_are_refused(
+    localizer: Localizer, recording: Recording, lost: list[int], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        localizer.places(localizer.inputs(recording), lost)
+
+
+def test_files_keep_every_bit(localizer: Localizer, recording: Recording, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    found = Localizer.load(tmp_path)
+    assert all(np.array_equal(found.weights[name], weight) for name, weight in localizer.weights.items())
+    inputs = localizer.inputs(recording)
+    assert np.array_equal(found.inputs(recording), inputs)
+    assert np.array_equal(found.places(inputs, [2]), localizer.places(inputs, [2]))
+    assert found.errors == localizer.errors
+    assert found.test == localizer.test
+    found.save(tmp_path / "again")
+    for name in ("localizer.json", "localizer.safetensors"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
+
+
+def test_files_that_do_not_belong_together_are_refused(localizer: Localizer, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    weights = tmp_path / "localizer.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4])
+    with pytest.raises(InputError, match=r"not the weights that localizer\.json was written with"):
+        Localizer.load(tmp_path)
+    weights.unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        Localizer.load(tmp_path)
+
+
+@pytest.mark.parametrize(("key", "value"), [("features", "smell"), ("scaling", {}), ("rate_hz", None)])
+def test_a_document_that_is_no_localizer_is_refused(
+    localizer: Localizer, tmp_path: Path, key: str, value: object
+) -> None:
+    localizer.save(tmp_path)
+    document = json.loads((tmp_path / "localizer.json").read_text())
+    (tmp_path / "localizer.json").write_text(json.dumps(document | {key: value}))
+    with pytest.raises(InputError, match=r"localizer\.json"):
+        Localizer.load(tmp_path)
+
+
+def test_recordings_that_do_not_suit_are_refused(localizer: Localizer, recording: Recording) -> None:
+    fewer = Recording(
+        recording.readings[:, :3], recording.times_s, recording.presses_mm, recording.begun, recording.lifted
+    )
+    with pytest.raises(InputError, match="3 fibres, the localizer was trained on 4"):
+        localizer.inputs(fewer)
+    faster = Recording(
+        recording.readings, recording.times_s / 2, recording.presses_mm, recording.begun, recording.lifted
+    )
+    with pytest.raises(InputError, match="readings a second"):
+        localizer.inputs(faster)
+
+
+@given(seed=st.integers(0, 999), gain=st.floats(1e-3, 1e3))
+def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None:
+    rng = np.random.default_rng(seed)
+    inputs, places = rng.standard_normal((30, 3, 4)), rng.uniform(-9, 9, (30, 2))
+    plain, scaled = Scaling.fit(inputs, places), Scaling.fit(gain * inputs, places)
+    assert np.allclose(plain.inputs(inputs), scaled.inputs(gain * inputs), atol=1e-4)
+    assert np.abs(plain.targets(places)).max() <= 1 + 1e-6
+    assert np.allclose(plain.places_mm(plain.targets(places)), places, atol=1e-5)
+
+
+def test_a_dead_fibre_is_scaled_to_finite_numbers() -> None:
+    inputs = np.zeros((10, 2, 3))
+    inputs[:, 0] = np.random.default_rng(0).standard_normal((10, 3))
+    assert np.isfinite(Scaling.fit(inputs, np.zeros((10, 2))).inputs(inputs)).all()
