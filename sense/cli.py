@@ -1,12 +1,12 @@
 """`padforge sense`: the edge where recordings come in and places go out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
+from design.console import json_option, load_spec, progress, seed_option, show_result, spec_option
 
 if TYPE_CHECKING:
     from design.morphology import Morphology
@@ -18,9 +18,14 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
 recording_argument = click.argument("recording", type=_FOLDER)
-recording_out_option = click.option(
-    "--out", type=_FOLDER, required=True, help="Folder of the recording; must be new or empty."
-)
+
+
+def recording_out_option(default: str) -> Callable[..., Any]:
+    """`--out DIR`, the run directory that is written."""
+    note = f"Folder of the recording; must be new or empty (default: {default})."
+    return click.option("--out", type=_FOLDER, help=note)
+
+
 model_option = click.option("--model", type=_FOLDER, required=True, help="Folder that calibrate wrote.")
 
 
@@ -51,11 +56,11 @@ def sense() -> None:
 @click.option("--presses", type=int, help="Presses to record.")
 @seed_option
 @spec_option
-@recording_out_option
+@recording_out_option("out/pad/recording")
 def record(
-    rig: str, morphology: Path | None, presses: int | None, seed: int | None, spec: Path | None, out: Path
+    rig: str, morphology: Path | None, presses: int | None, seed: int | None, spec: Path | None, out: Path | None
 ) -> None:
-    """Record presses at random places; only the simulated rig is there yet."""
+    """Record presses at random places on a simulated pad."""
     from design.morphology import Morphology
     from design.settings import Pad
 
@@ -63,8 +68,9 @@ def record(
     of_pad = settings.section(Pad)
     pad = Morphology.load(morphology) if morphology else Morphology.straight(of_pad.grid, of_pad.pitch_mm)
     inputs = [path for path in (morphology, spec) if path is not None]
-    recording = run_recording(settings, pad, out, {"presses": presses, "seed": seed}, inputs)
-    click.echo(_describe(recording, out))
+    folder = out or Path("out/pad/recording")
+    recording = run_recording(settings, pad, folder, {"presses": presses, "seed": seed}, inputs)
+    click.echo(_describe(recording, folder))
 
 
 def run_recording(
@@ -87,8 +93,8 @@ def run_recording(
 
 @sense.command("import")
 @click.argument("file", type=_FILE)
-@recording_out_option
-def import_(file: Path, out: Path) -> None:
+@recording_out_option("out/NAME/recording for NAME.mat")
+def import_(file: Path, out: Path | None) -> None:
     """Make a recording of FILE, a published .mat or a .csv.
 
     \b
@@ -104,10 +110,11 @@ def import_(file: Path, out: Path) -> None:
     readers = {".mat": import_mat, ".csv": import_csv}
     if file.suffix.lower() not in readers:
         raise InputError(f"{file}: ends in {file.suffix!r}, allowed are {', '.join(readers)}")
-    refuse_existing(out)
+    folder = out or Path("out") / file.stem / "recording"
+    refuse_existing(folder)
     recording = readers[file.suffix.lower()](file)
-    recording.save(out, provenance("padforge sense import", inputs=[file]))
-    click.echo(_describe(recording, out))
+    recording.save(folder, provenance("padforge sense import", inputs=[file]))
+    click.echo(_describe(recording, folder))
 
 
 @sense.command()
@@ -115,16 +122,17 @@ def import_(file: Path, out: Path) -> None:
 @click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
 @seed_option
 @spec_option
-@out_option()
+@click.option("--out", type=_FOLDER, help="Folder for the results (default: the one RECORDING lies in).")
 @json_option
 def calibrate(
-    recording: Path, test_split: str | None, seed: int | None, spec: Path | None, out: Path, as_json: bool
+    recording: Path, test_split: str | None, seed: int | None, spec: Path | None, out: Path | None, as_json: bool
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
 
     Writes localizer.safetensors, localizer.json, calibration.json, error_map.png and error_by_loss.png.
     """
-    document = run_calibration(load_spec(spec), _open(recording), out, {"split": test_split, "seed": seed})
+    overrides = {"split": test_split, "seed": seed}
+    document = run_calibration(load_spec(spec), _open(recording), out or recording.parent, overrides)
     show_result(document, summary(document), as_json)
 
 
