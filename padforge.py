@@ -108,11 +108,12 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> bool:
 
 def _make_way(recorded: Path) -> None:
     """Remove an earlier simulated recording, which the same seed gives again; one of a real pad is never touched."""
-    from sense import Recording
+    from design.files import read_json
+    from sense.recording import FORMAT, START
 
     if not recorded.exists():
         return
-    kind = Recording.open(recorded).source.get("kind")
+    kind = read_json(recorded / START, FORMAT).get("source", {}).get("kind")
     if kind != "simulated":
         raise InputError(f"{recorded}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
     shutil.rmtree(recorded)

@@ -12,6 +12,7 @@ from scipy.interpolate import PchipInterpolator
 
 from design.errors import InputError
 from design.morphology import Morphology
+from design.palette import HORIZONTAL, VERTICAL
 from fabricate import export, printability
 from fabricate.drawings import tracks_svg
 from fabricate.export import FILES, build
@@ -109,8 +110,8 @@ def test_png_shows_the_ridges_in_the_colours_of_their_families(built):
     out, _ = built
     with Image.open(out / "mould.png") as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
-    for colour in ((0xE0, 0x7B, 0x39), (0x3F, 0x6F, 0xB5)):
-        assert (np.abs(pixels - colour).max(axis=2) < 8).mean() > 0.003
+    for colour in (HORIZONTAL, VERTICAL):
+        assert (np.abs(pixels - [int(colour[i : i + 2], 16) for i in (1, 3, 5)]).max(axis=2) < 8).mean() > 0.003
 
 
 def test_the_document_has_what_a_lab_needs(built):
