@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from design.cli import design
-from design.console import load_spec, out_option, seed_option, spec_option
+from design.console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
 from design.errors import InputError
 from fabricate.cli import fabricate
 from sense.cli import sense
@@ -72,6 +72,25 @@ def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) 
 def report(folder: Path) -> None:
     """Write report.html for the pad in FOLDER: whatever its stages have left there, on one page."""
     click.echo(f"report: {write_report(folder)}")
+
+
+@cli.command()
+@click.argument("name", type=click.Choice(["contact", "objective"]))
+@out_option("out/bench")
+@json_option
+def bench(name: str, out: Path, as_json: bool) -> None:
+    """Measure run time against error, beside plain ways of doing the same.
+
+    Writes NAME.json, NAME.csv and NAME.png.
+    """
+    from design.bench import bench_contact, bench_objective
+    from design.bench_table import lines
+
+    run_bench = {"contact": bench_contact, "objective": bench_objective}[name]
+    with progress() as bar:
+        task = bar.add_task(name, total=None, note="")
+        document = run_bench(out, lambda step: bar.update(task, note=step))
+    show_result(document, lines(document), as_json)
 
 
 def _sections() -> "dict[str, type[Section]]":

@@ -1,5 +1,6 @@
 from .contact import signals as signals
 from .contact import signals_quantized as signals_quantized
+from .contact import signals_sparse as signals_sparse
 from .curves import crossings as crossings
 from .curves import flatten as flatten
 from .errors import InputError as InputError

@@ -4,18 +4,22 @@ A press deforms a regular polygon around its centre; a fibre signals the weighte
 """
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
-from .kernels.exact import exact_signals, family_strays
+from .kernels.exact import count_touched, exact_signals, family_strays
 from .kernels.pchip import population_slopes
 from .kernels.press import EUCLIDEAN, INVERSE, INVERSE_SQUARE, MANHATTAN, UNIFORM
 from .kernels.quantized import quantized_signals
 from .morphology import Morphology
 from .settings import Contact
 from .threads import in_chunks
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 
@@ -46,41 +50,85 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
 
 def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
     """`signals`, and the number of spans that were looked at for them."""
+    travel, cross, batch = fibre_axes(pad)
+    places = np.asarray(presses, dtype=np.float64)
+    contacts = places.shape[1] if places.ndim == 3 else 1
+    flat = as_presses(places.reshape(-1, places.shape[-1]) if places.ndim == 3 else places)
+    fibres = travel.shape[1]
+    out = np.zeros(len(travel) * len(flat) * fibres)
+    visited = _run_exact(travel, cross, family_strays(cross), flat, contact, _NONE, _NONE, out)
+    result = out.reshape(len(travel), -1, contacts, fibres).sum(axis=2) if contacts > 1 else out
+    return result.reshape(*batch, -1, fibres), visited
+
+
+def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
+    """`signals` of one pad as a sparse (Q, 2M) matrix: time and memory follow what is touched, not the pad's size.
+
+    Args:
+        pad, contact: as in `signals`. presses: (Q, 2) centres in grid units.
+    """
+    from scipy.sparse import csr_array
+
+    contact = contact or Contact()
+    travel, cross, _ = fibre_axes(pad)
+    places, strays = as_presses(presses), family_strays(cross)
+    starts = count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
+    fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
+    _run_exact(travel, cross, strays, places, contact, starts, fibre, signal)
+    found = csr_array((signal, fibre, starts), shape=(len(places), 2 * pad.grid))
+    found.eliminate_zeros()
+    return found
+
+
+_NONE = np.empty(0, np.int64)
+
+
+def _run_exact(
+    travel: Array,
+    cross: Array,
+    strays: Array,
+    places: Array,
+    contact: Contact,
+    starts: NDArray[np.int64],
+    fibre: NDArray[np.int64],
+    signal: Array,
+) -> int:
+    """`exact_signals` over the cores."""
+    slope, shape = population_slopes(travel, cross), press_shape(contact)
+
+    def work(begin: int, end: int) -> int:
+        return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, signal)
+
+    return sum(in_chunks(work, len(travel) * len(places), grain=2000))
+
+
+def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
+    """Travel and cross coordinates (P, 2M, n) of a pad or a population, and the population's own shape."""
     knots = pad.knots if isinstance(pad, Morphology) else np.asarray(pad, dtype=np.float64)
     batch = knots.reshape(-1, *knots.shape[-3:])
     grid = batch.shape[1] // 2
     travel, cross = (
-        np.ascontiguousarray(np.concatenate([batch[:, :grid, :, axis], batch[:, grid:, :, 1 - axis]], axis=1))
-        for axis in (0, 1)
+        np.concatenate([batch[:, :grid, :, axis], batch[:, grid:, :, 1 - axis]], axis=1) for axis in (0, 1)
     )
-    slope, strays = population_slopes(travel, cross), family_strays(cross)
-    places = np.asarray(presses, dtype=np.float64)
-    contacts = places.shape[1] if places.ndim == 3 else 1
-    flat = as_presses(places.reshape(-1, places.shape[-1]) if places.ndim == 3 else places)
+    return travel, cross, knots.shape[:-3]
+
+
+def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, float, int, int]:
+    """A contact as the kernels take it: chains and extents in the frame of each family, radius, weight, length."""
     chains, reach = _frames(contact.radius, contact.sides)
-    weight, length = _WEIGHTS[contact.weight], _LENGTHS[contact.length]
-    out = np.zeros((len(batch), len(flat), 2 * grid))
-
-    def work(begin: int, end: int) -> int:
-        return exact_signals(
-            travel, cross, slope, strays, flat, chains, reach, contact.radius, weight, length, begin, end, out
-        )
-
-    visited = sum(in_chunks(work, len(batch) * len(flat), grain=2000))
-    result = out.reshape(len(batch), -1, contacts, 2 * grid).sum(axis=2) if contacts > 1 else out
-    return result.reshape(*knots.shape[:-3], *result.shape[1:]), visited
+    return chains, reach, contact.radius, _WEIGHTS[contact.weight], _LENGTHS[contact.length]
 
 
 @lru_cache(maxsize=64)
 def _frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
-    """The press's shape in the frame of each family: chains (3, B) of breakpoints t, upper v, lower v; extents (2, 4).
+    """The press's shape in the frame of each family: chains (3, B) of breakpoints t, upper v, lower v; extents (2, 5).
 
     A circle has no breakpoints. At t a polygon reaches up to the lowest of its upper edges' lines and down to the
     highest of its lower ones.
     """
     if sides is None:
         empty = np.empty((3, 0))
-        return (empty, empty), radius * np.tile([-1.0, 1.0, -1.0, 1.0], (2, 1))
+        return (empty, empty), radius * np.tile([-1.0, 1.0, -1.0, 1.0, 1.0], (2, 1))
     corner = 2 * np.pi * np.arange(sides) / sides
     normal = corner + np.pi / sides
     apothem = np.cos(np.pi / sides)
@@ -93,7 +141,7 @@ def _frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Arra
         upper = np.where(across > 1e-12, edge, np.inf).min(axis=1)
         lower = np.where(across < -1e-12, edge, -np.inf).max(axis=1)
         chains.append(radius * np.stack([t, upper, lower]))
-        reach.append([t[0], t[-1], lower.min(), upper.max()])
+        reach.append([t[0], t[-1], lower.min(), upper.max(), apothem])
     return (chains[0], chains[1]), radius * np.array(reach)
 
 
@@ -114,20 +162,23 @@ def signals_quantized(
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
-    contact = contact or Contact()
+    return quantized(pad, presses, contact or Contact(), samples)[0]
+
+
+def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int) -> tuple[Array, int]:
+    """`signals_quantized`, and the number of samples that were looked at for them."""
     if samples < 2:
         raise InputError(f"samples is {samples}, allowed is at least 2")
-    knots = pad.knots if isinstance(pad, Morphology) else np.asarray(pad, dtype=np.float64)
-    batch = np.ascontiguousarray(knots.reshape(-1, *knots.shape[-3:]))
+    travel, cross, batch = fibre_axes(pad)
     places = as_presses(presses)
-    weight, length = _WEIGHTS[contact.weight], _LENGTHS[contact.length]
-    out = np.zeros((len(batch), len(places), batch.shape[1]))
+    shape = press_shape(contact)
+    out = np.zeros((len(travel), len(places), travel.shape[1]))
 
-    def work(begin: int, end: int) -> None:
-        quantized_signals(batch, places, contact.radius, contact.sides or 0, weight, length, samples, begin, end, out)
+    def work(begin: int, end: int) -> int:
+        return quantized_signals(travel, cross, places, *shape, samples, begin, end, out)
 
-    in_chunks(work, len(batch) * batch.shape[1], grain=max(1, 100_000 // (samples + 50 * len(places))))
-    return out.reshape(*knots.shape[:-3], *out.shape[1:])
+    looked_at = sum(in_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
+    return out.reshape(*batch, *out.shape[1:]), looked_at
 
 
 def as_presses(presses: ArrayLike) -> Array:

@@ -1,14 +1,17 @@
 """What a search minimises: the published objective, for the genetic search and for comparison."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .contact import boustrophedon, signals_quantized
-from .information import disorder, joint_entropy, quantize, sharpness
+from .contact import as_presses, boustrophedon, fibre_axes, press_shape
+from .information import LEVELS
+from .kernels.information import published_terms as terms_kernel
 from .morphology import Morphology
 from .settings import Contact
+from .threads import in_chunks
 
 
 @dataclass(frozen=True)
@@ -28,9 +31,12 @@ class PublishedTerms:
     objective: float
 
 
+@lru_cache(maxsize=16)
 def published_presses(grid: int, side: int = 7) -> NDArray[np.float64]:
     """The (side^2, 2) presses the published search samples: a serpentine over 1..M, jittered by U(0, 2/49)."""
-    return boustrophedon(grid, side, jitter=2 / 49)
+    places = boustrophedon(grid, side, jitter=2 / 49)
+    places.setflags(write=False)
+    return places
 
 
 def published_terms(
@@ -48,17 +54,18 @@ def published_terms(
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
     """
-    grid = knots.shape[1] // 2
-    places = published_presses(grid) if presses is None else presses
+    travel, cross, _ = fibre_axes(knots)
+    grid = travel.shape[1] // 2
+    places = as_presses(published_presses(grid) if presses is None else presses)
+    shape = press_shape(contact or Contact())
+    found = np.zeros((len(knots), 3))
+
+    def work(begin: int, end: int) -> None:
+        terms_kernel(travel, cross, places, *shape, samples, LEVELS, begin, end, found)
+
+    in_chunks(work, len(knots), grain=8)
     alpha, beta, gamma = weights
-    found = []
-    crossing = disorder(knots, samples)
-    for signals, c in zip(signals_quantized(knots, places, contact, samples), crossing, strict=True):
-        levels = quantize(signals)
-        entropy = joint_entropy(levels[:, :grid]) + joint_entropy(levels[:, grid:])
-        z = sharpness(levels)
-        found.append(PublishedTerms(entropy, z, float(c), alpha / (1 + entropy) + beta * z + gamma * float(c)))
-    return found
+    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
 
 
 def published_objective(

@@ -190,7 +190,8 @@ def fibre_signal(
     """Signal of one fibre for the press at (ct, cv), and how many spans were looked at.
 
     Args:
-        t, v, d: (n,) knots and slopes. reach: (4,) extent of the shape: least and greatest t, least and greatest v.
+        t, v, d: (n,) knots and slopes.
+        reach: (5,) of the shape: least and greatest t, least and greatest v, radius of the circle inside.
     """
     n = len(t)
     begin, end = ct + reach[0], ct + reach[1]
@@ -231,6 +232,29 @@ def family_strays(cross: Any) -> Any:
     return out
 
 
+@njit(cache=True, error_model="numpy")
+def touched_range(cv: float, reach: Any, stray: float, grid: int) -> tuple[int, int]:
+    """Fibres [first, end) of a family, by index, that a press at cross coordinate cv can touch.
+
+    Fibre i (from 0) keeps to level i + 1 within the family's stray.
+    """
+    first = min(max(math.ceil(cv + reach[2] - stray) - 1, 0.0), float(grid))
+    end = min(max(math.floor(cv + reach[3] + stray), 0.0), float(grid))
+    return int(first), int(end)
+
+
+@njit(cache=True, error_model="numpy")
+def count_touched(strays: Any, presses: Any, reach: Any, grid: int) -> Any:
+    """(Q + 1,) running number of fibres that presses (Q, 2) can touch on one pad with strays (2,)."""
+    starts = np.zeros(len(presses) + 1, np.int64)
+    for q in range(len(presses)):
+        starts[q + 1] = starts[q]
+        for family in range(2):
+            first, end = touched_range(presses[q, 1 - family], reach[family], strays[family], grid)
+            starts[q + 1] += max(end - first, 0)
+    return starts
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def exact_signals(
     travel: Any,
@@ -245,29 +269,32 @@ def exact_signals(
     length: int,
     begin: int,
     end: int,
-    out: Any,
+    starts: Any,
+    fibre: Any,
+    signal: Any,
 ) -> int:
-    """Signals of pads for presses into out (P, Q, 2M), zeros before; returns how many spans were looked at.
-
-    A family's fibres keep to their level within its stray, so those a press can touch are an index range.
+    """Signals of pads for presses, only of fibres a press can touch; returns how many spans were looked at.
 
     Args:
         travel, cross, slope: (P, 2M, n) knots and slopes. strays: (P, 2) of `family_strays`.
         presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
-        chains: two (3, B), reach: (2, 4): the shape in the frame of each family.
+        chains: two (3, B), reach: (2, 5): the shape in the frame of each family.
+        starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
+            `signal`; or empty for dense signals (P Q 2M,), zeros before.
     """
-    grid = travel.shape[1] // 2
+    fibres = travel.shape[1]
+    grid = fibres // 2
     span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     visited = 0
     for index in range(begin, end):
         p, q = index // len(presses), index % len(presses)
+        slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
             shape = chains[0] if family == 0 else chains[1]
-            first = min(max(math.ceil(cv + reach[family, 2] - strays[p, family]) - 1, 0.0), float(grid))
-            last = min(max(math.floor(cv + reach[family, 3] + strays[p, family]), 0.0), float(grid))
-            for f in range(family * grid + int(first), family * grid + int(last)):
-                out[p, q, f], spans = fibre_signal(
+            first, last = touched_range(cv, reach[family], strays[p, family], grid)
+            for f in range(family * grid + first, family * grid + last):
+                value, spans = fibre_signal(
                     travel[p, f],
                     cross[p, f],
                     slope[p, f],
@@ -282,4 +309,9 @@ def exact_signals(
                     scratch,
                 )
                 visited += spans
+                if len(starts):
+                    fibre[slot], signal[slot] = f, value
+                    slot += 1
+                else:
+                    signal[index * fibres + f] = value
     return visited

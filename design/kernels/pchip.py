@@ -1,5 +1,6 @@
 """PCHIP curves: slopes and samples. Arrays in grid units."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -43,15 +44,15 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
     """Values of the PCHIP through (t, v) at 0, step, 2 step, ... into out; the last sample is the last knot."""
     d = np.empty(len(t))
     pchip_slopes(t, v, d)
-    j = 0
-    for i in range(len(out) - 1):
-        x = i * step
-        while j < len(t) - 2 and x >= t[j + 1]:
-            j += 1
-        h = t[j + 1] - t[j]
-        m = (v[j + 1] - v[j]) / h
-        s = (x - t[j]) / h
-        out[i] = v[j] + h * s * (d[j] + s * ((3 * m - 2 * d[j] - d[j + 1]) + s * (d[j] + d[j + 1] - 2 * m)))
+    i = 0
+    for j in range(len(t) - 1):
+        h, rise = t[j + 1] - t[j], v[j + 1] - v[j]
+        a1, a2, a3 = h * d[j], 3 * rise - h * (2 * d[j] + d[j + 1]), h * (d[j] + d[j + 1]) - 2 * rise
+        end = min(math.ceil(t[j + 1] / step), len(out) - 1)
+        while i < end:
+            s = (i * step - t[j]) / h
+            out[i] = v[j] + s * (a1 + s * (a2 + s * a3))
+            i += 1
     out[-1] = v[-1]
 
 

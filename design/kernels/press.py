@@ -1,4 +1,4 @@
-"""The press: what lies inside its shape, and what a fibre element there weighs."""
+"""The press: what a fibre element in it weighs."""
 
 import math
 
@@ -6,22 +6,6 @@ from numba import njit
 
 UNIFORM, INVERSE_SQUARE, INVERSE = 0, 1, 2
 MANHATTAN, EUCLIDEAN = 0, 1
-
-
-@njit(cache=True, error_model="numpy")
-def inside(dx: float, dy: float, radius: float, sides: int) -> bool:
-    """Whether (dx, dy) from the press centre lies in the regular polygon, or the circle where sides is 0."""
-    square = dx * dx + dy * dy
-    if square > radius * radius:
-        return False
-    if sides == 0:
-        return True
-    apothem = radius * math.cos(math.pi / sides)
-    if square <= apothem * apothem:
-        return True
-    wedge = 2 * math.pi / sides
-    middle = (math.floor(math.atan2(dy, dx) / wedge) + 0.5) * wedge
-    return dx * math.cos(middle) + dy * math.sin(middle) <= apothem
 
 
 @njit(cache=True, error_model="numpy")

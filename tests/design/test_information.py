@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.interpolate import PchipInterpolator
 
-from design import Morphology, published_objective
-from design.information import disorder, joint_entropy, quantize, sharpness
+from design import Contact, Morphology, published_objective, signals
+from design.contact import boustrophedon
+from design.information import disorder, disorder_area, idle_share, information, joint_entropy, quantize, sharpness
 from design.objective import published_presses, published_terms
 
 
@@ -74,3 +76,51 @@ def test_published_presses_cover_the_grid():
     assert places.shape == (49, 2)
     assert places.min() >= 1
     assert places.max() <= 4 + 2 / 49
+
+
+def test_disorder_area_is_what_disorder_samples():
+    pad = Morphology.random(4, 6, seed=3)
+    assert disorder(pad.knots, 400_001) * 5 / 400_000 == pytest.approx(disorder_area(pad), rel=1e-6)
+    assert disorder_area(Morphology.straight(4)) == 0
+
+
+def test_disorder_area_of_a_known_bump():
+    """Fibre 1 rises by 2 over a knot in the middle and back: area above fibre 2 between the crossings, by SciPy."""
+    knots = Morphology.straight(2).knots
+    knots = np.insert(knots, 1, (knots[:, 0] + knots[:, 1]) / 2, axis=1)
+    knots[0, 1, 1] = 3.0
+    curve = PchipInterpolator(knots[0, :, 0], knots[0, :, 1])
+    at = np.linspace(0, 3, 300_001)
+    expected = np.trapezoid(np.maximum(curve(at) - 2, 0), at)
+    assert disorder_area(Morphology(knots)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("name", "share"), [("square_grid_cir", 0.70), ("5para_dis", 0.58)])
+def test_idle_share_of_the_published_pads(published, name, share):
+    """Table III of the paper: 70 % and 57 % in simulation."""
+    places = boustrophedon(4, 32, 5 / 49)
+    assert idle_share(signals(Morphology.load(published / f"{name}.mat"), places)) == pytest.approx(share, abs=0.01)
+
+
+def test_idle_share_counts_changes_within_the_threshold():
+    changes = np.array([[0.0, 0.0], [0.01, 1.0], [1.0, 0.0]])
+    assert idle_share(changes) == pytest.approx(0.5)
+    assert idle_share(changes, threshold=0.02) == pytest.approx(4 / 6)
+
+
+def test_information_does_not_stop_at_the_number_of_presses():
+    """Each tenfold drop in noise adds log2 10 bits along both axes, where the pad tells all places apart."""
+    pad = Morphology.random(4, 20, seed=0)
+    coarse, fine = information(pad, noise=1.0), information(pad, noise=0.1)
+    assert fine > np.log2(400)
+    assert fine - coarse == pytest.approx(2 * np.log2(10), rel=0.05)
+
+
+def test_information_falls_with_noise_to_nothing():
+    pad = Morphology.random(4, 5, seed=0)
+    found = [information(pad, noise=noise) for noise in (1, 10, 100, 1e6)]
+    assert found == sorted(found, reverse=True)
+    assert found[-1] == pytest.approx(0, abs=0.01)
+    assert information(Morphology.straight(4), Contact(radius=1e-9, sides=None), noise=1e6) == pytest.approx(
+        0, abs=0.01
+    )
