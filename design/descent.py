@@ -18,17 +18,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .differentiable import pchip_sample, smooth_signals
+from .differentiable import ExactSignals, pchip_sample, pchip_slopes
 from .morphology import MARGIN, Morphology, assemble
 from .settings import Contact, Pad, Rules, Search
 
 Array = NDArray[np.float64]
 
 SIDE = 14  # presses per row and column of the stratified sample a step looks at
-SAMPLES_PER_UNIT = 36  # of a fibre; the rules see DENSER times as many
-DENSER = 3
+SAMPLES_PER_UNIT = 108  # of a fibre, for the rules
 NOISE = (0.30, 0.06)  # sigma, grid units of signal, annealed from first to last step
-SOFTNESS = (0.15, 0.04)  # width of the press's edge, annealed likewise
 RATE = 0.06
 PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
 
@@ -134,22 +132,21 @@ def descend(
     fibres = Fibres(pad, search, rules, rng)
     optimiser = torch.optim.Adam(fibres.parameters(), lr=RATE)
     extent = pad.grid + 1
-    samples = SAMPLES_PER_UNIT * DENSER * extent + 1
-    fine = extent / (samples - 1)
+    samples = SAMPLES_PER_UNIT * extent + 1
     at = torch.linspace(0, extent, samples, dtype=torch.float64)
     for number in range(search.steps):
         progress = number / max(1, search.steps - 1)
-        sigma, softness, weight = (_anneal(*ends, progress) for ends in (NOISE, SOFTNESS, PENALTY))
+        sigma, weight = (_anneal(*ends, progress) for ends in (NOISE, PENALTY))
         for group in optimiser.param_groups:
             group["lr"] = RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
-        presses = torch.tensor(_stratified(pad.grid, rng), dtype=torch.float32)
+        places = _stratified(pad.grid, rng)
         kept = torch.tensor(_losses(2 * pad.grid, search.lost, rng), dtype=torch.float32)
         travel, cross = fibres()
-        curve, slope = pchip_sample(travel, cross, at)
-        coarse = curve[None, :, ::DENSER].float()
-        signals = smooth_signals(coarse, DENSER * fine, presses, _disc_radius(contact), softness)[0]
-        spread = ambiguity(signals, presses, kept, sigma)
-        broken = penalty(curve, slope, fine, pad, rules) if rules.enforce else torch.zeros(())
+        signals = ExactSignals.apply(travel, cross, pchip_slopes(travel, cross), places, contact)
+        spread = ambiguity(signals.float(), torch.tensor(places, dtype=torch.float32), kept, sigma)
+        broken = torch.zeros(())
+        if rules.enforce:
+            broken = penalty(*pchip_sample(travel, cross, at), extent / (samples - 1), pad, rules)
         optimiser.zero_grad()
         (spread + weight * broken).backward()
         optimiser.step()
@@ -160,14 +157,6 @@ def descend(
 def _anneal(first: float, last: float, progress: float) -> float:
     """From the first value to the last along a geometric path."""
     return first * (last / first) ** progress
-
-
-def _disc_radius(contact: Contact) -> float:
-    """Radius of the disc with the area of the press's polygon."""
-    if contact.sides is None:
-        return contact.radius
-    wedge = 2 * math.pi / contact.sides
-    return contact.radius * math.sqrt(math.sin(wedge) / wedge)
 
 
 def _stratified(grid: int, rng: np.random.Generator) -> Array:

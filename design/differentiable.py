@@ -1,7 +1,15 @@
-"""The fibres and a smoothed contact model in torch: what the gradient search differentiates."""
+"""The fibres and their exact signals in torch: what the gradient search differentiates."""
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
+
+from .contact import press_shape
+from .kernels.exact import exact_signals, family_strays
+from .kernels.gradient import signals_gradient
+from .settings import Contact
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
@@ -43,27 +51,27 @@ def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
     return v0 + h * s * (d0 + s * (c2 + s * c3)), d0 + s * (2 * c2 + 3 * s * c3)
 
 
-def smooth_signals(cross: Tensor, step: float, presses: Tensor, radius: float, softness: float) -> Tensor:
-    """Signals of sampled fibres with a soft edge of the press: uniform Manhattan length, a disc of `radius`.
+class ExactSignals(torch.autograd.Function):
+    """The exact signals of one pad as a torch function of its knots and slopes, with their analytic gradient.
 
-    Args:
-        cross: (B, 2M, F) cross coordinates at travel 0, step, 2 step, ...
-        presses: (Q, 2) places.
-        softness: width of the edge, grid units; towards 0 the signals become the quantised ones of a circle.
-
-    Returns:
-        (B, 2M, Q) signals in grid units.
+    `ExactSignals.apply(travel, cross, slope, presses, contact)`: travel, cross, slope (2M, n) float64, presses (Q, 2)
+    numpy; gives (2M, Q).
     """
-    grid = cross.shape[1] // 2
-    travel = torch.arange(cross.shape[2], dtype=cross.dtype) * step
-    run = step + cross.diff(dim=-1).abs()
-    families = []
-    for family in range(2):
-        rows = slice(family * grid, (family + 1) * grid)
-        near = (travel[:-1] + step / 2 - presses[:, family, None]) ** 2  # (Q, F-1)
-        middle = (cross[:, rows, 1:] + cross[:, rows, :-1]) / 2
-        square = near + (middle[:, :, None, :] - presses[:, 1 - family, None]) ** 2
-        # sqrt-free edge: K^2 - r^2 over 2 K is the distance to the edge to first order
-        share = torch.sigmoid((radius**2 - square) / (2 * radius * softness))
-        families.append((share * run[:, rows, None, :]).sum(dim=-1))
-    return torch.cat(families, dim=1)
+
+    @staticmethod
+    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Any, contact: Contact) -> Tensor:
+        """Signals (2M, Q) in grid units."""
+        t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
+        shape, strays, none = press_shape(contact), family_strays(v[None]), np.empty(0, np.int64)
+        ctx.inputs = (t, v, d, strays[0], presses, shape)
+        out = np.zeros(len(presses) * len(t))
+        begin, end = 0, len(presses)
+        exact_signals(t[None], v[None], d[None], strays, presses, *shape, begin, end, none, none, out)
+        return torch.from_numpy(out.reshape(-1, len(t)).T)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient by travel, cross and slope."""
+        t, v, d, strays, presses, shape = ctx.inputs
+        found = signals_gradient(t, v, d, strays, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
+        return (*torch.from_numpy(found), None, None)

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from .contact import signals_quantized
+from .contact import boustrophedon, signals
+from .information import idle_share, information
 from .morphology import Morphology
 from .objective import published_terms
 from .rules import Violation, check
@@ -45,7 +46,8 @@ def score(pad: Morphology, contact: Contact, lost: int = 2) -> dict[str, float]:
     """Every term of a pad, by name.
 
     `ambiguity_lost_k` is the expected localisation error in grid units (formula of `descent`) over all losses of k
-    fibres, with the published signals on a regular grid of presses; the rest are the published terms.
+    fibres, on a regular grid of presses; `information` is that of the pad in bits (formula there), `idle_share` the
+    share of presses in which a fibre is idle; the rest are the published terms.
     """
     import torch
 
@@ -53,7 +55,7 @@ def score(pad: Morphology, contact: Contact, lost: int = 2) -> dict[str, float]:
 
     line = np.linspace(1, pad.grid, SCORING_SIDE) if pad.grid > 1 else np.linspace(0.5, 1.5, SCORING_SIDE)
     presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    signals = torch.tensor(signals_quantized(pad, presses, contact).T, dtype=torch.float32)
+    found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
     fibres = 2 * pad.grid
     terms = {}
     for k in range(min(lost, fibres - 1) + 1):
@@ -62,8 +64,10 @@ def score(pad: Morphology, contact: Contact, lost: int = 2) -> dict[str, float]:
         for loss in losses:
             kept = torch.ones(1, fibres)
             kept[0, list(loss)] = 0
-            total += ambiguity(signals, torch.tensor(presses, dtype=torch.float32), kept, NOISE[1]).item()
+            total += ambiguity(found, torch.tensor(presses, dtype=torch.float32), kept, NOISE[1]).item()
         terms[f"ambiguity_lost_{k}"] = total / len(losses)
+    serpentine = boustrophedon(pad.grid, 32, 5 / 49)
+    terms |= {"information": information(pad, contact), "idle_share": idle_share(signals(pad, serpentine, contact))}
     published = asdict(published_terms(pad.knots[None], contact)[0])
     return terms | {f"published_{name}": value for name, value in published.items()}
 

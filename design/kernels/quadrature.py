@@ -44,7 +44,7 @@ _GAUSS = np.array(
         0.417959183673469387755102040816327,
     ]
 )
-_PRECISION = 1e-11
+PRECISION = 1e-11
 HALVINGS = 48
 
 
@@ -66,7 +66,7 @@ def _density(span: Any, s: float, radius: float, weight: int, length: int) -> fl
 
 
 @njit(cache=True, error_model="numpy")
-def _kronrod(span: Any, a: float, b: float, radius: float, weight: int, length: int) -> tuple[float, float]:
+def kronrod(span: Any, a: float, b: float, radius: float, weight: int, length: int) -> tuple[float, float]:
     """15-point Kronrod integral over [a, b] and its error estimate (difference to 7-point Gauss, sharpened)."""
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
     centre = _density(span, middle, radius, weight, length)
@@ -92,8 +92,8 @@ def measure(span: Any, a: float, b: float, radius: float, weight: int, length: i
     top = 0
     while top >= 0:
         low, high = stack[top]
-        part, error = _kronrod(span, low, high, radius, weight, length)
-        if error <= _PRECISION or top >= HALVINGS:
+        part, error = kronrod(span, low, high, radius, weight, length)
+        if error <= PRECISION or top >= HALVINGS:
             total += part
             top -= 1
         else:

@@ -1,13 +1,10 @@
 """Both searches: they improve, obey the rules, and depend on the seed alone."""
 
-import numpy as np
 import pytest
 import torch
 
 from design import Contact, Morphology, search
 from design.descent import ambiguity
-from design.differentiable import smooth_signals
-from design.kernels.pchip import sample_curves
 from design.search import score
 from design.settings import Pad, Rules, Search
 
@@ -67,14 +64,3 @@ def test_a_lost_fibre_tells_nothing():
     signals = torch.tensor([[0.0, 9.0], [0.0, 0.0]])
     kept = torch.tensor([[0.0, 1.0]])
     assert ambiguity(signals, presses, kept, sigma=0.1).item() == pytest.approx(0.5)
-
-
-def test_soft_signals_approach_the_quantised_ones():
-    from design import signals_quantized
-
-    pad = Morphology.random(3, 4, seed=2)
-    presses = np.random.default_rng(0).uniform(1, 3, (20, 2))
-    cross = torch.tensor(sample_curves(pad.knots[None], 4001))
-    soft = smooth_signals(cross, 4 / 4000, torch.tensor(presses), 0.6, softness=1e-3)[0].T.numpy()
-    hard = signals_quantized(pad, presses, Contact(sides=None), 4001)
-    assert np.abs(soft - hard).max() < 0.02
