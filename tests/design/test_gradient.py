@@ -33,8 +33,9 @@ def taylor_ratio(contact, seed):
     move = torch.tensor(rng.normal(size=knots.shape))
     move[:, :, [0, -1]] = 0
 
-    def value(places):
-        return (weights * torch_signals(*places, presses, contact)).sum()
+    def value(knots):
+        travel, cross = knots
+        return (weights * torch_signals(travel, cross, presses, contact)).sum()
 
     base = value(knots)
     (gradient,) = torch.autograd.grad(base, knots)
