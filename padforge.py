@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.cli import design
+from design.cli import INTERRUPTED, design
 from design.console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
 from design.errors import InputError
 from fabricate.cli import fabricate
@@ -59,12 +59,11 @@ def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) 
     Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
     """
     settings = load_spec(spec)
-    for model in _sections().values():  # a mistake in any section shows before minutes of work
-        settings.section(model)
-    sound = _run_stages(settings, seed, out)
-    path = write_report(out)
-    click.echo(f"report: {path}")
-    context.exit(0 if sound else 1)
+    _check_ahead(settings, out)
+    code = _run_stages(settings, seed, out)
+    if code != INTERRUPTED:
+        click.echo(f"report: {write_report(out)}")
+    context.exit(code)
 
 
 @cli.command()
@@ -101,8 +100,25 @@ def _sections() -> "dict[str, type[Section]]":
     return DESIGN | FABRICATE | SENSE
 
 
-def _run_stages(spec: "Spec", seed: int | None, out: Path) -> bool:
-    """All stages into `out`, each with its summary on stdout; whether every rule and check holds."""
+def _check_ahead(spec: "Spec", out: Path) -> None:
+    """Refuse what would fail only after minutes of work: any section, sections that do not fit, a real recording."""
+    import numpy as np
+
+    from design.settings import Pad
+    from fabricate import Settings
+    from sense.calibration import split_presses
+    from sense.settings import Localizer, Rig
+
+    for model in _sections().values():
+        spec.section(model)
+    Settings.from_spec(spec).require_consistent(spec.section(Pad).pitch_mm)
+    learning = spec.section(Localizer)
+    split_presses(spec.section(Rig).presses, learning.split, learning.test_share, np.random.default_rng(0))
+    _require_replaceable(out / "recording")
+
+
+def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
+    """All stages into `out`, each with its summary on stdout; the exit code: 0, 1 if a rule or check fails, or 130."""
     from design.cli import run_search
     from design.cli import summary as design_summary
     from fabricate import Settings, build
@@ -111,31 +127,35 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> bool:
     from sense.cli import summary as calibration_summary
 
     seeds = {"seed": seed}
-    recorded = out / "recording"
-    _make_way(recorded)
     _, found = run_search(spec, out, seeds)
     click.echo("\n".join(design_summary(found, out)))
+    if found.interrupted:
+        return INTERRUPTED
     written = [out / "morphology.json"]
     mould = build(found.morphology, out, settings=Settings.from_spec(spec), inputs=written)
     click.echo("\n".join(mould_summary(mould, out)))
+    recorded = out / "recording"
+    _require_replaceable(recorded)
+    if recorded.exists():
+        shutil.rmtree(recorded)
     recording = run_recording(spec, found.morphology, recorded, seeds, written)
     click.echo(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {recorded}")
     calibration = run_calibration(spec, recording, out, seeds)
     click.echo("\n".join(f"  {line}" for line in calibration_summary(calibration)))
-    return not found.violations and all(finding["status"] != "fail" for finding in mould["findings"])
+    return int(bool(found.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))
 
 
-def _make_way(recorded: Path) -> None:
-    """Remove an earlier simulated recording, which the same seed gives again; one of a real pad is never touched."""
+def _require_replaceable(recorded: Path) -> None:
+    """Refuse to run over a recording, unless it is a simulated one, which the same seed gives again."""
     from design.files import read_json
     from sense.recording import FORMAT, START
 
-    if not recorded.exists():
+    if not recorded.exists() or (recorded.is_dir() and not any(recorded.iterdir())):
         return
-    kind = read_json(recorded / START, FORMAT).get("source", {}).get("kind")
+    source = read_json(recorded / START, FORMAT).get("source")
+    kind = source.get("kind") if isinstance(source, dict) else None
     if kind != "simulated":
         raise InputError(f"{recorded}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
-    shutil.rmtree(recorded)
 
 
 def write_report(folder: Path) -> Path:
@@ -148,7 +168,11 @@ def write_report(folder: Path) -> Path:
     for name, section in (("design", _design), ("fabrication", _mould), ("calibration", _calibration)):
         path = folder / f"{name}.json"
         if path.exists():
-            figures, pieces = section(folder, read_json(path, f"padforge-{name}/1"))
+            document = read_json(path, f"padforge-{name}/1")
+            try:
+                figures, pieces = section(folder, document)
+            except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+                raise InputError(f"{path}: not as padforge writes it ({error!r})") from error
             key_figures += figures
             body += pieces
     if not body:
@@ -166,14 +190,15 @@ def _design(folder: Path, document: dict[str, Any]) -> Pieces:
 
     spread = {int(name[-1]): value for name, value in document["terms"].items() if name.startswith("ambiguity")}
     broken = [[v["rule"], ", ".join(map(str, v["fibres"])), v["measured"], v["limit"]] for v in document["violations"]]
-    holds = f"{len(broken)} broken" if broken else "all hold"
+    enforced = document["provenance"]["settings"]["rules"]["enforce"]
+    holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
     return [(holds, "design rules"), (f"{spread[0]:.3f}", "expected error, grid units")], [
         heading("Fibres"),
         figures(
             [(folder / "design.svg", "The plan: horizontal and vertical fibres, their crossings, and the contact.")]
         ),
         table(["fibres lost", "expected error (grid units)"], list(spread.items())),
-        paragraph("Rules: " + ("broken as listed." if broken else "every rule of [rules] holds on the exact curves.")),
+        paragraph(f"Rules of [rules], checked on the exact curves: {holds}."),
         *([table(["rule", "fibres", "measured", "limit"], broken)] if broken else []),
     ]
 
@@ -219,13 +244,18 @@ def _calibration(folder: Path, document: dict[str, Any]) -> Pieces:
 def main() -> None:
     """Run the command line; a user's own mistake is one line on stderr and exit 2."""
     try:
-        code = cli.main(standalone_mode=False)
+        code = cli.main(standalone_mode=False, prog_name="padforge")
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        code = 2
     except (click.exceptions.Abort, KeyboardInterrupt):
-        code = _fail("interrupted; what was finished is kept", 130)
+        code = _fail("interrupted; what was finished is kept", INTERRUPTED)
     except click.ClickException as error:
         code = _fail(error.format_message(), 2)
-    except (InputError, OSError) as error:
+    except InputError as error:
         code = _fail(str(error), 2)
+    except OSError as error:
+        code = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
     sys.exit(code)
 
 

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from .search import SearchResult
     from .settings import Spec
 
+INTERRUPTED = 130
+
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 
 
@@ -48,7 +50,7 @@ def design(
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed}
     document, result = run_search(load_spec(spec), out, overrides)
     show_result(document, summary(result, out), as_json)
-    context.exit(1 if result.violations else 0)
+    context.exit(INTERRUPTED if result.interrupted else 1 if result.violations else 0)
 
 
 def run_search(spec: "Spec", out: Path, overrides: dict[str, Any]) -> tuple[dict[str, Any], "SearchResult"]:
@@ -96,7 +98,8 @@ def summary(result: "SearchResult", out: Path) -> list[str]:
     broken = [f"  broken  {violation}" for violation in result.violations[:10]]
     more = len(result.violations) - len(broken)
     return [
-        f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}",
+        f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
+        + (" (interrupted: the best so far)" if result.interrupted else ""),
         f"  expected error {lost} grid units with {' / '.join(map(str, range(len(spread))))} fibres lost",
         *(broken or ["  all rules hold"]),
         *([f"  ... and {more} more"] if more > 0 else []),
@@ -117,7 +120,7 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
     path = out or Path(f"{morphology.stem}.svg")
-    if path.suffix not in (".svg", ".png"):
+    if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
     save_figure(draw_plan(pad, settings.section(Contact), check_rules(pad, settings.section(Rules))), path)
     click.echo(f"plan -> {path}")

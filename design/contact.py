@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
-from .kernels.exact import count_touched, exact_signals, family_strays
+from .kernels.exact import exact_signals
 from .kernels.pchip import population_slopes
 from .kernels.press import EUCLIDEAN, INVERSE, INVERSE_SQUARE, MANHATTAN, UNIFORM
 from .kernels.quantized import quantized_signals
+from .kernels.reach import count_touched, family_strays
 from .morphology import Morphology
 from .settings import Contact
 from .threads import in_chunks
@@ -51,14 +52,17 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
 def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
     """`signals`, and the number of spans that were looked at for them."""
     travel, cross, batch = fibre_axes(pad)
-    places = np.asarray(presses, dtype=np.float64)
-    contacts = places.shape[1] if places.ndim == 3 else 1
-    flat = as_presses(places.reshape(-1, places.shape[-1]) if places.ndim == 3 else places)
+    flat, places = as_presses(presses, several=True)
     fibres = travel.shape[1]
     out = np.zeros(len(travel) * len(flat) * fibres)
     visited = _run_exact(travel, cross, family_strays(cross), flat, contact, _NONE, _NONE, out)
-    result = out.reshape(len(travel), -1, contacts, fibres).sum(axis=2) if contacts > 1 else out
-    return result.reshape(*batch, -1, fibres), visited
+    return _summed(out, (*batch, *places, fibres)), visited
+
+
+def _summed(signals: Array, shape: tuple[int, ...]) -> Array:
+    """Signals in the shape (..., Q, C, 2M), summed over the C presses that were made at once."""
+    whole = signals.reshape(shape)
+    return whole[..., 0, :] if shape[-2] == 1 else whole.sum(axis=-2)
 
 
 def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
@@ -71,7 +75,7 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
     contact = contact or Contact()
     travel, cross, _ = fibre_axes(pad)
-    places, strays = as_presses(presses), family_strays(cross)
+    places, strays = as_presses(presses)[0], family_strays(cross)
     starts = count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
     _run_exact(travel, cross, strays, places, contact, starts, fibre, signal)
@@ -103,13 +107,21 @@ def _run_exact(
 
 
 def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
-    """Travel and cross coordinates (P, 2M, n) of a pad or a population, and the population's own shape."""
-    knots = pad.knots if isinstance(pad, Morphology) else np.asarray(pad, dtype=np.float64)
+    """Travel and cross coordinates (P, 2M, n) of a pad or a population, and the population's own shape.
+
+    Raises:
+        InputError: knots that are no (..., 2M, N+2, 2) finite numbers ascending along the travel axis.
+    """
+    knots = pad.knots if isinstance(pad, Morphology) else _numbers(pad, "knots")
+    if knots.ndim < 3 or knots.shape[-1] != 2 or knots.shape[-2] < 2 or knots.shape[-3] % 2 or not knots.shape[-3]:
+        raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
     batch = knots.reshape(-1, *knots.shape[-3:])
     grid = batch.shape[1] // 2
     travel, cross = (
         np.concatenate([batch[:, :grid, :, axis], batch[:, grid:, :, 1 - axis]], axis=1) for axis in (0, 1)
     )
+    if not isinstance(pad, Morphology) and not (np.isfinite(cross).all() and (np.diff(travel) > 0).all()):
+        raise InputError("knots hold NaN or infinity, or do not ascend along the travel axis")
     return travel, cross, knots.shape[:-3]
 
 
@@ -152,7 +164,7 @@ def signals_quantized(
 
     Args:
         pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
-        presses: (Q, 2) centres in grid units.
+        presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, as in `signals`.
         contact: shape and weight; the published default if None.
         samples: points per fibre, uniform along the travel axis, at least 2 (published: 2000).
 
@@ -167,10 +179,10 @@ def signals_quantized(
 
 def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int) -> tuple[Array, int]:
     """`signals_quantized`, and the number of samples that were looked at for them."""
-    if samples < 2:
-        raise InputError(f"samples is {samples}, allowed is at least 2")
+    if not (isinstance(samples, int | np.integer) and samples >= 2):
+        raise InputError(f"samples is {samples}, allowed is a whole number from 2")
     travel, cross, batch = fibre_axes(pad)
-    places = as_presses(presses)
+    places, shape_of_presses = as_presses(presses, several=True)
     shape = press_shape(contact)
     out = np.zeros((len(travel), len(places), travel.shape[1]))
 
@@ -178,19 +190,33 @@ def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, sam
         return quantized_signals(travel, cross, places, *shape, samples, begin, end, out)
 
     looked_at = sum(in_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
-    return out.reshape(*batch, *out.shape[1:]), looked_at
+    return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
 
 
-def as_presses(presses: ArrayLike) -> Array:
-    """`presses` as a contiguous, finite (Q, 2) array of grid units."""
-    places = np.ascontiguousarray(presses, dtype=np.float64)
-    if places.size == 0:
-        return places.reshape(0, 2)
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise InputError(f"presses have shape {places.shape}, expected (Q, 2)")
+def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
+    """`presses` as contiguous, finite (Q C, 2) grid units, and (Q, C): C is 1 for (Q, 2).
+
+    Raises:
+        InputError: presses that are no (Q, 2), or (Q, C, 2) where `several` are allowed at once, or not finite.
+    """
+    places = _numbers(presses, "presses")
+    if places.shape == (0,):
+        places = places.reshape(0, 2)
+    if places.ndim not in ((2, 3) if several else (2,)) or places.shape[-1] != 2:
+        raise InputError(f"presses have shape {places.shape}, expected (Q, 2)" + (" or (Q, C, 2)" if several else ""))
     if not np.isfinite(places).all():
         raise InputError("presses hold NaN or infinity, expected finite grid units")
-    return places
+    return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
+
+
+def _numbers(values: ArrayLike, name: str) -> Array:
+    try:
+        found = np.asarray(values)
+        if found.dtype.kind not in "fiub":
+            raise InputError(f"{name} are {found.dtype} values, expected real numbers")
+        return found.astype(np.float64)
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else InputError(f"{name} are not numbers ({error})") from error
 
 
 def boustrophedon(grid: int, side: int, jitter: float = 0.0, seed: int = 214) -> Array:

@@ -122,11 +122,12 @@ def descend(
     contact: Contact,
     search: Search,
     rules: Rules,
-    report: Callable[[Step], None] = lambda step: None,
+    report: Callable[[Step], bool] = lambda step: True,
 ) -> Morphology:
     """One start of the gradient search: Adam with annealed noise and rising penalties.
 
-    The same start of the same seed gives the same fibres, whichever other starts run.
+    The same start of the same seed gives the same fibres, whichever other starts run. Where `report`, which hears of
+    every step, answers False, the start ends with the fibres it has.
     """
     rng = np.random.default_rng([search.seed, start])
     fibres = Fibres(pad, search, rules, rng)
@@ -150,7 +151,8 @@ def descend(
         optimiser.zero_grad()
         (spread + weight * broken).backward()
         optimiser.step()
-        report(Step(number + 1, spread.item(), broken.item()))
+        if not report(Step(number + 1, spread.item(), broken.item())):
+            break
     return Morphology(fibres.knots(), pad.pitch_mm)
 
 

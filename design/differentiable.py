@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from .contact import press_shape
-from .kernels.exact import exact_signals, family_strays
+from .kernels.exact import exact_signals
 from .kernels.gradient import signals_gradient
+from .kernels.reach import family_strays
 from .settings import Contact
 
 

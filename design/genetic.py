@@ -32,18 +32,19 @@ class _PublishedProblem(Problem):
 
 
 def breed(
-    pad: Pad, contact: Contact, search: Search, report: Callable[[int, float], None] = lambda generation, best: None
+    pad: Pad, contact: Contact, search: Search, report: Callable[[int, float], bool] = lambda generation, best: True
 ) -> Morphology:
     """Minimise the published objective over `search.generations` generations of `search.population` pads.
 
-    `report` hears each generation's number (from 1) and the best objective so far.
+    `report` hears each generation's number (from 1) and the best objective so far; if it answers False, that is it.
     """
     problem = _PublishedProblem(pad, contact, search)
     algorithm = GA(pop_size=search.population)
     algorithm.setup(problem, termination=("n_gen", search.generations), seed=search.seed)
     for generation in range(1, search.generations + 1):
         algorithm.next()
-        report(generation, float(_best(algorithm).F[0]))
+        if not report(generation, float(_best(algorithm).F[0])):
+            break
     return Morphology(problem.fibres(_best(algorithm).X[None])[0], pad.pitch_mm)
 
 

@@ -47,6 +47,7 @@ class Morphology:
             raise InputError(f"pitch_mm is {self.pitch_mm!r}, allowed is 0 < pitch_mm <= 1000")
         knots.setflags(write=False)
         object.__setattr__(self, "knots", knots)
+        object.__setattr__(self, "pitch_mm", float(self.pitch_mm))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Morphology):
@@ -68,6 +69,7 @@ class Morphology:
     @classmethod
     def straight(cls, grid: int, pitch_mm: float = 11.25) -> "Morphology":
         """The square grid: M straight fibres per family, N = 0."""
+        _require_counts(grid, 0)
         return cls(assemble(np.empty((2 * grid, 0, 2))), pitch_mm)
 
     @classmethod
@@ -75,6 +77,7 @@ class Morphology:
         cls, grid: int, knots: int, seed: int | np.random.Generator = 0, pitch_mm: float = 11.25
     ) -> "Morphology":
         """Knots drawn uniformly over the pad, as the published search starts from."""
+        _require_counts(grid, knots)
         rng = np.random.default_rng(seed)
         inner = rng.uniform(MARGIN, grid + 1 - MARGIN, (2 * grid, knots, 2))
         return cls(assemble(inner), pitch_mm)
@@ -97,7 +100,7 @@ class Morphology:
             InputError: the file is missing, torn, of another kind, or its knots break the rules of the class.
         """
         path = Path(path)
-        if path.suffix == ".mat":
+        if path.suffix.lower() == ".mat":
             from .published import load_morphology
 
             return load_morphology(path)
@@ -105,7 +108,7 @@ class Morphology:
         try:
             knots = np.array(document["knots"], dtype=np.float64)
             pad = cls(knots, float(document["pitch_mm"]), document.get("provenance", {}))
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: no valid morphology ({error!r})") from error
         except ValueError as error:
             raise InputError(f"{path}: {error}") from error
@@ -165,6 +168,13 @@ def _separate(travel: Array, step: float = 1e-9) -> None:
         travel[..., k] = np.maximum(travel[..., k], travel[..., k - 1] + step)
     for k in range(travel.shape[-1] - 2, 0, -1):
         travel[..., k] = np.minimum(travel[..., k], travel[..., k + 1] - step)
+
+
+def _require_counts(grid: int, knots: int) -> None:
+    if grid < 1:
+        raise InputError(f"grid is {grid}, allowed is at least 1")
+    if knots < 0:
+        raise InputError(f"knots is {knots}, allowed is at least 0")
 
 
 def _validate(knots: Array) -> None:

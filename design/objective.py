@@ -56,7 +56,7 @@ def published_terms(
     """
     travel, cross, _ = fibre_axes(knots)
     grid = travel.shape[1] // 2
-    places = as_presses(published_presses(grid) if presses is None else presses)
+    places = as_presses(published_presses(grid) if presses is None else presses)[0]
     shape = press_shape(contact or Contact())
     found = np.zeros((len(knots), 3))
 

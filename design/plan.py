@@ -55,7 +55,7 @@ def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation]
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as `.png` or `.svg`, atomically and byte-reproducibly (no dates, stable ids)."""
     with atomic(path) as temporary, mpl.rc_context({"svg.hashsalt": "padforge"}):
-        figure.savefig(temporary, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        figure.savefig(temporary, dpi=150, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
 
 
 def _contact_shape(contact: Contact, pitch_mm: float) -> Circle | Polygon:

@@ -21,6 +21,8 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
     Raises:
         InputError: the file is missing, torn, no MATLAB file, or lacks a variable.
     """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a MATLAB file")
     try:
         content = scipy.io.loadmat(path)
     except OSError as error:

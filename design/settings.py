@@ -29,7 +29,7 @@ class Pad(Section):
     """`[pad]`: what the pad is."""
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
-    pitch_mm: float = Field(default=11.25, gt=0, le=1000, description="distance of neighbouring fibre ends, mm")
+    pitch_mm: float = Field(default=11.25, ge=0.1, le=1000, description="distance of neighbouring fibre ends, mm")
     fibre_diameter_mm: float = Field(default=0.3, gt=0, le=10, description="diameter of the laid fibre, mm")
     deep_family: Literal["horizontal", "vertical"] = Field(
         default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
@@ -61,7 +61,7 @@ class Contact(Section):
         length: "manhattan" (|dx| + |dy|, as the published code has it) or "euclidean".
     """
 
-    radius: float = Field(default=0.6, gt=0, le=1e4, description="object radius K, grid units")
+    radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units")
     sides: Sides = Field(default=30, description='sides D of the object, or "circle"')
     weight: Literal["uniform", "inverse_square", "inverse"] = Field(
         default="uniform", description="weight of a fibre element: 1, 1/(K + d^2) or 1/d"
@@ -92,11 +92,11 @@ class Rules(Section):
     enforce: bool = Field(
         default=True, description="false drops every rule: an explicit choice to design the unbuildable"
     )
-    min_bend_radius_mm: float = Field(default=1.0, ge=0, description="least bend radius of a fibre, mm")
-    min_gap_mm: float = Field(default=0.8, ge=0, description="least gap between centre lines of a family, mm")
+    min_bend_radius_mm: float = Field(default=1.0, ge=0, le=1000, description="least bend radius of a fibre, mm")
+    min_gap_mm: float = Field(default=0.8, ge=0, le=1000, description="least gap between centre lines of a family, mm")
     same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
-    border_mm: float = Field(default=2.0, ge=0, description="least distance of a fibre to the pad's border, mm")
-    max_length_mm: float = Field(default=500.0, gt=0, description="greatest length of a fibre, mm")
+    border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
+    max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
 
 
 MODELS: dict[str, type[Section]] = {"pad": Pad, "contact": Contact, "search": Search, "rules": Rules}

@@ -45,7 +45,10 @@ def fabricate() -> None:
 )
 @json_option
 def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, as_json: bool) -> None:
-    """Write the mould of MORPHOLOGY; `build` may be left out."""
+    """Write the mould of MORPHOLOGY; `build` may be left out.
+
+    The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
+    """
     from design.morphology import Morphology
 
     from .export import build as build_files

@@ -28,6 +28,8 @@ Place = tuple[float, float]
 SOUND = ("manifold", "watertight", "bodies", "volume", "genus")
 """The checks a mesh must pass to be a solid at all."""
 
+_LARGEST_MM = 1e6
+
 _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""
 
@@ -100,13 +102,18 @@ def check_mesh(path: Path, printer: Printer = DEFAULTS.printer) -> list[Finding]
     import trimesh
 
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: {'a folder, expected a mesh file' if path.is_dir() else 'no such file'}")
     try:
-        mesh = trimesh.load_mesh(path)
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(path)
     except Exception as error:  # readers of broken files raise whatever comes
-        raise InputError(f"{path}: not a mesh that can be read ({error})") from error
+        raise InputError(f"{path}: not a mesh that can be read ({error or type(error).__name__})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{path}: holds no triangles")
+        raise InputError(f"{path}: holds no triangles that can be read, or is torn")
+    if not np.isfinite(mesh.vertices).all() or np.abs(mesh.vertices).max() > _LARGEST_MM:
+        raise InputError(f"{path}: vertices hold NaN, infinity or more than {_LARGEST_MM:g}")
+    if mesh.units:  # a 3MF says its unit; an STL has none and counts as mm
+        mesh.convert_units("millimeters")
     return inspect_mesh(mesh.vertices, mesh.faces, printer)
 
 

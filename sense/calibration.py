@@ -1,7 +1,5 @@
 """Calibration: learn places from a recording, and say how far off they are on presses never learnt from."""
 
-import itertools
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
@@ -11,16 +9,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from design.errors import InputError
 from design.files import provenance
+from design.losses import lost_subsets
 from design.settings import validated
 
 from . import settings
 from .localizer import Localizer, Scaling
+from .network import refuse_unsound
 from .presses import INPUTS
 from .recording import Recording
 
 FORMAT = "padforge-calibration/1"
-MAX_SUBSETS = 256
-"""Sets of lost fibres that are tried per number of lost fibres; of more, as many are drawn at random."""
 LEAST_TRAINING = 2
 """Presses needed to learn from: of fewer, the span is none."""
 
@@ -49,7 +47,7 @@ def calibrate(
         The localizer, and the document of `calibration.json`.
 
     Raises:
-        InputError: an option out of range, or too few presses to hold a share back.
+        InputError: an option out of range, too few presses to hold a share back, or a training that diverged.
     """
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
     options = validated(settings.Localizer, {**(options or settings.Localizer()).model_dump(), **given}, "[localizer]")
@@ -63,8 +61,13 @@ def calibrate(
     scaling = Scaling.fit(raw, places_mm)
     from .training import train  # torch, seconds to import, is needed here only
 
+    weights = train(scaling.inputs(raw), scaling.targets(places_mm), options, rng, progress)
+    try:
+        refuse_unsound(weights, scaling.entries)
+    except InputError as error:
+        raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
     localizer = Localizer(
-        weights=train(scaling.inputs(raw), scaling.targets(places_mm), options, rng, progress),
+        weights=weights,
         scaling=scaling,
         features=options.features,
         rate_hz=recording.rate_hz,
@@ -106,10 +109,17 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
         pressed, and found with all fibres).
 
     Raises:
-        InputError: a level that leaves no fibre, or a recording that does not suit the localizer.
+        InputError: no level, one that leaves no fibre, or a recording that does not suit the localizer.
     """
+    levels, presses = tuple(levels), len(recording.presses_mm)
+    if not levels:
+        raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
     own = recording.digest == localizer.learnt_from
-    test = np.array(localizer.test if own else range(len(recording.presses_mm)), dtype=np.int64)
+    if own and not max(localizer.test) < presses:
+        raise InputError(
+            f"test press {max(localizer.test)} of the localizer: no such press, allowed are 0 to {presses - 1}"
+        )
+    test = np.array(localizer.test if own else range(presses), dtype=np.int64)
     inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
     rows, by_subset = [], []
     for level in levels:
@@ -140,17 +150,6 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
 def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = ()) -> Array:
     """(Q, 2) places in mm found for every press of `recording`, without the fibres `lost`, by index."""
     return localizer.places(localizer.inputs(recording), lost)
-
-
-def lost_subsets(fibres: int, lost: int) -> list[tuple[int, ...]]:
-    """All sets of `lost` of the fibres, or MAX_SUBSETS different ones, always the same, where there are more."""
-    if math.comb(fibres, lost) <= MAX_SUBSETS:
-        return list(itertools.combinations(range(fibres), lost))
-    rng = np.random.default_rng(0)
-    drawn: set[tuple[int, ...]] = set()
-    while len(drawn) < MAX_SUBSETS:
-        drawn.add(tuple(sorted(rng.choice(fibres, lost, replace=False).tolist())))
-    return sorted(drawn)
 
 
 def distances(found_mm: Array, pressed_mm: Array) -> Array:

@@ -132,18 +132,23 @@ def calibrate(
     Writes localizer.safetensors, localizer.json, calibration.json, error_map.png and error_by_loss.png.
     """
     overrides = {"split": test_split, "seed": seed}
-    document = run_calibration(load_spec(spec), _open(recording), out or recording.parent, overrides)
+    document = run_calibration(load_spec(spec), _open(recording), out or recording.absolute().parent, overrides)
     show_result(document, summary(document), as_json)
 
 
 def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Calibrate with the settings of `spec`, write all results to `out`, and return `calibration.json`."""
+    """Calibrate with the settings of `spec`, write all results to `out`, and return `calibration.json`.
+
+    Nothing in `out` changes before the last result is there.
+    """
     from design.files import write_json
 
     from .calibration import calibrate as learn
     from .figures import draw_error_by_loss, draw_error_map
+    from .output import refuse_unwritable, staged
     from .settings import Localizer
 
+    refuse_unwritable(out)
     options = spec.section(Localizer, **overrides)
     with progress() as bar:
         task = bar.add_task("training", total=options.epochs, note="")
@@ -152,10 +157,11 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
             bar.update(task, completed=done, note=f"epoch {done} of {total}")
 
         localizer, document = learn(recording, options, progress=report)
-    localizer.save(out)
-    write_json(out / "calibration.json", document)
-    draw_error_map(document, out / "error_map.png")
-    draw_error_by_loss(document, out / "error_by_loss.png")
+    with staged(out) as folder:
+        localizer.save(folder)
+        write_json(folder / "calibration.json", document)
+        draw_error_map(document, folder / "error_map.png")
+        draw_error_by_loss(document, folder / "error_by_loss.png")
     return document
 
 

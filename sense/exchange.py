@@ -15,7 +15,9 @@ from design.errors import InputError
 from design.files import atomic, write_text
 from design.published import load_mat
 
-from .recording import MAX_FIBRES, Recording
+from .limits import MAX_FIBRES
+from .output import writing
+from .recording import Recording
 
 READINGS_PER_PRESS = 40
 """Length of the published cycle of a press, readings."""
@@ -86,7 +88,7 @@ def import_csv(path: str | Path) -> Recording:
 def _read_table(path: Path) -> Array:
     """The numbers of a CSV with the expected header; an empty cell is NaN."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             header, *lines = list(csv.reader(file)) or [[]]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
@@ -95,7 +97,8 @@ def _read_table(path: Path) -> Array:
     names = [name.strip() for name in header]
     if names[:1] != ["time_s"] or names[-2:] != ["x_mm", "y_mm"] or not 4 <= len(names) <= 3 + MAX_FIBRES:
         found = ",".join(names)[:60] or "nothing"
-        raise InputError(f"{path}: header is {found!r}, expected time_s, one column per fibre, x_mm, y_mm")
+        hint = "; values are separated by commas, not by semicolons" if ";" in found else ""
+        raise InputError(f"{path}: header is {found!r}, expected time_s, one column per fibre, x_mm, y_mm{hint}")
     table = np.empty((len(lines), len(names)))
     for number, line in enumerate(lines):
         if len(line) != len(names):
@@ -108,12 +111,21 @@ def _read_table(path: Path) -> Array:
 
 
 def export_csv(recording: Recording, path: str | Path) -> None:
-    """Write `recording` in the CSV form of this module, atomically; importing it gives the same numbers."""
+    """Write `recording` in the CSV form of this module, atomically; importing it gives the same numbers.
+
+    Raises:
+        InputError: `path` cannot be written.
+    """
+    path = Path(path)
     header = ["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm"]
     places: list[list[float | str]] = [["", ""] for _ in recording.times_s]
     for place, begun, lifted in zip(recording.presses_mm.tolist(), recording.begun, recording.lifted, strict=True):
         places[begun:lifted] = [place] * int(lifted - begun)
-    with atomic(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with (
+        writing(path),
+        atomic(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(header)
         for time, volts, place in zip(recording.times_s.tolist(), recording.readings.tolist(), places, strict=True):
@@ -121,6 +133,11 @@ def export_csv(recording: Recording, path: str | Path) -> None:
 
 
 def write_places(places_mm: Array, path: str | Path) -> None:
-    """Write (Q, 2) places found, mm from the pad's centre, as CSV: press (counted from 0), x_mm, y_mm; atomically."""
+    """Write (Q, 2) places found, mm from the pad's centre, as CSV: press (counted from 0), x_mm, y_mm; atomically.
+
+    Raises:
+        InputError: `path` cannot be written.
+    """
     lines = [f"{press},{x:.4f},{y:.4f}\n" for press, (x, y) in enumerate(places_mm.tolist())]
-    write_text(Path(path), "press,x_mm,y_mm\n" + "".join(lines))
+    with writing(Path(path)):
+        write_text(Path(path), "press,x_mm,y_mm\n" + "".join(lines))

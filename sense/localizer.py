@@ -1,6 +1,7 @@
 """The localizer: from the readings of a press to its place, with any fibres lost. Needs no torch."""
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,16 +13,19 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from design.errors import InputError
-from design.files import atomic, read_json, write_json
+from design.files import atomic, read_json
 
-from .network import Floats, Weights, forward, masked
+from .document import FORMAT, LEAST_SPREAD_V, read_document
+from .network import Floats, Weights, forward, masked, refuse_unsound
+from .output import writing
 from .presses import INPUTS
 from .recording import Recording
 
-FORMAT = "padforge-localizer/1"
 DOCUMENT, WEIGHTS = "localizer.json", "localizer.safetensors"
 RATE_TOLERANCE = 0.25
 """Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
+MAX_INPUT = 1e4
+"""Greatest scaled input, in spreads: what lies further off is no press, and is held there."""
 _CHUNK = 8192
 
 Array = NDArray[np.float64]
@@ -53,11 +57,11 @@ class Scaling:
         spread = np.sqrt(own * fibre)
         low, high = places_mm.min(axis=0), places_mm.max(axis=0)
         span = float((high - low).max() / 2)
-        return cls(inputs.mean(axis=0), np.where(spread > 0, spread, 1.0), (low + high) / 2, span or 1.0)
+        return cls(inputs.mean(axis=0), np.where(spread >= LEAST_SPREAD_V, spread, 1.0), (low + high) / 2, span or 1.0)
 
     def inputs(self, inputs: Array) -> Floats:
         """(Q, C, F) volts to what the network takes."""
-        return ((inputs - self.centre) / self.spread).astype(np.float32)
+        return np.clip((inputs - self.centre) / self.spread, -MAX_INPUT, MAX_INPUT).astype(np.float32)
 
     def targets(self, places_mm: Array) -> Floats:
         """(Q, 2) mm to what the network gives."""
@@ -66,6 +70,11 @@ class Scaling:
     def places_mm(self, targets: Floats) -> Array:
         """What the network gives to mm."""
         return targets * self.span_mm + self.middle_mm
+
+    @property
+    def entries(self) -> int:
+        """D, the numbers that enter the network: the inputs, and one a fibre that says whether it lives."""
+        return self.centre.size + len(self.centre)
 
 
 @dataclass(frozen=True)
@@ -124,18 +133,24 @@ class Localizer:
         return self.scaling.places_mm(np.concatenate(found)) if found else np.empty((0, 2))
 
     def _alive(self, lost: ArrayLike) -> NDArray[np.bool_]:
-        given = np.asarray(lost, dtype=np.int64).ravel()
-        outside = given[(given < 0) | (given >= self.fibres)]
-        if len(outside):
-            raise InputError(f"lost fibre {outside[0]}: no such fibre, allowed are 0 to {self.fibres - 1}")
         alive = np.ones(self.fibres, dtype=bool)
-        alive[given] = False
+        for fibre in np.asarray(lost).ravel().tolist():
+            if type(fibre) is not int or not 0 <= fibre < self.fibres:
+                raise InputError(f"lost fibre {fibre}: no such fibre, allowed are 0 to {self.fibres - 1}")
+            alive[fibre] = False
         if not alive.any():
             raise InputError(f"all {self.fibres} fibres are lost, at least one must be left")
         return alive
 
     def save(self, folder: str | Path) -> None:
-        """Write `localizer.safetensors` and `localizer.json`; reading them back gives the same to the last bit."""
+        """Write `localizer.safetensors` and `localizer.json`; reading them back gives the same to the last bit.
+
+        Nothing is touched before both are complete. The document has the digest of its weights, so `load` tells a
+        pair that was interrupted between its halves from a whole one.
+
+        Raises:
+            InputError: something is not finite or no JSON, or `folder` cannot be written.
+        """
         folder = Path(folder)
         content = save({name: np.ascontiguousarray(weight) for name, weight in self.weights.items()})
         document = {
@@ -157,47 +172,50 @@ class Localizer:
             "test": list(self.test),
             "provenance": dict(self.provenance),
         }
-        with atomic(folder / WEIGHTS) as temporary:
-            temporary.write_bytes(content)
-        write_json(folder / DOCUMENT, document)
+        try:
+            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{folder / DOCUMENT}: localizer cannot be written as JSON ({error})") from error
+        with writing(folder), atomic(folder / WEIGHTS) as new_weights, atomic(folder / DOCUMENT) as new_document:
+            new_weights.write_bytes(content)
+            new_document.write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, folder: str | Path) -> "Localizer":
         """Read what `save` wrote.
 
         Raises:
-            InputError: a file is missing, torn or of another kind, or the two do not belong together.
+            InputError: a file is missing, torn or of another kind, a value is none that `save` writes, or the two do
+                not belong together.
         """
         folder = Path(folder)
-        document = read_json(folder / DOCUMENT, FORMAT)
+        document = read_document(read_json(folder / DOCUMENT, FORMAT), str(folder / DOCUMENT))
+        path = folder / WEIGHTS
         try:
-            content = (folder / WEIGHTS).read_bytes()
+            content = path.read_bytes()
         except OSError as error:
-            raise InputError(f"{folder / WEIGHTS}: cannot be read ({error.strerror})") from error
-        if hashlib.sha256(content).hexdigest() != document.get("weights_sha256"):
-            raise InputError(f"{folder / WEIGHTS}: not the weights that {DOCUMENT} was written with")
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        if hashlib.sha256(content).hexdigest() != document.weights_sha256:
+            raise InputError(f"{path}: not the weights that {DOCUMENT} was written with; calibrate again")
+        scaling = Scaling(
+            np.array(document.scaling.centre_v),
+            np.array(document.scaling.spread_v),
+            np.array(document.scaling.middle_mm),
+            document.scaling.span_mm,
+        )
         try:
-            scaling = document["scaling"]
-            localizer = cls(
-                weights=load(content),
-                scaling=Scaling(
-                    np.array(scaling["centre_v"], dtype=np.float64),
-                    np.array(scaling["spread_v"], dtype=np.float64),
-                    np.array(scaling["middle_mm"], dtype=np.float64),
-                    float(scaling["span_mm"]),
-                ),
-                features=document["features"],
-                rate_hz=float(document["rate_hz"]),
-                learnt_from=document["learnt_from"],
-                split=document["split"],
-                test=tuple(document["test"]),
-                errors=document["errors"],
-                provenance=document["provenance"],
-            )
+            weights = load(content)
+            refuse_unsound(weights, scaling.entries)
         except (KeyError, TypeError, ValueError, SafetensorError) as error:
-            raise InputError(f"{folder / DOCUMENT}: no valid localizer ({error!r})") from error
-        if localizer.features not in INPUTS:
-            raise InputError(
-                f"{folder / DOCUMENT}: features is {localizer.features!r}, allowed are {', '.join(INPUTS)}"
-            )
-        return localizer
+            raise InputError(f"{path}: no weights of the localizer that {DOCUMENT} describes ({error})") from error
+        return cls(
+            weights=weights,
+            scaling=scaling,
+            features=document.features,
+            rate_hz=document.rate_hz,
+            learnt_from=document.learnt_from,
+            split=document.split,
+            test=tuple(document.test),
+            errors=[row.model_dump() for row in document.errors],
+            provenance=document.provenance,
+        )

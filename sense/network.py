@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from design.errors import InputError
+
 Floats = NDArray[np.float32]
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2) and
@@ -18,6 +20,33 @@ Weights = Mapping[str, Floats]
 
 EPSILON = 1e-5
 """Added to the variance that a layer is normalised by."""
+MAX_WEIGHT = 1e4
+"""Greatest weight of a sound network, far above any that training ends with; no sum of a pass overflows below it."""
+
+
+def refuse_unsound(weights: Weights, entries: int) -> None:
+    """Raise InputError unless `weights` are those of a network that takes `entries` numbers, and all of them sane."""
+    found = {name: weight.shape for name, weight in weights.items()}
+    first, layers = found.get("first.w", ()), found.get("hidden.w", ())[:1]
+    if len(first) != 3 or len(layers) != 1 or 0 in first:
+        raise InputError(f"weights have shapes {found}, expected first.w (E, D, H), hidden.w (L, E, H, H) and others")
+    members, _, hidden = first
+    expected = {
+        "first.w": (members, entries, hidden),
+        "first.b": (members, 1, hidden),
+        "hidden.w": (*layers, members, hidden, hidden),
+        "hidden.b": (*layers, members, 1, hidden),
+        "last.w": (members, hidden, 2),
+        "last.b": (members, 1, 2),
+    }
+    if found != expected:
+        raise InputError(f"weights have shapes {found}, expected {expected}")
+    for name, weight in weights.items():
+        greatest = np.abs(weight).max(initial=0)
+        if weight.dtype != np.float32 or not greatest <= MAX_WEIGHT:
+            raise InputError(
+                f"weights {name} are {weight.dtype} up to {greatest:g}, allowed is float32 up to {MAX_WEIGHT:g}"
+            )
 
 
 def masked(inputs: Floats, alive: NDArray[np.bool_]) -> Floats:

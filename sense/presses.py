@@ -56,6 +56,8 @@ INPUTS: dict[str, Callable[[Array, Indices, Indices], Array]] = {
     "published": published_inputs,
 }
 """How the inputs of `[localizer] features` are made."""
+SIZES = {"windows": len(DOWN) + len(UP), "published": 3}
+"""F, how many numbers of each fibre they are."""
 
 
 def _neighbours(begun: Indices, lifted: Indices, readings: int) -> tuple[Indices, Indices]:

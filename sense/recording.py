@@ -9,9 +9,12 @@ journal calls done can be used.
 import hashlib
 import json
 import os
+import shutil
+import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from reprlib import repr as shortened
 from types import TracebackType
 from typing import Any
 
@@ -21,11 +24,13 @@ from numpy.typing import ArrayLike, NDArray
 from design.errors import InputError
 from design.files import read_json, write_json
 
+from .journal import read_journal
+from .limits import MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_S, MAX_VOLTS, MIN_RATE_HZ, numbers, refuse_beyond
+from .output import refuse_unwritable, writing
 from .stream import BlockWriter, read_blocks
 
 FORMAT = "padforge-recording/1"
 START, JOURNAL, READINGS = "start.json", "journal.ndjson", "readings.bin"
-MAX_FIBRES = 512
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -45,8 +50,9 @@ class Recording:
         torn_presses: presses that were left out because the end of the stream was torn off.
 
     Raises:
-        InputError: shapes that do not fit together, values that are not finite, times that do not ascend, presses
-            that overlap, or one without a reading before it.
+        InputError: no numbers, shapes that do not fit together, values that are not finite or beyond the limits of
+            this module, times that do not ascend, presses that overlap, one without a reading before it, or a
+            source that JSON cannot hold.
     """
 
     readings: Array
@@ -65,7 +71,7 @@ class Recording:
             ("begun", np.int64),
             ("lifted", np.int64),
         ):
-            array = np.array(getattr(self, name), dtype=kind)
+            array = numbers(getattr(self, name), kind, name)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         _validate(self)
@@ -104,12 +110,14 @@ class Recording:
             InputError: no run directory, a file damaged elsewhere than at its end, or no press in it.
         """
         path = Path(path)
+        if not (path / START).is_file():
+            raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
         start = read_json(path / START, FORMAT)
         fibres = start.get("fibres")
         if type(fibres) is not int or not 1 <= fibres <= MAX_FIBRES:
             raise InputError(f"{path / START}: fibres is {fibres!r}, allowed is 1 to {MAX_FIBRES}")
         rows, _ = read_blocks(path / READINGS, fibres)
-        done = _read_journal(path / JOURNAL)
+        done = read_journal(path / JOURNAL)
         presses = [press for press in done if press[3] <= len(rows)]
         table = np.array(presses, dtype=np.float64).reshape(-1, 4)
         try:
@@ -129,25 +137,21 @@ class Recording:
         """Write a run directory that appears whole or not at all.
 
         Raises:
-            InputError: `path` exists and is not an empty directory: a recording is never written over.
+            InputError: `path` exists and is not an empty directory (a recording is never written over, not even one
+                that appeared meanwhile), or cannot be written.
         """
         path = Path(path).resolve()
         refuse_existing(path)
-        unfinished = path.with_name(f".{path.name}-{os.getpid()}")
+        unfinished = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
         try:
             with Recorder(unfinished, self.fibres, self.source, provenance) as recorder:
                 recorder.append(self.times_s, self.readings)
                 for place, begun, lifted in zip(self.presses_mm, self.begun, self.lifted, strict=True):
                     recorder.begin(place, int(begun))
                     recorder.done(int(lifted))
-            if path.exists():
-                path.rmdir()
-            unfinished.rename(path)
+            _put(unfinished, path)
         finally:
-            if unfinished.exists():
-                for file in unfinished.iterdir():
-                    file.unlink()
-                unfinished.rmdir()
+            shutil.rmtree(unfinished, ignore_errors=True)
 
 
 class Recorder:
@@ -156,15 +160,21 @@ class Recorder:
     Nothing is promised to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
 
     Raises:
-        InputError: `path` exists and is not an empty directory.
+        InputError: `path` exists and is not an empty directory, or cannot be written.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
         refuse_existing(path)
         document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
-        write_json(path / START, document)
-        self._stream = (path / READINGS).open("xb")
-        self._journal = (path / JOURNAL).open("x", encoding="utf-8")
+        with writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+            try:
+                self._stream = (path / READINGS).open("xb")  # of two that start at once, one makes this file
+            except FileExistsError:
+                refuse_existing(path)
+                raise
+            write_json(path / START, document)
+            self._journal = (path / JOURNAL).open("x", encoding="utf-8")
         self._blocks = BlockWriter(self._stream, fibres)
         self._lines: list[str] = []
         self._press = 0
@@ -206,35 +216,33 @@ class Recorder:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise InputError if `path` is anything but absent or an empty directory."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    """Raise InputError if `path` is anything but absent or an empty directory, or cannot be written."""
+    refuse_unwritable(path)
+    if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
 
 
-def _read_journal(path: Path) -> list[tuple[float, float, int, int]]:
-    """Place (x, y in mm) and readings (begun, lifted) of every press that is done, in order of the press."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
-    begun: dict[int, tuple[float, float, int]] = {}
-    done: dict[int, int] = {}
-    for number, line in enumerate(text.split("\n")[:-1], start=1):  # what follows the last newline is a torn line
+def _put(unfinished: Path, path: Path) -> None:
+    """Rename a run directory to `path`, unless another came there first."""
+    with writing(path):
         try:
-            event = json.loads(line)
-            press, reading = int(event["press"]), int(event["reading"])
-            if event["event"] == "begun":
-                begun[press] = (float(event["x_mm"]), float(event["y_mm"]), reading)
-            elif event["event"] == "done" and press in begun:
-                done[press] = reading
-            else:
-                raise ValueError(f"event {event['event']!r} of press {press}")
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: line {number} is no journal entry ({error})") from error
-    return [(*begun[press], done[press]) for press in sorted(done)]
+            if path.exists():
+                path.rmdir()
+            unfinished.rename(path)
+        except OSError:
+            refuse_existing(path)
+            raise
 
 
 def _validate(recording: Recording) -> None:
+    if not isinstance(recording.source, Mapping):
+        raise InputError(f"source is {shortened(recording.source)}, expected a mapping")
+    try:
+        json.dumps(dict(recording.source), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"source is {shortened(dict(recording.source))}, expected what JSON can hold ({error})"
+        ) from error
     readings, presses = recording.readings, recording.presses_mm
     if readings.ndim != 2 or not 1 <= readings.shape[1] <= MAX_FIBRES or len(readings) < 2:
         raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
@@ -244,13 +252,19 @@ def _validate(recording: Recording) -> None:
         raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
     if recording.begun.shape != (len(presses),) or recording.lifted.shape != (len(presses),):
         raise InputError(f"{len(presses)} presses have {recording.begun.size} begins and {recording.lifted.size} ends")
-    for name, values in (("readings", readings), ("times", recording.times_s), ("presses", presses)):
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values.reshape(len(values), -1)).all(axis=1)))
-            raise InputError(f"{name} hold NaN or infinity (first in row {row}), expected finite numbers")
+    for name, values, limit, unit in (
+        ("readings", readings, MAX_VOLTS, "V"),
+        ("times", recording.times_s, MAX_S, "s"),
+        ("presses", presses, MAX_MM, "mm"),
+    ):
+        refuse_beyond(name, values.reshape(len(values), -1), limit, unit)
     if (np.diff(recording.times_s) <= 0).any():
         row = int(np.argmax(np.diff(recording.times_s) <= 0)) + 1
         raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
+    if not MIN_RATE_HZ <= recording.rate_hz <= MAX_RATE_HZ:
+        raise InputError(
+            f"times give {recording.rate_hz:g} readings a second, allowed is {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"
+        )
     edges = np.column_stack([recording.begun, recording.lifted]).ravel()
     late = np.diff(edges, prepend=0, append=len(readings) + 1) < 1
     if late.any():

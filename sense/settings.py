@@ -6,12 +6,15 @@ from pydantic import Field
 
 from design.settings import Section
 
+Features = Literal["windows", "published"]
+Split = Literal["random", "chronological"]
+
 
 class Rig(Section):
     """`[rig]`: how presses are recorded, and how the simulated pad answers."""
 
     presses: int = Field(default=1500, ge=1, le=1_000_000, description="presses in a recording")
-    rate_hz: float = Field(default=13.3, gt=0, le=10_000, description="readings per second")
+    rate_hz: float = Field(default=13.3, ge=0.1, le=10_000, description="readings per second")
     readings_per_press: int = Field(
         default=40, ge=8, le=100_000, description="readings in the cycle of a press: down at its half, up at its end"
     )
@@ -26,10 +29,10 @@ class Rig(Section):
 class Localizer(Section):
     """`[localizer]`: how places are learnt from readings."""
 
-    features: Literal["windows", "published"] = Field(
+    features: Features = Field(
         default="windows", description="17 baseline-free window means a fibre, or the 3 published filtered values"
     )
-    split: Literal["random", "chronological"] = Field(
+    split: Split = Field(
         default="random", description="presses held back for the test: drawn at random, or the last ones"
     )
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")

@@ -1,8 +1,10 @@
 """The front door: what it imports, how it fails, and the whole chain on a small pad."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -105,6 +107,43 @@ def test_a_recording_of_a_real_pad_is_never_replaced(tmp_path):
     assert result.returncode == 2
     assert "choose another --out" in result.stderr
     assert (recording / "start.json").exists()
+
+
+def test_what_would_fail_late_is_refused_before_anything_is_done(tmp_path):
+    (tmp_path / "pad.toml").write_text("[rig]\npresses = 3\n")
+    result = padforge("run", cwd=tmp_path)
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
+    assert "3 presses" in result.stderr
+    (tmp_path / "pad.toml").write_text("[pad]\npitch_mm = 0.3\n")
+    assert "ridge_width_mm" in padforge("run", cwd=tmp_path).stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["pad.toml"]
+
+
+def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain):
+    folder, _ = chain
+    recording = folder / "out" / "pad" / "recording" / "readings.bin"
+    before = recording.read_bytes()
+    (folder / "long.toml").write_text(SMALL.replace("steps = 60", "steps = 1000000"))
+    process = subprocess.Popen([sys.executable, "-m", "padforge", "run", "--spec", "long.toml"], cwd=folder)
+    time.sleep(12)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    assert recording.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", ['{"format": "padforge-design/1"}', '{"format": "padforge-design/1", "terms": 3}'])
+def test_a_report_on_damaged_files_names_them(tmp_path, content):
+    (tmp_path / "design.json").write_text(content)
+    result = padforge("report", ".", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "design.json: not as padforge writes it" in result.stderr
+
+
+def test_a_bare_command_shows_its_help(tmp_path):
+    result = padforge(cwd=tmp_path)
+    assert result.returncode == 2
+    assert "Commands:\n" in result.stderr
+    assert "Usage: padforge [OPTIONS]" in result.stderr
 
 
 def test_init_writes_settings_that_every_command_reads(tmp_path):

@@ -9,7 +9,6 @@ spans are monotone, so most pieces are taken or left whole by comparing ends; on
 meet are roots sought.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,10 @@ from numba import njit
 
 from .press import INVERSE
 from .quadrature import HALVINGS, across, measure
+from .reach import EPS, touched_range
 from .roots import SCRATCH, roots_in_unit
 
-EPS = 2.0**-52
+_PROBES = (0.22, 0.5, 0.78)
 
 
 @njit(cache=True, error_model="numpy")
@@ -76,9 +76,15 @@ def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: floa
     found, begin = 0, a
     for i in range(count + 1):
         end = b if i == count else roots[i]
-        s = 0.5 * (begin + end)
-        t, v = span[0] + span[1] * s, across(span, s)
-        if t * t + v * v <= radius * radius + 2 * radius * tolerance:
+        # no sign changes between roots, but a touch may lie there: the largest of three values has the sign
+        largest = 0.0
+        for share in _PROBES:
+            s = begin + share * (end - begin)
+            t, v = span[0] + span[1] * s, across(span, s)
+            depth = radius * radius - t * t - v * v
+            if abs(depth) > abs(largest):
+                largest = depth
+        if largest >= -2 * radius * tolerance:
             found = _keep(stretches, found, begin, end)
         begin = end
     return found
@@ -128,9 +134,14 @@ def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, 
             begin = here
             for i in range(count + 1):
                 end = after if i == count else roots[i]
-                s = 0.5 * (begin + end)
-                x = (s - here) / (after - here)
-                if l0 + (l1 - l0) * x - tolerance <= across(span, s) <= u0 + (u1 - u0) * x + tolerance:
+                above, below = 0.0, 0.0
+                for share in _PROBES:
+                    s = begin + share * (end - begin)
+                    x, at = (s - here) / (after - here), across(span, s)
+                    to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
+                    above = to_upper if abs(to_upper) > abs(above) else above
+                    below = to_lower if abs(to_lower) > abs(below) else below
+                if above >= -tolerance and below >= -tolerance:
                     found = _keep(stretches, found, begin, end)
                 begin = end
         here, v = after, v_after
@@ -201,7 +212,7 @@ def fibre_signal(
     total, visited = 0.0, 0
     j = max(np.searchsorted(t, begin, side="right") - 1, 0)
     while j < n - 1 and t[j] < end:
-        if min(v[j], v[j + 1]) <= cv + reach[3] and max(v[j], v[j + 1]) >= cv + reach[2]:
+        if min(v[j], v[j + 1]) <= cv + reach[3] + tolerance and max(v[j], v[j + 1]) >= cv + reach[2] - tolerance:
             s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
             for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
                 total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], radius, weight, length, scratch)
@@ -217,42 +228,6 @@ def make_scratch(breaks: int) -> Any:
     Each of the pieces between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it in 7 parts.
     """
     return np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((HALVINGS + 2, 2)), np.empty((4 * breaks + 8, 2))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def family_strays(cross: Any) -> Any:
-    """(P, 2) how far the fibres of each family stray from their own level, from knots' cross (P, 2M, n)."""
-    population, fibres, _ = cross.shape
-    grid = fibres // 2
-    out = np.zeros((population, 2))
-    for p in range(population):
-        for f in range(fibres):
-            level = f % grid + 1
-            out[p, f // grid] = max(out[p, f // grid], level - cross[p, f].min(), cross[p, f].max() - level)
-    return out
-
-
-@njit(cache=True, error_model="numpy")
-def touched_range(cv: float, reach: Any, stray: float, grid: int) -> tuple[int, int]:
-    """Fibres [first, end) of a family, by index, that a press at cross coordinate cv can touch.
-
-    Fibre i (from 0) keeps to level i + 1 within the family's stray.
-    """
-    first = min(max(math.ceil(cv + reach[2] - stray) - 1, 0.0), float(grid))
-    end = min(max(math.floor(cv + reach[3] + stray), 0.0), float(grid))
-    return int(first), int(end)
-
-
-@njit(cache=True, error_model="numpy")
-def count_touched(strays: Any, presses: Any, reach: Any, grid: int) -> Any:
-    """(Q + 1,) running number of fibres that presses (Q, 2) can touch on one pad with strays (2,)."""
-    starts = np.zeros(len(presses) + 1, np.int64)
-    for q in range(len(presses)):
-        starts[q + 1] = starts[q]
-        for family in range(2):
-            first, end = touched_range(presses[q, 1 - family], reach[family], strays[family], grid)
-            starts[q + 1] += max(end - first, 0)
-    return starts
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

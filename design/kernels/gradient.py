@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .exact import EPS, local_cubic, make_scratch, stretches_inside, touched_range
+from .exact import local_cubic, make_scratch, stretches_inside
 from .press import INVERSE, MANHATTAN, UNIFORM, weigh
 from .quadrature import HALVINGS, PRECISION, across, kronrod
+from .reach import EPS, touched_range
 
 GRAZING = 0.02
 """Least sine of the angle of a fibre to the boundary: flatter ones change their length there without bound."""
@@ -178,7 +179,7 @@ def signals_gradient(
             ct, cv = presses[q, family], presses[q, 1 - family]
             shape = chains[0] if family == 0 else chains[1]
             tolerance = 4 * EPS * (abs(cv) + radius)
-            low, high = cv + reach[family, 2], cv + reach[family, 3]
+            low, high = cv + reach[family, 2] - tolerance, cv + reach[family, 3] + tolerance
             first, last = touched_range(cv, reach[family], strays[family], grid)
             for f in range(family * grid + first, family * grid + last):
                 t, v, d = travel[f], cross[f], slope[f]

@@ -234,3 +234,42 @@ def test_odd_but_fair_input_is_taken_as_it_is():
     assert signals_sparse(pad, []).shape == (0, 4)
     with pytest.raises(InputError, match="presses"):
         signals(pad, [[np.nan, 1]])
+
+
+@pytest.mark.parametrize("radius", [1e-9, 0.25, 0.4, 1.0])
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_a_circle_that_only_touches_a_fibre_adds_nothing(radius, weight):
+    """From both sides, and exactly at the radius, where the crossing is a double root."""
+    for nudge in (0.0, 1e-15, -1e-15):
+        found = signals(
+            Morphology.straight(2), [[1.5, 1 + radius + nudge]], Contact(radius=radius, sides=None, weight=weight)
+        )
+        assert found[0, 0] <= 1e-6 / radius
+
+
+@pytest.mark.parametrize("sides", [3, 4, 5, 6, 8, 12, 30])
+def test_a_fibre_on_an_edge_counts_whole_whichever_way_rounding_goes(sides):
+    rng = np.random.default_rng(sides)
+    normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
+    for radius in rng.uniform(0.1, 1, 50):
+        apothem, edge = radius * np.cos(np.pi / sides), 2 * radius * np.sin(np.pi / sides)
+        for nx, ny in zip(np.cos(normal), np.sin(normal), strict=True):
+            if abs(nx) < 1e-9:
+                found = signals(Morphology.straight(3), [[2.5, 2 - apothem * ny]], Contact(radius=radius, sides=sides))
+                assert found[0, 1] == pytest.approx(edge, rel=1e-6)
+            if abs(ny) < 1e-9:
+                found = signals(Morphology.straight(3), [[2 - apothem * nx, 2.5]], Contact(radius=radius, sides=sides))
+                assert found[0, 4] == pytest.approx(edge, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "knots", [np.zeros((3, 2, 2)), np.zeros((2, 2)), np.full((4, 2, 2), np.nan), np.zeros((4, 3, 2)), "x"]
+)
+def test_knots_that_are_no_pad_are_refused(knots):
+    with pytest.raises(InputError, match="knots"):
+        signals(knots, [[1, 1]])
+
+
+def test_no_contact_at_all_is_a_row_of_zeros():
+    assert not signals(Morphology.straight(2), np.empty((5, 0, 2))).any()
+    assert signals(Morphology.straight(2), np.empty((5, 0, 2))).shape == (5, 4)

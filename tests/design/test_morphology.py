@@ -101,3 +101,17 @@ def test_a_torn_published_file_is_refused(published, tmp_path):
 def test_a_recording_is_no_morphology(published):
     with pytest.raises(InputError, match="no variable para"):
         Morphology.load(published / "para5_long_first4500.mat")
+
+
+@pytest.mark.parametrize(("grid", "knots"), [(0, 1), (-1, 2), (2, -1)])
+def test_impossible_counts_are_refused(grid, knots):
+    with pytest.raises(InputError, match="allowed is at least"):
+        Morphology.random(grid, knots)
+
+
+@pytest.mark.parametrize("pitch", ["1" + "0" * 400, "[" * 100_000])
+def test_numbers_and_nesting_beyond_measure_are_refused(tmp_path, pitch):
+    path = tmp_path / "pad.json"
+    path.write_text('{"format": "padforge-morphology/1", "knots": [], "pitch_mm": ' + pitch + "}")
+    with pytest.raises(InputError, match=r"pad\.json"):
+        Morphology.load(path)

@@ -7,7 +7,7 @@ from design import Morphology
 from design.rules import bend_radius, check
 from design.settings import Rules
 
-NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e9)
+NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
 
 
 def only(**limits):

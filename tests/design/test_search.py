@@ -1,5 +1,7 @@
 """Both searches: they improve, obey the rules, and depend on the seed alone."""
 
+import signal
+
 import pytest
 import torch
 
@@ -64,3 +66,19 @@ def test_a_lost_fibre_tells_nothing():
     signals = torch.tensor([[0.0, 9.0], [0.0, 0.0]])
     kept = torch.tensor([[0.0, 1.0]])
     assert ambiguity(signals, presses, kept, sigma=0.1).item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_ctrl_c_keeps_the_best_so_far(method):
+    """The signal comes from the first report; what was found by then is returned, and says so."""
+    settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
+    found = search(settings=settings, report=lambda *step: signal.raise_signal(signal.SIGINT))
+    assert found.interrupted
+    assert found.morphology.grid == 4
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
+    """Of 2M = 32 fibres taken 8 at a time there are ten million losses: a sample stands for them."""
+    terms = score(Morphology.straight(16), Contact(), lost=8)
+    assert 0 < terms["ambiguity_lost_0"] <= terms["ambiguity_lost_8"]

@@ -1,9 +1,12 @@
+import zipfile
+
 import numpy as np
 import pytest
 import trimesh
 
 from design.errors import InputError
 from design.morphology import Morphology
+from fabricate.export import build
 from fabricate.outlines import Plan
 from fabricate.printability import SOUND, Finding, check, check_mesh, inspect, inspect_mesh
 from fabricate.settings import DEFAULTS, Printer, Settings
@@ -185,3 +188,21 @@ def test_findings_are_plain_json():
     document = found(level_pad(1.8, 1.2), "same_family_crossings").document()
     assert list(document) == ["name", "status", "measured", "limit", "message", "places_mm"]
     assert all(isinstance(value, float) for place in document["places_mm"] for value in place)
+
+
+def test_a_3mf_in_inches_is_as_large_as_it_says(tmp_path):
+    build(Morphology.straight(2), tmp_path, ["3mf"])
+    with zipfile.ZipFile(tmp_path / "mould.3mf") as source, zipfile.ZipFile(tmp_path / "inch.3mf", "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name).replace(b"millimeter", b"inch"))
+    beds = [{f.name: f for f in check_mesh(tmp_path / name)}["bed"] for name in ("mould.3mf", "inch.3mf")]
+    assert [bed.status for bed in beds] == ["pass", "fail"]
+
+
+@pytest.mark.parametrize("content", [b"", b"solid\n", b"\0" * 84, b"\xff" * 500])
+def test_a_torn_mesh_is_refused_on_one_line(tmp_path, content):
+    path = tmp_path / "torn.stl"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"torn\.stl") as refusal:
+        check_mesh(path)
+    assert "\n" not in str(refusal.value)

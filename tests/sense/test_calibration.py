@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from design.errors import InputError
-from sense import Localizer, Recording, calibrate, evaluate, import_mat, locate
-from sense.calibration import lost_subsets, split_presses
+from design.losses import lost_subsets
+from design.settings import validated
+from sense import Localizer, Recording, Rig, calibrate, evaluate, import_mat, locate
+from sense.calibration import split_presses
 from sense.settings import Localizer as Options
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
@@ -38,7 +41,7 @@ def test_presses_held_back_leave_no_trace_in_the_localizer(recording: Recording,
     plain, _ = calibrate(recording, SHORT, split=split)
     test = np.array(plain.test)
     readings, places = np.array(recording.readings), np.array(recording.presses_mm)
-    places[test] = 1e6 + np.arange(len(test))[:, None]
+    places[test] = 5e4 + np.arange(len(test))[:, None]
     for press in test:  # while the probe is down, readings belong to one press alone
         readings[recording.begun[press] : recording.lifted[press]] = 77.0
     spoilt, _ = calibrate(replace(recording, readings=readings, presses_mm=places), SHORT, split=split)
@@ -131,3 +134,38 @@ def test_a_short_training_on_the_published_recording_is_already_near(published: 
     _, document = calibrate(recording, Options(members=1, hidden=96, epochs=25, lost=1))
     assert document["test_presses"] == 675
     assert document["errors"][0]["mean_mm"] < 2.4
+
+
+def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sense.training
+
+    train = sense.training.train
+
+    def diverged(*arguments: Any) -> Any:
+        return {name: weight * np.float32(np.nan) for name, weight in train(*arguments).items()}
+
+    monkeypatch.setattr(sense.training, "train", diverged)
+    with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate 0.004, try a lower one"):
+        calibrate(recording, SHORT)
+
+
+@pytest.mark.parametrize("volts", [0.0, 1e-160, 1000.0])
+def test_readings_at_the_limits_give_finite_errors(recording: Recording, volts: float) -> None:
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], recording.readings.shape)
+    places = np.sign(recording.presses_mm) * 1e5
+    found, document = calibrate(replace(recording, readings=volts * signs, presses_mm=places), SHORT)
+    for row in (*document["errors"], *evaluate(found, recording)["errors"]):
+        assert np.isfinite(list(row.values())).all()
+
+
+def test_levels_and_test_presses_that_are_not_there_are_refused(localizer: Localizer, recording: Recording) -> None:
+    with pytest.raises(InputError, match="lost names no number of fibres"):
+        evaluate(localizer, recording, [])
+    with pytest.raises(InputError, match="test press 300 of the localizer: no such press, allowed are 0 to 299"):
+        evaluate(replace(localizer, test=(0, 300)), recording, [0])
+
+
+@pytest.mark.parametrize("rate_hz", [1e-300, 0.0999, np.inf])
+def test_a_rate_no_rig_has_is_refused(rate_hz: float) -> None:
+    with pytest.raises(InputError, match=r"\[rig\] rate_hz: got"):
+        validated(Rig, {"rate_hz": rate_hz}, "[rig]")

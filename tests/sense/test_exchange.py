@@ -136,3 +136,37 @@ def test_bytes_at_random_are_an_input_error_and_nothing_else(tmp_path_factory, c
 def test_places_are_written_one_line_a_press(tmp_path: Path) -> None:
     write_places(np.array([[1.23456, -2.0], [0.0, 3.5]]), tmp_path / "places.csv")
     assert (tmp_path / "places.csv").read_text() == "press,x_mm,y_mm\n0,1.2346,-2.0000\n1,0.0000,3.5000\n"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
+def test_csv_may_begin_with_a_byte_order_mark(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "r.csv").write_text(lines(FINE), encoding=encoding)
+    assert import_csv(tmp_path / "r.csv").presses_mm.tolist() == [[3, 4], [-1, 0]]
+
+
+def test_csv_with_semicolons_is_told_of_commas(tmp_path: Path) -> None:
+    (tmp_path / "r.csv").write_text(lines(FINE).replace(",", ";"))
+    with pytest.raises(InputError, match="separated by commas, not by semicolons"):
+        import_csv(tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [("6,1,1e30,,", "readings hold 1e"), ("6,1,2,1e200,8", "presses hold 1e"), ("1e300,1,2,,", "times hold 1e")],
+)
+def test_implausible_numbers_are_refused(tmp_path: Path, row: str, message: str) -> None:
+    (tmp_path / "r.csv").write_text(lines([*FINE, row]))
+    with pytest.raises(InputError, match=rf"r\.csv: {message}.*allowed is"):
+        import_csv(tmp_path / "r.csv")
+
+
+def test_a_folder_for_a_file_and_a_file_for_a_folder_are_one_line(recording: Recording, tmp_path: Path) -> None:
+    for read in (import_csv, import_mat):
+        with pytest.raises(InputError, match=r"directory|folder"):
+            read(tmp_path)
+    (tmp_path / "file").touch()
+    for path in (tmp_path, tmp_path / "file" / "r.csv"):
+        with pytest.raises(InputError, match="cannot be written"):
+            export_csv(recording, path)
+        with pytest.raises(InputError, match="cannot be written"):
+            write_places(np.zeros((1, 2)), path)

@@ -1,6 +1,7 @@
 """The network and the localizer: NumPy says what torch says, masks hide, files keep every bit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -136,3 +137,113 @@ def test_a_dead_fibre_is_scaled_to_finite_numbers() -> None:
     inputs = np.zeros((10, 2, 3))
     inputs[:, 0] = np.random.default_rng(0).standard_normal((10, 3))
     assert np.isfinite(Scaling.fit(inputs, np.zeros((10, 2))).inputs(inputs)).all()
+
+
+def edited(document: dict, path: str, value: object) -> dict:
+    """`document` with the entry at `path`, keys and indices with dots between them, replaced."""
+    *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    place = document
+    for part in way:
+        place = place[part]
+    place[last] = value
+    return document
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        ("features", "smell", "features"),
+        ("features", "published", r"scaling\.centre_v"),
+        ("fibres", 3, r"scaling\.centre_v"),
+        ("fibres", 0, "fibres"),
+        ("fibres", True, "fibres"),
+        *(("rate_hz", value, "rate_hz") for value in (0, -1.0, "13", np.nan, np.inf, 1e-300, None)),
+        *(
+            (f"scaling.{key}.0.0", value, key)
+            for key in ("centre_v", "spread_v")
+            for value in (np.nan, np.inf, 1e9, "1")
+        ),
+        ("scaling.spread_v.0.0", 0.0, "spread_v"),
+        ("scaling.spread_v.0", [1.0], "spread_v"),
+        ("scaling.centre_v", [], "centre_v"),
+        *(("scaling.middle_mm", value, "middle_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
+        *(("scaling.span_mm", value, "span_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
+        ("split", "alphabetical", "split"),
+        *(("test", value, "test") for value in ([], [0.5], ["a"], [-1], [True], {}, [3, 3], [7])),
+        ("errors", [{}], r"errors\.0\.lost"),
+        ("errors", "none", "errors"),
+        ("learnt_from", 7, "learnt_from"),
+        ("provenance", [], "provenance"),
+        ("more", 1, "more"),
+    ],
+)
+def test_a_document_with_a_value_out_of_bounds_is_refused(
+    localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
+) -> None:
+    localizer.save(tmp_path)
+    document = edited(json.loads((tmp_path / "localizer.json").read_text()), path, value)
+    (tmp_path / "localizer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=rf"localizer\.json: .*{named}") as caught:
+        Localizer.load(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda w: {**w, "last.b": w["last.b"] * np.float32(np.nan)},
+        lambda w: {**w, "first.w": w["first.w"] + np.float32(1e30)},
+        lambda w: {**w, "first.w": w["first.w"][:, 1:]},
+        lambda w: {**w, "first.w": w["first.w"][:0]},
+        lambda w: {**w, "hidden.b": w["hidden.b"].astype(np.float64)},
+        lambda w: {name: weight for name, weight in w.items() if name != "last.w"},
+        lambda w: {},
+    ],
+)
+def test_weights_that_do_not_fit_the_document_are_refused(localizer: Localizer, tmp_path: Path, change) -> None:
+    replace(localizer, weights=change(dict(localizer.weights))).save(tmp_path)
+    with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
+        Localizer.load(tmp_path)
+
+
+@pytest.mark.parametrize("value", [np.nan, object()])
+def test_a_save_that_fails_leaves_the_model_that_was_there(localizer: Localizer, tmp_path: Path, value: object) -> None:
+    localizer.save(tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    other = {name: weight + 1 for name, weight in localizer.weights.items()}
+    with pytest.raises(InputError, match="cannot be written as JSON"):
+        replace(localizer, weights=other, provenance={"note": value}).save(tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    (tmp_path / "localizer.json").unlink()
+    (tmp_path / "localizer.json").mkdir()
+    before = (tmp_path / "localizer.safetensors").read_bytes()
+    with pytest.raises(InputError, match="cannot be written"):
+        replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()}).save(tmp_path)
+    assert (tmp_path / "localizer.safetensors").read_bytes() == before
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        localizer.save(tmp_path / "file")
+
+
+@pytest.mark.parametrize("lost", [[10**20], [0.5], [True], ["a"]])
+def test_a_mask_that_is_no_index_is_refused(localizer: Localizer, recording: Recording, lost: list) -> None:
+    with pytest.raises(InputError, match=r"lost fibre .*no such fibre, allowed are 0 to 3"):
+        localizer.places(localizer.inputs(recording), lost)
+
+
+def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localizer, recording: Recording) -> None:
+    readings = 1000.0 * np.random.default_rng(0).choice([-1, 1], recording.readings.shape)
+    still = Scaling(localizer.scaling.centre, np.full_like(localizer.scaling.spread, 1e-40), np.zeros(2), 1e5)
+    found = replace(localizer, scaling=still)
+    assert np.isfinite(found.places(found.inputs(replace(recording, readings=readings)))).all()
+
+
+def test_a_fibre_that_varies_by_rounding_only_is_not_blown_up() -> None:
+    inputs = 3.3 + 1e-15 * np.random.default_rng(0).standard_normal((10, 2, 3))
+    scaling = Scaling.fit(inputs, np.zeros((10, 2)))
+    assert (scaling.spread == 1).all()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sense.recording
 from design.errors import InputError
 from sense import Recorder, Recording
 
@@ -123,3 +124,137 @@ def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
 def test_what_does_not_fit_together_is_refused(recording: Recording, change, message: str) -> None:
     with pytest.raises(InputError, match=message):
         replace(recording, **change(recording))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: {"readings": spoiled(r.readings, (7, 0), -1e30)}, r"readings hold -1e\+30 V \(first in row 7\)"),
+        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), 1e6)}, r"presses hold 1e\+06 mm .*row 3.*allowed"),
+        (lambda r: {"times_s": spoiled(r.times_s, -1, 1e30)}, r"times hold 1e\+30 s .*allowed"),
+        (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e-300}, "times give .* readings a second, allowed"),
+        (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e5}, "times give 1e-05 readings a second, allowed"),
+        (lambda r: {"readings": "x"}, "readings are 'x'"),
+        (lambda r: {"readings": [[1.0], [1.0, 2.0]]}, "readings are .*expected an array of real numbers"),
+        (lambda r: {"readings": r.readings + 1j}, "readings are .*complex128"),
+        (lambda r: {"times_s": None}, "times_s are None"),
+        (lambda r: {"begun": r.begun + np.where(r.begun == 20, np.nan, 0)}, "begun are .*whole numbers"),
+        (lambda r: {"lifted": r.lifted + 0.5}, "lifted are .*whole numbers"),
+        (lambda r: {"lifted": [10**20] * len(r.lifted)}, "lifted are .*whole numbers"),
+        (lambda r: {"source": "a rig"}, "source is 'a rig', expected a mapping"),
+        (lambda r: {"source": {"gain": np.nan}}, "source is .*expected what JSON can hold"),
+    ],
+)
+def test_what_no_rig_records_is_refused(recording: Recording, change, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        replace(recording, **change(recording))
+    assert "\n" not in str(caught.value)
+
+
+def test_indices_may_be_whole_floats(recording: Recording) -> None:
+    assert replace(recording, begun=recording.begun.astype(float)) == recording
+
+
+def test_implausible_readings_in_the_stream_are_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run", 2, {}, {}) as recorder:
+        recorder.append(np.arange(9.0), np.full((9, 2), 1e300))
+        recorder.begin((0.0, 0.0), 3)
+        recorder.done(6)
+    with pytest.raises(
+        InputError, match=r"run: readings hold 1e\+300 V \(first in row 0\), allowed is -1000 to 1000 V"
+    ):
+        Recording.open(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *(
+            ('"reading": 20,', f'"reading": {value},')
+            for value in ("1e999", "1e30", "20.0", "true", '"20"', "-1", "NaN")
+        ),
+        *(('"press": 0,', f'"press": {value},') for value in ("1e999", "0.0", "false", '"0"', "null", "9" * 30)),
+        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"', "NaN", "null")),
+        ('"event": "begun", ', ""),
+        ('{"event"', "[" * 100_000 + '{"event"'),
+        ('{"event"', '3\n{"event"'),
+    ],
+)
+def test_a_journal_entry_of_other_values_is_refused(folder: Path, old: str, new: str) -> None:
+    journal = folder / "journal.ndjson"
+    text = journal.read_text()
+    assert old in text
+    journal.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=r"journal\.ndjson: line 1 is no journal entry") as caught:
+        Recording.open(folder)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("source", [[1], "simulated", None, 3])
+def test_a_source_that_is_no_mapping_is_refused(folder: Path, source: object) -> None:
+    document = json.loads((folder / "start.json").read_text())
+    (folder / "start.json").write_text(json.dumps(document | {"source": source}))
+    with pytest.raises(InputError, match=r"source is .*expected a mapping"):
+        Recording.open(folder)
+
+
+def test_a_folder_that_is_no_recording_is_said_to_be_none(folder: Path, tmp_path: Path) -> None:
+    for path in (tmp_path / "absent", tmp_path, folder / "start.json"):
+        with pytest.raises(InputError, match=r"no recording, expected a folder with start\.json, journal\.ndjson and"):
+            Recording.open(path)
+    (folder / "journal.ndjson").unlink()
+    (folder / "journal.ndjson").mkdir()
+    with pytest.raises(InputError, match=r"journal\.ndjson: cannot be read \(Is a directory\)"):
+        Recording.open(folder)
+
+
+@pytest.mark.parametrize("made_before", [False, True])
+def test_of_two_saves_into_one_folder_the_first_stays_and_the_second_is_told(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_before: bool
+) -> None:
+    path = tmp_path / "run"
+    if made_before:
+        path.mkdir()
+    late = replace(recording, times_s=recording.times_s + 1)
+    sync = Recorder.sync
+
+    def overtaken(recorder: Recorder) -> None:
+        sync(recorder)
+        monkeypatch.setattr(Recorder, "sync", sync)
+        recording.save(path, {})
+
+    monkeypatch.setattr(Recorder, "sync", overtaken)
+    with pytest.raises(InputError, match="never written over"):
+        late.save(path, {})
+    assert Recording.open(path) == recording
+    assert [found.name for found in tmp_path.iterdir()] == ["run"]
+
+
+def test_of_two_recorders_in_one_folder_the_second_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Recorder(tmp_path / "run", 3, {}, {})
+    before = (tmp_path / "run" / "start.json").read_bytes()
+    refuse_existing = sense.recording.refuse_existing
+
+    def looked_too_early(path: Path) -> None:
+        monkeypatch.setattr(sense.recording, "refuse_existing", refuse_existing)
+
+    monkeypatch.setattr(sense.recording, "refuse_existing", looked_too_early)
+    with pytest.raises(InputError, match="never written over"):
+        Recorder(tmp_path / "run", 4, {}, {})
+    first.__exit__(None, None, None)
+    assert (tmp_path / "run" / "start.json").read_bytes() == before
+
+
+def test_a_place_that_cannot_be_written_is_one_clear_line(recording: Recording, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    for path in (tmp_path / "file", tmp_path / "file" / "below" / "run"):
+        with pytest.raises(InputError, match="file is a file, expected a folder"):
+            recording.save(path, {})
+        with pytest.raises(InputError, match="file is a file, expected a folder"):
+            Recorder(path, 3, {}, {})
+    with pytest.raises(InputError, match=r"cannot be written \(File name too long\)"):
+        recording.save(tmp_path / ("n" * 300), {})
+    assert (tmp_path / "file").read_text() == "kept"
+    assert [found.name for found in tmp_path.iterdir()] == ["file"]

@@ -114,3 +114,47 @@ def test_a_torn_recording_is_said_to_be_one(padforge_sense) -> None:
 def test_importing_takes_no_torch(module: str) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(
+    padforge_sense, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sense.figures
+
+    padforge_sense("record", "--out", "rec")
+    assert padforge_sense("calibrate", "rec", "--out", "model")[0] == 0
+    before = {path.name: path.read_bytes() for path in Path("model").iterdir()}
+
+    def full(document: object, path: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sense.figures, "draw_error_by_loss", full)
+        code, _, err = padforge_sense("calibrate", "rec", "--seed", "5", "--out", "model")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "model: cannot be written (No space left on device)" in err
+    assert {path.name: path.read_bytes() for path in Path("model").iterdir()} == before
+    assert padforge_sense("calibrate", "rec", "--seed", "5", "--out", "model")[0] == 0
+    assert {path.name for path in Path("model").iterdir()} == set(before)
+    assert Path("model/localizer.json").read_bytes() != before["localizer.json"]
+
+
+def test_numbers_and_places_that_cannot_be_are_one_line(padforge_sense) -> None:
+    padforge_sense("record", "--out", "rec")
+    padforge_sense("calibrate", "rec", "--out", "model")
+    huge = "9" * 20
+    for arguments, message in (
+        (("locate", "--model", "model", "rec", "--mask", huge, "--out", "p.csv"), f"lost fibre {huge}: no such fibre"),
+        (("evaluate", "--model", "model", "rec", "--lost", huge), f"lost is {huge}, allowed is 0 to 3"),
+        (("evaluate", "--model", "model", "rec", "--lost", ""), "lost names no number of fibres"),
+        (("locate", "--model", "model", "rec", "--out", "pad.toml/p.csv"), "pad.toml/p.csv: cannot be written"),
+        (("locate", "--model", "model", "rec", "--out", "model"), "directory"),
+        (("calibrate", "rec", "--out", "pad.toml/model"), "pad.toml is a file, expected a folder"),
+        (("calibrate", "pad.toml", "--out", "m"), "is a file"),
+        (("calibrate", "absent", "--out", "m"), "absent: no recording, expected a folder with start.json"),
+        (("record", "--out", "pad.toml/rec"), "pad.toml is a file, expected a folder"),
+        (("import", "rec", "--out", "r"), "is a directory"),
+    ):
+        code, out, err = padforge_sense(*arguments)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert message in err

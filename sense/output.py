@@ -1,0 +1,51 @@
+"""Where results go: an output that cannot be written is one clear line, and several files appear together."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from design.errors import InputError
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the system has against writing `path` into one line.
+
+    Raises:
+        InputError: naming `path` and the reason.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def refuse_unwritable(folder: Path) -> None:
+    """Raise InputError if files cannot be put into `folder`, or it is not there and cannot be made."""
+    with writing(folder):
+        there = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+        if not there.is_dir():
+            raise InputError(f"{folder}: cannot be written, {there} is a file, expected a folder")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(f"{folder}: cannot be written, {there} does not allow it; choose another folder")
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder in `folder`; on success its files move to `folder`, on failure they vanish.
+
+    Raises:
+        InputError: `folder` cannot be written.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as name:
+            yield Path(name)
+            files = sorted(Path(name).iterdir())
+            in_the_way = [file.name for file in files if (folder / file.name).is_dir()]
+            if in_the_way:
+                raise InputError(f"{folder / in_the_way[0]}: is a folder, expected a file or nothing")
+            for file in files:
+                file.replace(folder / file.name)
