@@ -88,7 +88,9 @@ def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:
         for way, colour in colours.items():
             points = [(1e3 * r.seconds, max(r.error or 0, 1e-16)) for r in measured if (r.case, r.way) == (case, way)]
             if points:
-                axes.loglog(*zip(*points, strict=True), "o-", color=colour, label=way, markersize=4, linewidth=1.4)
+                marker = "o-" if len(points) > 1 else "D"
+                size = 4 if len(points) > 1 else 8
+                axes.loglog(*zip(*points, strict=True), marker, color=colour, label=way, markersize=size, linewidth=1.4)
         axes.set_title(case, loc="left", color=INK)
         axes.set_xlabel("run time (ms)")
         axes.grid(color=FAINT, linewidth=0.6)
