@@ -212,11 +212,11 @@ def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[
 def _numbers(values: ArrayLike, name: str) -> Array:
     try:
         found = np.asarray(values)
-        if found.dtype.kind not in "fiub":
-            raise InputError(f"{name} are {found.dtype} values, expected real numbers")
-        return found.astype(np.float64)
     except ValueError as error:
-        raise error if isinstance(error, InputError) else InputError(f"{name} are not numbers ({error})") from error
+        raise InputError(f"{name} are not numbers in rows of one length") from error
+    if found.dtype.kind not in "fiub":
+        raise InputError(f"{name} are {found.dtype} values, expected real numbers")
+    return found.astype(np.float64)
 
 
 def boustrophedon(grid: int, side: int, jitter: float = 0.0, seed: int = 214) -> Array:

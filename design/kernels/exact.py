@@ -19,7 +19,8 @@ from .quadrature import HALVINGS, across, measure
 from .reach import EPS, touched_range
 from .roots import SCRATCH, roots_in_unit
 
-_PROBES = (0.22, 0.5, 0.78)
+_PROBES = (0.5, 0.22, 0.78)
+_CLEAR = 1e6  # tolerances a value must be away from zero to be believed without a second look
 
 
 @njit(cache=True, error_model="numpy")
@@ -84,6 +85,8 @@ def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: floa
             depth = radius * radius - t * t - v * v
             if abs(depth) > abs(largest):
                 largest = depth
+            if abs(largest) > _CLEAR * radius * tolerance:
+                break
         if largest >= -2 * radius * tolerance:
             found = _keep(stretches, found, begin, end)
         begin = end
@@ -141,6 +144,8 @@ def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, 
                     to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
                     above = to_upper if abs(to_upper) > abs(above) else above
                     below = to_lower if abs(to_lower) > abs(below) else below
+                    if min(abs(above), abs(below)) > _CLEAR * tolerance:
+                        break
                 if above >= -tolerance and below >= -tolerance:
                     found = _keep(stretches, found, begin, end)
                 begin = end
