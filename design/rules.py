@@ -38,7 +38,7 @@ class Violation:
     def __str__(self) -> str:
         names = " and ".join(f"fibre {f}" for f in self.fibres) or "pad"
         place = "" if self.place_mm is None else f" at ({self.place_mm[0]:.1f}, {self.place_mm[1]:.1f}) mm"
-        return f"{self.rule}: {names} {self.measured:.3g}, limit {self.limit:.3g}{place}"
+        return f"{self.rule}: {names}{place}: {self.measured:.3g}, limit {self.limit:.3g}"
 
 
 def check(pad: Morphology, rules: Rules) -> list[Violation]:

@@ -81,5 +81,5 @@ def test_a_sharp_bend_is_found_and_a_gentle_one_passes():
 
 def test_a_finding_reads_as_one_line():
     text = str(check(bent(1.95), only(min_gap_mm=0.8))[0])
-    assert text.startswith("min_gap_mm: fibre 1 and fibre 2 0.56")
+    assert text.startswith("min_gap_mm: fibre 1 and fibre 2 at (0.0, -5.9) mm: 0.56")
     assert "\n" not in text
