@@ -40,7 +40,7 @@ def published_presses(grid: int, side: int = 7) -> NDArray[np.float64]:
 
 
 def published_terms(
-    knots: NDArray[np.float64],
+    pads: Morphology | NDArray[np.float64],
     contact: Contact | None = None,
     presses: ArrayLike | None = None,
     samples: int = 2000,
@@ -49,21 +49,21 @@ def published_terms(
     """Terms of formula (5), as the published code computes them, for every pad of a population.
 
     Args:
-        knots: (P, 2M, N+2, 2).
+        pads: a morphology, or knots (P, 2M, N+2, 2) of a population.
         presses: (Q, 2) in an order of neighbours; the 49 published ones if None.
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
     """
-    travel, cross, _ = fibre_axes(knots)
+    travel, cross, _ = fibre_axes(pads)
     grid = travel.shape[1] // 2
     places = as_presses(published_presses(grid) if presses is None else presses)[0]
     shape = press_shape(contact or Contact())
-    found = np.zeros((len(knots), 3))
+    found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:
         terms_kernel(travel, cross, places, *shape, samples, LEVELS, begin, end, found)
 
-    in_chunks(work, len(knots), grain=8)
+    in_chunks(work, len(travel), grain=8)
     alpha, beta, gamma = weights
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
 
@@ -76,4 +76,4 @@ def published_objective(
     weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
 ) -> float:
     """Formula (5) for one pad: alpha / (1 + entropy) + beta Z + gamma C; arguments as in `published_terms`."""
-    return published_terms(pad.knots[None], contact, presses, samples, weights)[0].objective
+    return published_terms(pad, contact, presses, samples, weights)[0].objective

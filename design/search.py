@@ -76,7 +76,7 @@ def score(pad: Morphology, contact: Contact, lost: int = 2) -> dict[str, float]:
         terms[f"ambiguity_lost_{k}"] = ambiguity(found, places, kept, NOISE[1]).item()
     serpentine = boustrophedon(pad.grid, 32, 5 / 49)
     terms |= {"information": information(pad, contact), "idle_share": idle_share(signals(pad, serpentine, contact))}
-    published = asdict(published_terms(pad.knots[None], contact)[0])
+    published = asdict(published_terms(pad, contact)[0])
     return terms | {f"published_{name}": value for name, value in published.items()}
 
 

@@ -48,11 +48,12 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
     for j in range(len(t) - 1):
         h, rise = t[j + 1] - t[j], v[j + 1] - v[j]
         a1, a2, a3 = h * d[j], 3 * rise - h * (2 * d[j] + d[j + 1]), h * (d[j] + d[j + 1]) - 2 * rise
-        end = min(math.ceil(t[j + 1] / step), len(out) - 1)
-        while i < end:
-            s = (i * step - t[j]) / h
-            out[i] = v[j] + s * (a1 + s * (a2 + s * a3))
-            i += 1
+        end = max(min(math.ceil(t[j + 1] / step), len(out) - 1), i)
+        part, start, first, per_h = out[i:end], t[j], v[j], 1 / h
+        for k in range(len(part)):  # over a slice: the compiler need not look for negative indices, and vectorises
+            s = ((i + k) * step - start) * per_h
+            part[k] = first + s * (a1 + s * (a2 + s * a3))
+        i = end
     out[-1] = v[-1]
 
 

@@ -130,8 +130,9 @@ def fibre_quantized(
     """
     n, segments = len(t), len(curve) - 1
     runs = np.empty(segments)
+    here, ahead = curve[:-1], curve[1:]
     for i in range(segments):
-        rise = abs(curve[i + 1] - curve[i])
+        rise = abs(ahead[i] - here[i])
         runs[i] = step + rise if length == MANHATTAN else math.sqrt(step * step + rise * rise)
     starts = np.empty(n, np.int64)
     for j in range(n - 1):
