@@ -193,38 +193,23 @@ def signals_gradient(
                             _inner(
                                 span, a, b, s0, d[j], d[j + 1], radius, weight, length, place, rate, scratch[3], change
                             )
-                            if a > -s0:
-                                _end(
-                                    span,
-                                    a,
-                                    s0,
-                                    -1.0,
-                                    d[j],
-                                    d[j + 1],
-                                    shape,
-                                    radius,
-                                    weight,
-                                    length,
-                                    place,
-                                    rate,
-                                    change,
-                                )
-                            if b < 1 - s0:
-                                _end(
-                                    span,
-                                    b,
-                                    s0,
-                                    1.0,
-                                    d[j],
-                                    d[j + 1],
-                                    shape,
-                                    radius,
-                                    weight,
-                                    length,
-                                    place,
-                                    rate,
-                                    change,
-                                )
+                            for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
+                                if not is_knot:
+                                    _end(
+                                        span,
+                                        s,
+                                        s0,
+                                        sign,
+                                        d[j],
+                                        d[j + 1],
+                                        shape,
+                                        radius,
+                                        weight,
+                                        length,
+                                        place,
+                                        rate,
+                                        change,
+                                    )
                         for x in range(6):
                             out[x // 2, f, j + x % 2] += upstream[q, f] * change[x]
                     j += 1
