@@ -1,5 +1,6 @@
 """The fibres as curves: PCHIP spans as cubic Beziers, flattened to a tolerance, and where they cross."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from .kernels.pchip import pchip_slopes
-from .morphology import Morphology
+from .morphology import Morphology, assemble
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,29 @@ def beziers(pad: Morphology) -> Array:
     return spans
 
 
+def slope_beziers(pad: Morphology) -> Array:
+    """(2M, N+1, 3) Bezier coefficients of every span's slope, cross per travel: a quadratic in the span's parameter."""
+    d = slopes(pad)
+    inner = np.empty((len(d), d.shape[1] - 1))
+    for fibre, (t, v) in enumerate(_travel_and_cross(pad)):
+        inner[fibre] = 3 * np.diff(v) / np.diff(t) - d[fibre, :-1] - d[fibre, 1:]
+    return np.stack([d[:, :-1], inner, d[:, 1:]], axis=2)
+
+
+def quadratic(control: Array, u: Array) -> Array:
+    """Quadratic Beziers: the values (...,) of coefficients (..., 3) at parameters (...,)."""
+    w = 1 - u
+    return w**2 * control[..., 0] + 2 * w * u * control[..., 1] + u**2 * control[..., 2]
+
+
+def cubic(control: Array, u: Array) -> Array:
+    """Cubic Beziers: the points (..., 2) of control points (..., 4, 2) at parameters (...,)."""
+    u = u[..., None]
+    w = 1 - u
+    p = np.moveaxis(control, -2, 0)
+    return w**3 * p[0] + 3 * w**2 * u * p[1] + 3 * w * u**2 * p[2] + u**3 * p[3]
+
+
 def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     """Each fibre as a polyline (n, 2) within `tolerance` of its curve, in grid units.
 
@@ -43,7 +67,7 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     for spans in beziers(pad):
         second = np.linalg.norm(np.diff(spans, 2, axis=1), axis=2).max(axis=1)
         counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
-        pieces = [_bezier_points(span, n) for span, n in zip(spans, counts, strict=True)]
+        pieces = [cubic(span, np.arange(n) / n) for span, n in zip(spans, counts, strict=True)]
         lines.append(np.vstack([*pieces, spans[-1, -1:]]))
     return lines
 
@@ -66,21 +90,48 @@ class Crossing:
     place: tuple[float, float]
 
 
-def crossings(pad: Morphology, tolerance: float = 1e-4) -> list[Crossing]:
+def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> list[Crossing]:
     """Every place where two fibres meet, ordered by fibre and place; fibres are flattened to `tolerance`.
 
-    Fibres that touch or run on each other count at the middle of what they share.
+    Fibres that touch or run on each other count at the middle of what they share. Without `across` only fibres of
+    one family are looked at.
     """
-    lines = [shapely.LineString(points) for points in flatten(pad, tolerance)]
-    tree = shapely.STRtree(lines)
-    pairs = tree.query(lines, predicate="intersects").T
-    found = []
-    for first, second in sorted(map(tuple, pairs[pairs[:, 0] < pairs[:, 1]])):
-        shared = lines[first].intersection(lines[second])
-        for part in shapely.get_parts(shapely.line_merge(shared) if shared.length else shared):
-            place = part.interpolate(0.5, normalized=True) if part.length else part
-            found.append(Crossing(int(first), int(second), (place.x, place.y)))
+    lines = np.array([shapely.LineString(points) for points in flatten(pad, tolerance)])
+    first, second = shapely.STRtree(lines).query(lines)
+    wanted = (first < second) & (across | ((first < pad.grid) == (second < pad.grid)))
+    first, second = first[wanted], second[wanted]
+    shared = shapely.intersection(lines[first], lines[second])
+    parts, pair = shapely.get_parts(shared, return_index=True)
+    point = shapely.get_type_id(parts) == shapely.GeometryType.POINT
+    overlap = np.flatnonzero(shapely.length(shared) > 0)
+    runs, of_overlap = shapely.get_parts(shapely.line_merge(shared[overlap]), return_index=True)
+    middles = shapely.line_interpolate_point(runs, 0.5, normalized=True)
+    places = shapely.get_coordinates(np.concatenate([parts[point], middles])).tolist()
+    pair = np.concatenate([pair[point], overlap[of_overlap]])
+    found = [
+        Crossing(i, j, (x, y)) for i, j, (x, y) in zip(first[pair].tolist(), second[pair].tolist(), places, strict=True)
+    ]
     return sorted(found, key=lambda c: (c.first, c.second, c.place))
+
+
+def crossing_angles(pad: Morphology, across: Sequence[Crossing]) -> Array:
+    """Angle in degrees, 0..90, between the curves' tangents at crossings of a horizontal with a vertical fibre.
+
+    Where two fibres touch or run on each other they have one tangent, so that the angle is 0.
+    """
+    x, y = np.array([c.place for c in across]).reshape(-1, 2).T
+    rise = _slopes_at(pad, np.array([c.first for c in across], dtype=int), x)  # dy / dx of the horizontal
+    run = _slopes_at(pad, np.array([c.second for c in across], dtype=int), y)  # dx / dy of the vertical
+    return np.degrees(np.arctan2(np.abs(1 - rise * run), np.abs(rise + run)))
+
+
+def _slopes_at(pad: Morphology, fibre: NDArray[np.int_], travel: Array) -> Array:
+    """Slope of each fibre (n,) at its own travel coordinate (n,)."""
+    knots = np.where((fibre < pad.grid)[:, None], pad.knots[fibre, :, 0], pad.knots[fibre, :, 1])
+    span = np.clip((knots <= travel[:, None]).sum(axis=1) - 1, 0, knots.shape[1] - 2)
+    row = np.arange(len(fibre))
+    u = (travel - knots[row, span]) / (knots[row, span + 1] - knots[row, span])
+    return quadratic(slope_beziers(pad)[fibre, span], u)
 
 
 def _travel_and_cross(pad: Morphology) -> list[tuple[Array, Array]]:
@@ -89,8 +140,23 @@ def _travel_and_cross(pad: Morphology) -> list[tuple[Array, Array]]:
     return [(knots[:, a].copy(), knots[:, 1 - a].copy()) for knots, a in zip(pad.knots, axes, strict=True)]
 
 
-def _bezier_points(control: Array, count: int) -> Array:
-    """`count` points of a cubic Bezier at equal parameter steps, its start included, its end not."""
-    u = (np.arange(count) / count)[:, None]
-    w = 1 - u
-    return w**3 * control[0] + 3 * w**2 * u * control[1] + 3 * w * u**2 * control[2] + u**3 * control[3]
+def refine(knots: Array, count: int) -> Array:
+    """Knots with `count` inner ones a fibre: more are put on the curve, in the middle of the longest spans.
+
+    Args:
+        knots: (2M, n, 2) with n - 2 <= count.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    grid = len(knots) // 2
+    fibres = []
+    for fibre, line in enumerate(knots):
+        axis = 0 if fibre < grid else 1
+        travel = line[:, axis]
+        curve = PchipInterpolator(travel, line[:, 1 - axis])
+        while len(travel) < count + 2:
+            longest = int(np.argmax(np.diff(travel)))
+            travel = np.insert(travel, longest + 1, travel[longest : longest + 2].mean())
+        cross = curve(travel)
+        fibres.append(np.stack([travel, cross] if axis == 0 else [cross, travel], axis=-1))
+    return assemble(np.array(fibres)[:, 1:-1])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Morphology, crossings, flatten
-from design.curves import beziers, lengths, slopes
+from design.curves import beziers, crossing_angles, lengths, slopes
 from design.differentiable import pchip_sample
 from design.kernels.pchip import sample_curves
 
@@ -82,6 +82,44 @@ def test_a_straight_grid_crosses_at_its_nodes():
     found = crossings(Morphology.straight(3))
     assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
     np.testing.assert_allclose([c.place for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
+
+
+def diagonal_pad():
+    """Two fibres, each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2)."""
+    fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
+    return Morphology(np.stack([fibre, fibre[:, ::-1]]))
+
+
+def test_fibres_that_run_on_each_other_also_count_where_they_cross():
+    found = crossings(diagonal_pad())
+    np.testing.assert_allclose([c.place for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
+    np.testing.assert_allclose(crossing_angles(diagonal_pad(), found), [90, 0, 90])
+
+
+@given(pads)
+def test_crossings_within_families_are_those_of_all(pad):
+    family = [c for c in crossings(pad) if (c.first < pad.grid) == (c.second < pad.grid)]
+    assert crossings(pad, across=False) == family
+
+
+@given(pads)
+def test_angles_are_those_of_scipys_tangents(pad):
+    across = [c for c in crossings(pad) if c.first < pad.grid <= c.second]
+    for c, angle in zip(across, crossing_angles(pad, across), strict=True):
+        rise = scipy_curve(pad, c.first).derivative()(c.place[0])
+        run = scipy_curve(pad, c.second).derivative()(c.place[1])
+        between = np.degrees(np.arctan(rise) + np.arctan(run) - np.pi / 2) % 180
+        assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
+
+
+def test_a_touch_has_angle_0():
+    line = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
+    bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
+    pad = Morphology(np.stack([line, bow]))
+    found = crossings(pad)
+    touch = [np.allclose(c.place, 1) for c in found]
+    assert sum(touch) == 1
+    assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("name", "all_", "family"), [("1para", 16, 0), ("5para_dis", 30, 6), ("20para", 672, 124)])

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
-from design import Morphology
-from design.rules import bend_radius, check
+from design import InputError, Morphology, Spec, crossings
+from design.curves import crossing_angles
+from design.rules import check
 from design.settings import Rules
 
 NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
@@ -12,24 +14,6 @@ NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, bo
 
 def only(**limits):
     return NONE.model_copy(update=limits)
-
-
-@pytest.mark.parametrize("radius", [0.5, 2.0, 10.0])
-def test_an_arc_has_its_own_radius(radius):
-    angle = np.linspace(0, 1.5, 4000)
-    arc = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    assert bend_radius(arc, window_mm=radius / 2)[0] == pytest.approx(radius, rel=5e-3)
-
-
-def test_a_corner_is_found_where_it_is():
-    line = np.array([[0, 0], [5, 0], [5, 5.0]])
-    radius, vertex = bend_radius(line, window_mm=1.0)
-    assert radius == pytest.approx(1 / (np.pi / 2))
-    assert vertex == 1
-
-
-def test_a_straight_line_does_not_bend():
-    assert bend_radius(np.array([[0, 0], [1, 0], [2, 0.0]]), 1.0)[0] == np.inf
 
 
 def test_the_straight_grid_breaks_nothing():
@@ -50,6 +34,85 @@ def test_fibres_too_close_are_named_with_their_gap():
     assert [v.fibres for v in found] == [(1, 2)]
     assert found[0].measured == pytest.approx(0.05 * 11.25, abs=1e-3)
     assert found[0].place_mm == pytest.approx((0, (1.975 - 2.5) * 11.25), abs=0.3)
+
+
+def zigzag(apart_mm, legs=3):
+    """A pad of 1 + 1 fibres whose horizontal one has upright branches `apart_mm` apart."""
+    at = 1 + np.arange(legs + 1) * apart_mm / 11.25
+    up = np.resize([1.0, 1.5], legs + 2)
+    branches = [
+        (x + side, y) for x, low, high in zip(at, up, up[1:], strict=False) for side, y in ((0, low), (1e-6, high))
+    ]
+    fibre = np.array([(0, 1), *branches, (2, 1)])
+    return Morphology(np.stack([fibre, np.column_stack([np.ones(len(fibre)), fibre[:, 0]])]))
+
+
+def test_branches_of_one_fibre_too_close_are_found_with_their_gap():
+    found = check(zigzag(0.5), only(min_gap_mm=0.8))
+    assert [(v.rule, v.fibres) for v in found] == [("min_gap_mm", (1,))]
+    assert found[0].measured == pytest.approx(0.5, abs=1e-3)
+    assert str(found[0]).startswith("min_gap_mm: fibre 1 at (")
+    assert check(zigzag(0.5), only(min_gap_mm=0.48)) == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_fold_found_is_one_of_the_curve(seed):
+    """Against points of SciPy's curve, 0.02 mm apart: none lies nearer, and some almost as near."""
+    pad = Morphology.random(1, 6, seed)
+    found = check(pad, only(min_gap_mm=2.0))
+    assert found
+    for v in found:
+        fibre = v.fibres[0] - 1
+        t, cross = pad.knots[fibre, :, fibre], pad.knots[fibre, :, 1 - fibre]
+        fine = np.unique(np.concatenate([np.linspace(0, 2, 200_000), t]))
+        curve = 11.25 * np.column_stack([fine, PchipInterpolator(t, cross)(fine)])
+        arc = np.append(0, np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum())
+        at = np.arange(0, arc[-1], 0.02)
+        points = np.column_stack([np.interp(at, arc, axis) for axis in curve.T])
+        ahead = np.searchsorted(at, at + np.pi)
+        least = min(
+            np.linalg.norm(points[j:] - p, axis=1).min(initial=np.inf) for p, j in zip(points, ahead, strict=True)
+        )
+        assert v.measured - 2e-3 <= least <= v.measured + 0.025
+
+
+def test_too_many_crossings_of_the_families_are_one_finding():
+    found = check(Morphology.straight(4), only(max_crossings=15))
+    assert [str(v) for v in found] == ["max_crossings: pad: 16, limit 15"]
+    assert check(Morphology.straight(4), only(max_crossings=16)) == []
+    many = check(Morphology.straight(40), only(max_crossings=1234))
+    assert [str(v) for v in many] == ["max_crossings: pad: 1600, limit 1234"]
+
+
+def test_any_number_of_crossings_is_written_and_read_as_a_word():
+    assert Spec({"rules": {"max_crossings": "any"}}).section(Rules).max_crossings is None
+    assert Rules().model_dump()["max_crossings"] == "any"
+    with pytest.raises(InputError, match=r"\[rules\] max_crossings: got 'none'"):
+        Spec({"rules": {"max_crossings": "none"}}).section(Rules)
+
+
+def test_a_slanting_crossing_is_found_with_its_angle():
+    """Half-way up a span that is as high as long, between two turning points, a PCHIP has slope 1.5."""
+    swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
+    pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
+    found = check(pad, only(min_crossing_angle_deg=40))
+    assert [(v.rule, v.fibres) for v in found] == [("min_crossing_angle_deg", (1, 2))]
+    assert found[0].measured == pytest.approx(np.degrees(np.arctan(1 / 1.5)), abs=1e-6)
+    assert found[0].place_mm == pytest.approx((0, 0), abs=1e-3)
+    assert check(pad, only(min_crossing_angle_deg=33)) == []
+    assert check(Morphology.straight(4), only(min_crossing_angle_deg=90)) == []
+
+
+def test_a_pair_of_fibres_is_named_once_with_its_least_angle():
+    pad = Morphology.random(3, 8, seed=1)
+    across = [c for c in crossings(pad, 1e-6) if c.first < 3 <= c.second]
+    least = {}
+    for c, angle in zip(across, crossing_angles(pad, across), strict=True):
+        pair = (c.first + 1, c.second + 1)
+        least[pair] = min(angle, least.get(pair, 30))
+    found = check(pad, only(min_crossing_angle_deg=30, same_family_crossings=10**6))
+    assert {v.fibres: v.measured for v in found} == {pair: angle for pair, angle in least.items() if angle < 30}
+    assert len(found) > 1
 
 
 def test_a_crossing_within_a_family_is_counted_at_its_places():
@@ -77,6 +140,25 @@ def test_a_sharp_bend_is_found_and_a_gentle_one_passes():
     found = check(sharp, only(min_bend_radius_mm=1.0))
     assert [v.fibres for v in found] == [(1,)]
     assert check(bent(1.3), only(min_bend_radius_mm=1.0)) == []
+
+
+def test_a_bend_is_placed_where_it_is():
+    knots = np.array([[0, 1], [1.0, 1.9], [2, 1.0]])
+    pad = Morphology(np.stack([knots, [[1, 0], [1, 1.0], [1, 2.0]]]), pitch_mm=2.0)
+    found = check(pad, only(min_bend_radius_mm=2.0))
+    assert [v.fibres for v in found] == [(1,)]
+    assert found[0].place_mm == pytest.approx((0, 0.9 * 2), abs=0.01)
+
+
+@pytest.mark.parametrize(("rise", "breaks"), [(0.145, False), (0.155, True)])
+def test_a_kink_passes_up_to_half_a_radian(rise, breaks):
+    """Two straight branches that meet in a peak within 1e-7 of it, where the PCHIP's slope overshoots by a third."""
+    at = np.array([0, 0.5, 1 - 1e-7, 1, 1 + 1e-7, 1.5, 2])
+    roof = np.column_stack([at, 1 + rise * (1 - np.abs(at - 1))])
+    turn = 2 * (2 * np.arctan(4 / 3 * rise) - np.arctan(rise))
+    found = check(Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_bend_radius_mm=3.0))
+    assert (turn > 0.5) == breaks
+    assert [v.measured for v in found] == ([pytest.approx(1.5 / turn, rel=1e-3)] if breaks else [])
 
 
 def test_a_finding_reads_as_one_line():
