@@ -129,7 +129,7 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     seeds = {"seed": seed}
     _, found = run_search(spec, out, seeds)
     click.echo("\n".join(design_summary(found, out)))
-    if found.interrupted:
+    if found.stopped:
         return INTERRUPTED
     written = [out / "morphology.json"]
     mould = build(found.morphology, out, settings=Settings.from_spec(spec), inputs=written)

@@ -1,5 +1,7 @@
 """`padforge design`: the edge where settings come in and morphologies go out."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +11,8 @@ import click
 from .console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from .search import SearchResult
     from .settings import Spec
 
@@ -22,6 +26,11 @@ morphology_argument = click.argument("morphology", type=click.Path(path_type=Pat
 @click.option("--method", type=click.Choice(["descent", "genetic"]), help="Gradient search, or the published one.")
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
+@click.option("--from", "origin", metavar="random|straight|FILE", default="random", help="What to start from.")
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Where presses are told apart.")
+@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="End with the best after S seconds.")
+@click.option("--resume", is_flag=True, help="Go on where a search into the same folder was broken off.")
+@click.option("--scheduler", metavar="ADDRESS", help="Run the starts on a Dask cluster.")
 @seed_option
 @out_option("out/pad")
 @json_option
@@ -32,6 +41,11 @@ def design(
     method: str | None,
     knots: int | None,
     starts: int | None,
+    origin: str,
+    device: str | None,
+    time_budget: float | None,
+    resume: bool,
+    scheduler: str | None,
     seed: int | None,
     out: Path,
     as_json: bool,
@@ -41,20 +55,32 @@ def design(
     \b
     padforge design                                   into out/pad, with the settings of pad.toml or the defaults
     padforge design --knots 8 --seed 1 --out out/pad
+    padforge design --from out/pad/morphology.json    improves on a pad
     padforge design check out/pad/morphology.json     exit 1 if a rule is broken
 
-    Writes morphology.json, design.json, design.svg and design.png. Exit 1 if the best pad breaks a rule.
+    Writes morphology.json, design.json, design.svg and design.png. Exit 1 if the best pad breaks a rule. Ctrl-C ends
+    with the best so far (exit 130); that and a kill leave what --resume goes on from.
     """
     if context.invoked_subcommand is not None:
         return
-    overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed}
-    document, result = run_search(load_spec(spec), out, overrides)
+    overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
+    with cluster(scheduler) as executor:
+        document, result = run_search(
+            load_spec(spec), out, overrides, origin, time_budget=time_budget, resume=resume, executor=executor
+        )
     show_result(document, summary(result, out), as_json)
-    context.exit(INTERRUPTED if result.interrupted else 1 if result.violations else 0)
+    context.exit(INTERRUPTED if result.stopped == "interrupted" else 1 if result.violations else 0)
 
 
-def run_search(spec: "Spec", out: Path, overrides: dict[str, Any]) -> tuple[dict[str, Any], "SearchResult"]:
-    """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result."""
+def run_search(
+    spec: "Spec", out: Path, overrides: dict[str, Any], origin: str = "random", **how: Any
+) -> tuple[dict[str, Any], "SearchResult"]:
+    """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result.
+
+    Args:
+        origin: "random", "straight" or the file of a morphology to start from, which also says how many knots a fibre
+            has unless `overrides` does. how: more arguments of `search`.
+    """
     from .files import provenance, write_json
     from .morphology import Morphology
     from .plan import draw_plan, save_figure
@@ -62,33 +88,66 @@ def run_search(spec: "Spec", out: Path, overrides: dict[str, Any]) -> tuple[dict
     from .settings import Contact, Pad, Rules, Search
 
     pad, contact, rules = spec.section(Pad), spec.section(Contact), spec.section(Rules)
+    begin, inputs = None, []
+    if origin == "straight":
+        begin = Morphology.straight(pad.grid, pad.pitch_mm)
+    elif origin != "random":
+        begin, inputs = Morphology.load(origin), [Path(origin)]
+        overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(Search, **overrides)
     with progress() as bar:
         tasks: dict[str, Any] = {}
+        best: list[float] = []
 
         def report(run: str, done: int, total: int, objective: float) -> None:
             if run not in tasks:
                 tasks[run] = bar.add_task(run, total=total, note="")
-            bar.update(tasks[run], completed=done, note=f"objective {objective:.4f}")
+            best[:] = [min([objective, *best])]
+            bar.update(tasks[run], completed=done, note=f"objective {objective:.4f}, best {best[0]:.4f}")
 
-        result = search(pad, contact, settings, rules, report)
-    origin = provenance("padforge design", settings.seed, packages=("torch", "pymoo"))
+        result = search(pad, contact, settings, rules, origin=begin, report=report, keep_in=out / "search", **how)
+    origin_of = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
     used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
-    origin["settings"] = {name: section.model_dump() for name, section in used.items()}
-    Morphology(result.morphology.knots, pad.pitch_mm, origin).save(out / "morphology.json")
+    origin_of["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}
+    Morphology(result.morphology.knots, pad.pitch_mm, origin_of).save(out / "morphology.json")
     document = {
         "format": "padforge-design/1",
         "terms": result.terms,
         "violations": [asdict(violation) for violation in result.violations],
         "history": result.history,
         "seconds": round(result.seconds, 3),
-        "provenance": origin,
+        "stopped": result.stopped,
+        "provenance": origin_of,
     }
     figure = draw_plan(result.morphology, contact, result.violations)
     save_figure(figure, out / "design.svg")
     save_figure(figure, out / "design.png")
     write_json(out / "design.json", document)
     return document, result
+
+
+@contextmanager
+def cluster(address: str | None) -> "Iterator[Executor | None]":
+    """Slices of the starts on the Dask cluster at `address`, or None for this machine.
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers there.
+    """
+    if address is None:
+        yield None
+        return
+    from .errors import InputError
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError("--scheduler needs Dask: pip install 'padforge[cluster]'") from error
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--scheduler is {address}: no Dask scheduler answers there ({error})") from error
+    with client, client.get_executor(pure=False, retries=10) as executor:
+        yield executor
 
 
 def summary(result: "SearchResult", out: Path) -> list[str]:
@@ -99,7 +158,7 @@ def summary(result: "SearchResult", out: Path) -> list[str]:
     more = len(result.violations) - len(broken)
     return [
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
-        + (" (interrupted: the best so far)" if result.interrupted else ""),
+        + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
         f"  expected error {lost} grid units with {' / '.join(map(str, range(len(spread))))} fibres lost",
         *(broken or ["  all rules hold"]),
         *([f"  ... and {more} more"] if more > 0 else []),
@@ -149,9 +208,12 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
 def score(morphology: Path, spec: Path | None) -> None:
     """Print every term of the objective as JSON."""
     from .morphology import Morphology
-    from .search import score as score_terms
-    from .settings import Contact, Search
+    from .rules import check as check_rules
+    from .score import score as score_terms
+    from .settings import Contact, Rules, Search
 
-    settings = load_spec(spec)
-    terms = score_terms(Morphology.load(morphology), settings.section(Contact), settings.section(Search).lost)
-    show_result({"terms": terms}, [], as_json=True)
+    settings, pad = load_spec(spec), Morphology.load(morphology)
+    contact, search, rules = settings.section(Contact), settings.section(Search), settings.section(Rules)
+    terms = score_terms(pad, contact, search.lost, search.noise, rules)
+    found = [asdict(violation) for violation in check_rules(pad, rules)]
+    show_result({"terms": terms, "violations": found}, [], as_json=True)

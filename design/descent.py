@@ -1,175 +1,183 @@
-"""Gradient search on the expected localisation error under noise and fibre loss.
+"""Gradient search on the localisation ambiguity under noise and fibre loss, within the rules.
 
-For presses p_a with signals s_a the ambiguity of a pad whose fibres `kept` still work is
-
-    A = mean_a sum_b w_ab |p_a - p_b|,    w_ab = softmax_b(-|s_a - s_b|^2_kept / (4 sigma^2)),
-
-the mean distance between a press and a place drawn from what its noisy signals leave possible. Averaged over losses
-it falls as the conditional entropy H(place | signals) falls, but unlike the published joint entropy it does not
-saturate: presses that stay distinguishable still count for how far apart the confusable ones lie.
+One start is a `Descent`: it advances by any number of steps, tells its state as plain arrays and goes on from them to
+the same bits, so that it can run in slices on any thread or machine and survive being killed.
 """
 
+import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .differentiable import ExactSignals, pchip_sample, pchip_slopes
-from .morphology import MARGIN, Morphology, assemble
-from .settings import Contact, Pad, Rules, Search
-
-Array = NDArray[np.float64]
+from .ambiguity import ambiguity, sharpness
+from .checkpoint import State
+from .contact import boustrophedon
+from .differentiable import ExactSignals, pchip_slopes
+from .fibres import Fibres, border_of, first_course
+from .losses import draw_losses, loss_shares
+from .morphology import Morphology
+from .penalties import penalties
+from .problem import Problem
+from .rules import check
 
 SIDE = 14  # presses per row and column of the stratified sample a step looks at
-SAMPLES_PER_UNIT = 108  # of a fibre, for the rules
-NOISE = (0.30, 0.06)  # sigma, grid units of signal, annealed from first to last step
-RATE = 0.06
+WINDOW = 5.0  # side of the part of the pad a step looks at, grid units: presses further apart are seldom confused
+LOUDER = 2.0  # noise of the first step as a multiple of the last one's
+RATE = 0.02
 PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
+MARGIN = 1.05  # on the limits of the rules
+NOTED_STEPS = 10  # between entries of the history
+REPAIR_STEPS, REPAIR_CHECKS = 600, 20  # after the last step, until the exact check passes; steps between checks
+REPAIR_RATE, REPAIR_MARGIN = 0.002, 0.01  # and what is added to the margin at each check that does not pass
 
 
-@dataclass(frozen=True)
-class Step:
-    """What a step of a start reports: its number (from 1), the ambiguity and the penalty of the rules."""
+class Descent:
+    """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of what is broken.
 
-    number: int
-    ambiguity: float
-    penalty: float
+    The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
 
-
-class Fibres(torch.nn.Module):
-    """Free variables of a pad's fibres, mapped so that knots stay ascending, apart and off the border.
-
-    Travel coordinates are running sums of a softmax with a floor under every span, cross coordinates a sigmoid.
+    Attributes:
+        step: steps done. objective: ambiguity and sharpness at the last step. done: whether nothing is left to do.
     """
 
-    def __init__(self, pad: Pad, search: Search, rules: Rules, rng: np.random.Generator) -> None:
-        super().__init__()
-        grid, knots = pad.grid, search.knots
-        self.extent = float(grid + 1)
-        self.border = max(MARGIN, rules.border_mm / pad.pitch_mm) if rules.enforce else MARGIN
-        self.floor = (0.4 if rules.enforce else 0.05) * self.extent / (knots + 1)
-        level = np.tile(np.arange(1.0, grid + 1), 2)[:, None]
-        spread = 0.5 if rules.enforce else 1.5
-        cross = level + spread * rng.standard_normal((2 * grid, knots))
-        unit = np.clip((cross - self.border) / (self.extent - 2 * self.border), 0.05, 0.95)
-        self.spans = torch.nn.Parameter(torch.tensor(0.3 * rng.standard_normal((2 * grid, knots + 1))))
-        self.cross = torch.nn.Parameter(torch.tensor(np.log(unit / (1 - unit))))
-        self.register_buffer("level", torch.tensor(level))
+    def __init__(self, problem: Problem, start: int, state: State | None = None) -> None:
+        self.problem = problem
+        self.rng = np.random.default_rng([problem.search.seed, start])
+        self.step, self.objective, self.done = 0, math.inf, False
+        self._history: list[tuple[int, float]] = []
+        pad, search, rules = problem.pad, problem.search, problem.rules
+        if state is None:
+            course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
+            self.fibres = Fibres.through(course, border_of(pad, rules))
+            self._optimiser = self._adam()
+        else:
+            self._restore(state)
 
-    def forward(self) -> tuple[Tensor, Tensor]:
-        """Travel and cross coordinates of all knots, ends included, both (2M, N+2)."""
-        count = self.spans.shape[1]
-        spans = self.floor + (self.extent - count * self.floor) * self.spans.softmax(dim=1)
-        start = torch.zeros_like(spans[:, :1])
-        travel = torch.cat([start, spans.cumsum(dim=1)[:, :-1], start + self.extent], dim=1)
-        level = self.get_buffer("level")
-        cross = self.border + (self.extent - 2 * self.border) * self.cross.sigmoid()
-        return travel, torch.cat([level, cross, level], dim=1)
+    def advance(self, steps: int) -> None:
+        """Take up to `steps` steps, fewer if it is done before."""
+        for _ in range(steps):
+            if self.done:
+                return
+            if self.step < self.problem.search.steps:
+                self._step()
+            else:
+                self._repair()
 
-    def knots(self) -> Array:
-        """(2M, N+2, 2) knots as `Morphology` holds them."""
-        with torch.no_grad():
-            travel, cross = (x.numpy() for x in self())
-        grid = len(travel) // 2
-        inner = np.stack([travel, cross], axis=-1)[:, 1:-1]
-        inner[grid:] = inner[grid:, :, ::-1]
-        return assemble(inner)
+    def finish(self) -> None:
+        """Leave out what is left of the search, and repair what is broken."""
+        if self.step < self.problem.search.steps:
+            self._begin_repair()
+        self.advance(REPAIR_STEPS)
 
+    def morphology(self) -> Morphology:
+        """The fibres as they are."""
+        return Morphology(self.fibres.knots(), self.problem.pad.pitch_mm)
 
-def ambiguity(signals: Tensor, presses: Tensor, kept: Tensor, sigma: float) -> Tensor:
-    """A of the module's formula, averaged over losses.
+    def state(self) -> State:
+        """Everything the rest of the search depends on, as arrays."""
+        adam = self._optimiser.state_dict()["state"]
+        generator = json.dumps(self.rng.bit_generator.state).encode()
+        state = {
+            "spans": self.fibres.spans.detach().numpy().copy(),
+            "cross": self.fibres.cross.detach().numpy().copy(),
+            "fixed": np.array([self.fibres.floor, self.fibres.border]),
+            "progress": np.array([self.step, self.objective, self.done]),
+            "history": np.array(self._history).reshape(-1, 2),
+            "generator": np.frombuffer(generator, np.uint8).copy(),
+        }
+        for variable, moments in adam.items():
+            state |= {f"adam_{variable}_{name}": value.numpy().copy() for name, value in moments.items()}
+        return state
 
-    Args:
-        signals: (2M, Q). presses: (Q, 2). kept: (L, 2M), 1 for a fibre that works, 0 for a lost one.
-        sigma: noise of a signal, grid units.
-    """
-    difference = (signals[:, :, None] - signals[:, None, :]) ** 2
-    apart = (kept @ difference.flatten(1)).view(len(kept), *difference.shape[1:])
-    weight = torch.softmax(-apart / (4 * sigma**2), dim=-1)
-    return (weight * torch.cdist(presses, presses)).sum(dim=-1).mean()
+    def _restore(self, state: State) -> None:
+        floor, border = state["fixed"].tolist()
+        self.fibres = Fibres(torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border)
+        step, self.objective, done = state["progress"].tolist()
+        self.step, self.done = int(step), bool(done)
+        self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
+        self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
+        self._optimiser = self._adam()
+        moments: dict[int, dict[str, Any]] = {}
+        for name, value in state.items():
+            if name.startswith("adam_"):
+                _, variable, moment = name.split("_", 2)
+                moments.setdefault(int(variable), {})[moment] = torch.tensor(value)
+        self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
 
-
-def penalty(curve: Tensor, slope: Tensor, step: float, pad: Pad, rules: Rules) -> Tensor:
-    """How far sampled fibres break the rules on gap, bend, border and length: 0 where all hold with a small margin.
-
-    Args:
-        curve, slope: (2M, F) cross coordinates and slopes at travel 0, step, ...; grid units.
-    """
-    grid = len(curve) // 2
-    stretch = torch.sqrt(1 + slope**2)
-    gap = 1.15 * rules.min_gap_mm / pad.pitch_mm
-    families = curve.view(2, grid, -1)
-    steepest = torch.maximum(stretch.view(2, grid, -1)[:, 1:], stretch.view(2, grid, -1)[:, :-1])
-    closeness = torch.relu(gap - families.diff(dim=1) / steepest) / gap if gap > 0 else torch.zeros(1)
-    heading = torch.atan(slope)
-    turn = heading.diff(dim=-1).abs()
-    arc = step * (stretch[:, 1:] + stretch[:, :-1]) / 2
-    radius = 1.15 * rules.min_bend_radius_mm / pad.pitch_mm
-    bend = torch.relu(turn * radius / arc - 1)
-    zone = max(1, round(rules.border_mm / pad.pitch_mm / step))  # by its own wall a fibre leaves at 45 degrees or less
-    hugging = torch.relu(torch.cat([slope[:, :zone], slope[:, -zone:]], dim=1).abs() - 1)
-    length = torch.relu((step * stretch).sum(dim=1) * pad.pitch_mm / rules.max_length_mm - 1)
-    return closeness.mean() + (closeness**2).mean() * 10 + bend.mean() + hugging.mean() / 10 + length.mean()
-
-
-def descend(
-    start: int,
-    pad: Pad,
-    contact: Contact,
-    search: Search,
-    rules: Rules,
-    report: Callable[[Step], bool] = lambda step: True,
-) -> Morphology:
-    """One start of the gradient search: Adam with annealed noise and rising penalties.
-
-    The same start of the same seed gives the same fibres, whichever other starts run. Where `report`, which hears of
-    every step, answers False, the start ends with the fibres it has.
-    """
-    rng = np.random.default_rng([search.seed, start])
-    fibres = Fibres(pad, search, rules, rng)
-    optimiser = torch.optim.Adam(fibres.parameters(), lr=RATE)
-    extent = pad.grid + 1
-    samples = SAMPLES_PER_UNIT * extent + 1
-    at = torch.linspace(0, extent, samples, dtype=torch.float64)
-    for number in range(search.steps):
-        progress = number / max(1, search.steps - 1)
-        sigma, weight = (_anneal(*ends, progress) for ends in (NOISE, PENALTY))
-        for group in optimiser.param_groups:
-            group["lr"] = RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
-        places = _stratified(pad.grid, rng)
-        kept = torch.tensor(_losses(2 * pad.grid, search.lost, rng), dtype=torch.float32)
-        travel, cross = fibres()
-        signals = ExactSignals.apply(travel, cross, pchip_slopes(travel, cross), places, contact)
-        spread = ambiguity(signals.float(), torch.tensor(places, dtype=torch.float32), kept, sigma)
-        broken = torch.zeros(())
+    def _step(self) -> None:
+        """One step on the ambiguity and the rules."""
+        search, rules = self.problem.search, self.problem.rules
+        progress = self.step / max(1, search.steps - 1)
+        rate = RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
+        travel, cross = self.fibres.axes()
+        total = self._spread(travel, cross, search.noise * LOUDER ** (1 - progress))
+        self.objective = total.item()
         if rules.enforce:
-            broken = penalty(*pchip_sample(travel, cross, at), extent / (samples - 1), pad, rules)
-        optimiser.zero_grad()
-        (spread + weight * broken).backward()
-        optimiser.step()
-        if not report(Step(number + 1, spread.item(), broken.item())):
-            break
-    return Morphology(fibres.knots(), pad.pitch_mm)
+            total = total + PENALTY[0] * (PENALTY[1] / PENALTY[0]) ** progress * self._penalty(travel, cross, MARGIN)
+        self._follow(total, rate)
+        self.step += 1
+        if self.step % NOTED_STEPS == 0 or self.step == search.steps:
+            self._history.append((self.step, self.objective))
+        if self.step == search.steps:
+            self._begin_repair()
+
+    def _begin_repair(self) -> None:
+        """What comes after the last step: nothing, if the exact check finds nothing."""
+        self.step = self.problem.search.steps
+        self.done = not self._broken()
+        self._optimiser = self._adam()
+
+    def _repair(self) -> None:
+        """One step on the rules alone, which moves only what breaks them, with a margin that grows until they hold."""
+        repairs = self.step - self.problem.search.steps
+        margin = MARGIN + REPAIR_MARGIN * (repairs // REPAIR_CHECKS)
+        self._follow(self._penalty(*self.fibres.axes(), margin), REPAIR_RATE)
+        self.step += 1
+        if (repairs + 1) % REPAIR_CHECKS == 0:
+            self.done = repairs + 1 >= REPAIR_STEPS or not self._broken()
+
+    def _follow(self, total: Tensor, rate: float) -> None:
+        for group in self._optimiser.param_groups:
+            group["lr"] = rate
+        self._optimiser.zero_grad()
+        total.backward()
+        self._optimiser.step()
+
+    def _penalty(self, travel: Tensor, cross: Tensor, margin: float) -> Tensor:
+        found = penalties(travel, cross, self.problem.pad, self.problem.rules, margin)
+        return torch.stack(list(found.values())).sum()
+
+    def _adam(self) -> torch.optim.Adam:
+        return torch.optim.Adam([self.fibres.spans, self.fibres.cross], lr=RATE)
+
+    def _spread(self, travel: Tensor, cross: Tensor, noise: float) -> Tensor:
+        """Ambiguity, and sharpness where it is asked for, averaged over the contacts."""
+        search, grid = self.problem.search, self.problem.pad.grid
+        slope, device = pchip_slopes(travel, cross), torch.device(search.device)
+        places = stratified(grid, self.rng)
+        kept, weight = draw_losses(2 * grid, loss_shares(search.lost), self.rng)
+        there, losses, shares = (torch.tensor(x, dtype=torch.float32, device=device) for x in (places, kept, weight))
+        total = torch.zeros((), device=device)
+        for contact in self.problem.contacts:
+            signals: Tensor = ExactSignals.apply(travel, cross, slope, places, contact)  # pyright: ignore[reportAssignmentType]
+            total = total + ambiguity(signals.float().to(device), there, losses, shares, noise)
+            if search.sharpness > 0:
+                in_order = ExactSignals.apply(travel, cross, slope, boustrophedon(grid, SIDE), contact)
+                total = total + search.sharpness * sharpness(in_order.float().to(device))
+        return total.cpu() / len(self.problem.contacts)
+
+    def _broken(self) -> bool:
+        rules = self.problem.rules
+        return rules.enforce and bool(check(self.morphology(), rules))
 
 
-def _anneal(first: float, last: float, progress: float) -> float:
-    """From the first value to the last along a geometric path."""
-    return first * (last / first) ** progress
-
-
-def _stratified(grid: int, rng: np.random.Generator) -> Array:
-    """One press in each of SIDE x SIDE cells over 1..M, (SIDE^2, 2)."""
-    corner = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
-    return 1 + (grid - 1) * (corner + rng.random(corner.shape)) / SIDE
-
-
-def _losses(fibres: int, lost: int, rng: np.random.Generator) -> Array:
-    """Masks (L, 2M) of fibres that still work: none lost, then two random losses of every number up to `lost`."""
-    kept = np.ones((1 + 2 * min(lost, fibres - 1), fibres))
-    for row in range(1, len(kept)):
-        kept[row, rng.choice(fibres, (row + 1) // 2, replace=False)] = 0
-    return kept
+def stratified(grid: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """One press in each of SIDE x SIDE cells over a part of the pad, (SIDE^2, 2): all of 1..M unless it is large."""
+    low, size = (1.0, min(grid - 1.0, WINDOW)) if grid > 1 else (0.5, 1.0)
+    corner = low + rng.random(2) * (max(grid - 1.0, size) - size)
+    cell = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+    return corner + size * (cell + rng.random(cell.shape)) / SIDE

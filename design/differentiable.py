@@ -1,5 +1,6 @@
 """The fibres and their exact signals in torch: what the gradient search differentiates."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,24 @@ def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
     s = (at - t0) / h
     c2, c3 = 3 * m - 2 * d0 - d1, d0 + d1 - 2 * m
     return v0 + h * s * (d0 + s * (c2 + s * c3)), d0 + s * (2 * c2 + 3 * s * c3)
+
+
+def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
+    """Places (..., P, 2) and slopes (..., P) of the PCHIP curves through (t, v), (..., n), P = (n - 1) per_span + 1.
+
+    Every span gets as many samples, closer to its ends, since that is where a steep one bends.
+    """
+    d = pchip_slopes(t, v)
+    t0, v0, d0, d1 = (x[..., None] for x in (t[..., :-1], v[..., :-1], d[..., :-1], d[..., 1:]))
+    h = t.diff(dim=-1)[..., None]
+    m = v.diff(dim=-1)[..., None] / h
+    s = (1 - torch.cos(torch.arange(per_span, dtype=t.dtype) * (math.pi / per_span))) / 2
+    c2, c3 = 3 * m - 2 * d0 - d1, d0 + d1 - 2 * m
+    columns = t0 + h * s, v0 + h * s * (d0 + s * (c2 + s * c3)), d0 + s * (2 * c2 + 3 * s * c3)
+    at, value, slope = (
+        torch.cat([x.flatten(-2), y[..., -1:]], dim=-1) for x, y in zip(columns, (t, v, d), strict=True)
+    )
+    return torch.stack([at, value], dim=-1), slope
 
 
 class ExactSignals(torch.autograd.Function):

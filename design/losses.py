@@ -4,6 +4,11 @@ import itertools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DRAWS = 2  # random losses of each size a step of the search looks at
 
 
 def lost_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...]]:
@@ -15,3 +20,25 @@ def lost_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...
     while len(drawn) < most:
         drawn.add(tuple(sorted(rng.choice(fibres, lost, replace=False).tolist())))
     return sorted(drawn)
+
+
+def loss_shares(lost: int | tuple[float, ...]) -> tuple[float, ...]:
+    """P(k), k = 0, 1, ...: equal up to a number of lost fibres, or the given weights scaled to the sum 1."""
+    weights = (1.0,) * (lost + 1) if isinstance(lost, int) else lost
+    return tuple(weight / sum(weights) for weight in weights)
+
+
+def draw_losses(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> tuple[Array, Array]:
+    """Masks (L, 2M) of fibres that still work, and their weights (L,): DRAWS random losses of each size above 0.
+
+    Sizes of weight 0, and those that would leave no fibre, are left out.
+    """
+    kept, weights = [], []
+    for lost, share in enumerate(shares[:fibres]):
+        draws = DRAWS if lost else 1
+        for _ in range(draws if share > 0 else 0):
+            mask = np.ones(fibres)
+            mask[rng.choice(fibres, lost, replace=False)] = 0
+            kept.append(mask)
+            weights.append(share / draws)
+    return np.array(kept), np.array(weights) / sum(weights)

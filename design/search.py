@@ -1,33 +1,36 @@
-"""One face for both searches: settings in, the best morphology with its scores and its history out."""
+"""One face for both searches: settings in, the best morphology with its scores and its history out.
+
+A search is a number of starts, each a task that advances in slices from one plain state to the next. Slices run on any
+executor of the `concurrent.futures` kind, here or on a cluster; between them a start can be noted, kept on disk, or
+stopped, and nothing of that changes what it finds.
+"""
 
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .contact import boustrophedon, signals
-from .information import idle_share, information
-from .losses import lost_subsets
+from .checkpoint import Checkpoints, State
+from .errors import InputError
 from .morphology import Morphology
-from .objective import published_terms
+from .problem import Problem
 from .rules import Violation, check
+from .score import ambiguities, score
 from .settings import Contact, Pad, Rules, Search
+from .starts import Slice, advance, finish
 
 Report = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
 
-Note = Callable[[str, int, int, float], bool]
-"""The same, and answers whether to go on."""
-
-NOTED_STEPS = 10
-SCORING_SIDE, SCORED_LOSSES = 20, 64
+RESERVE = 0.15  # share of a time budget kept for repairing and scoring
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,12 @@ class SearchResult:
     """What a search found.
 
     Attributes:
-        morphology: the best pad: fewest broken rules first, then least score.
+        morphology: the best pad: fewest broken rules first, then least mean ambiguity over the losses.
         terms: every term of `score` for it.
         violations: the rules it breaks; empty where rules are not enforced.
-        history: one entry per reported step: {"run", "step", "objective"}.
+        history: one entry per noted step: {"run", "step", "objective"}.
         seconds: wall time.
-        interrupted: whether Ctrl-C ended the search early; the best so far is kept.
+        stopped: why it ended early with the best so far: "interrupted", "out of time", or "" if it did not.
     """
 
     morphology: Morphology
@@ -48,36 +51,7 @@ class SearchResult:
     violations: list[Violation]
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
-    interrupted: bool = False
-
-
-def score(pad: Morphology, contact: Contact, lost: int = 2) -> dict[str, float]:
-    """Every term of a pad, by name.
-
-    `ambiguity_lost_k` is the expected localisation error in grid units (formula of `descent`) over losses of k
-    fibres, on a regular grid of presses; `information` is that of the pad in bits (formula there), `idle_share` the
-    share of presses in which a fibre is idle; the rest are the published terms.
-    """
-    import torch
-
-    from .descent import NOISE, ambiguity
-
-    line = np.linspace(1, pad.grid, SCORING_SIDE) if pad.grid > 1 else np.linspace(0.5, 1.5, SCORING_SIDE)
-    presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
-    places = torch.tensor(presses, dtype=torch.float32)
-    fibres = 2 * pad.grid
-    terms = {}
-    for k in range(min(lost, fibres - 1) + 1):
-        losses = lost_subsets(fibres, k, SCORED_LOSSES)
-        kept = torch.ones(len(losses), fibres)
-        for row, loss in enumerate(losses):
-            kept[row, list(loss)] = 0
-        terms[f"ambiguity_lost_{k}"] = ambiguity(found, places, kept, NOISE[1]).item()
-    serpentine = boustrophedon(pad.grid, 32, 5 / 49)
-    terms |= {"information": information(pad, contact), "idle_share": idle_share(signals(pad, serpentine, contact))}
-    published = asdict(published_terms(pad, contact)[0])
-    return terms | {f"published_{name}": value for name, value in published.items()}
+    stopped: str = ""
 
 
 def search(
@@ -85,86 +59,169 @@ def search(
     contact: Contact | None = None,
     settings: Search | None = None,
     rules: Rules | None = None,
+    *,
+    origin: Morphology | None = None,
     report: Report = lambda run, done, total, objective: None,
+    keep_in: Path | None = None,
+    resume: bool = False,
+    time_budget: float | None = None,
+    executor: Executor | None = None,
 ) -> SearchResult:
     """Find the fibres of a pad by the method `settings` names; None stands for the defaults of `pad.toml`.
 
-    The same settings give the same morphology, however many threads run the starts.
+    The same settings give the same morphology, wherever the starts run and however often they are broken off and
+    resumed; only a time budget or Ctrl-C that cuts a search short changes what it finds.
+
+    Args:
+        origin: morphology to start from, of the pad's grid and at most `settings.knots` knots a fibre; random if None.
+        report: hears of each start's progress, in this thread.
+        keep_in: folder for the states of the starts, from which `resume` goes on; removed when the search completes.
+        time_budget: seconds after which it ends with the best so far.
+        executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None,
+            since torch and the kernels let go of the interpreter while they work.
+
+    Raises:
+        InputError: an origin that does not fit, a device that is not there, or states of other settings.
     """
-    pad, contact = pad or Pad(), contact or Contact()
-    settings, rules = settings or Search(), rules or Rules()
     begin = time.perf_counter()
-    history: list[dict[str, Any]] = []
-    stop = threading.Event()
+    problem = _problem(pad or Pad(), contact or Contact(), settings or Search(), rules or Rules(), origin)
+    checkpoints = Checkpoints(keep_in, problem.settings()) if keep_in else None
+    states = checkpoints.begin(resume) if checkpoints else {}
+    stop = _Stop(None if time_budget is None else begin + (1 - RESERVE) * time_budget)
+    with _stopped_by_interrupt(stop), _threads(executor) as pool:
+        _run(problem, states, pool, stop, report, checkpoints)
+        found = _candidates(problem, states, pool, stop)
+    best, violations = _choose(found, problem)
+    if checkpoints and not stop.reason:
+        checkpoints.clear()
+    terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
+    return SearchResult(best, terms, violations, _history(problem, states), time.perf_counter() - begin, stop.reason)
 
-    def note(run: str, step: int, total: int, objective: float) -> bool:
-        if step % NOTED_STEPS == 0 or step == total or settings.method == "genetic":
-            history.append({"run": run, "step": step, "objective": objective})
-            report(run, step, total, objective)
-        return not stop.is_set()
 
-    with _stopped_by_interrupt(stop):
-        find = _descend_all if settings.method == "descent" else _breed
-        candidates = find(pad, contact, settings, rules, note)
-        findings = [check(candidate, rules) if rules.enforce else [] for candidate in candidates]
-        scores = [score(candidate, contact, settings.lost) for candidate in candidates]
-    ranks = [(len(broken), _mean_ambiguity(terms)) for broken, terms in zip(findings, scores, strict=True)]
-    best = min(range(len(candidates)), key=ranks.__getitem__)
-    history.sort(key=lambda entry: (entry["run"], entry["step"]))
-    seconds = time.perf_counter() - begin
-    return SearchResult(candidates[best], scores[best], findings[best], history, seconds, stop.is_set())
+def _problem(pad: Pad, contact: Contact, settings: Search, rules: Rules, origin: Morphology | None) -> Problem:
+    if settings.device == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            raise InputError("device is 'cuda', but no such device is found; allowed here is 'cpu'")
+    if origin is not None:
+        knots = origin.knots.shape[1] - 2
+        if origin.grid != pad.grid:
+            raise InputError(
+                f"the morphology to start from has grid {origin.grid}, allowed is that of the pad, {pad.grid}"
+            )
+        if knots > settings.knots:
+            raise InputError(
+                f"knots is {settings.knots}, allowed is at least the {knots} of the morphology to start from"
+            )
+    return Problem(pad, (contact, *settings.contacts), settings, rules, origin)
+
+
+class _Stop:
+    """Whether to go on: until Ctrl-C or a deadline of `time.perf_counter`."""
+
+    def __init__(self, deadline: float | None) -> None:
+        self.deadline, self.reason = deadline, ""
+        self.interrupts = 0
+
+    def interrupt(self) -> None:
+        self.interrupts, self.reason = self.interrupts + 1, "interrupted"
+
+    def __bool__(self) -> bool:
+        if not self.reason and self.deadline is not None and time.perf_counter() > self.deadline:
+            self.reason = "out of time"
+        return bool(self.reason)
 
 
 @contextmanager
-def _stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
+def _stopped_by_interrupt(stop: _Stop) -> Iterator[None]:
     """Let Ctrl-C set `stop` instead of tearing down threads; outside the main thread, where none arrives, nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda number, frame: stop.set())
+    before = signal.signal(signal.SIGINT, lambda number, frame: stop.interrupt())
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _mean_ambiguity(terms: dict[str, float]) -> float:
-    return float(np.mean([value for name, value in terms.items() if name.startswith("ambiguity")]))
-
-
-def _descend_all(pad: Pad, contact: Contact, settings: Search, rules: Rules, note: Note) -> list[Morphology]:
-    """Every start of the gradient search, one thread a core: torch lets go of the interpreter while it works.
-
-    Once a start is told to stop, those that wait are left out.
-    """
+@contextmanager
+def _threads(executor: Executor | None) -> Iterator[Executor]:
+    """The executor given, or one thread a core; slices set torch to one thread each, which is undone here."""
     import torch
 
-    from .descent import Step, descend
-
-    stopped = threading.Event()
-
-    def run(start: int) -> Morphology | None:
-        def heard(step: Step) -> bool:
-            if not note(f"start {start + 1}", step.number, settings.steps, step.ambiguity):
-                stopped.set()
-            return not stopped.is_set()
-
-        return None if stopped.is_set() else descend(start, pad, contact, settings, rules, heard)
-
+    if executor is not None:
+        yield executor
+        return
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            starts = [pool.submit(run, start) for start in range(settings.starts)]
-            while wait(starts, timeout=0.1).not_done:  # a wait without end would not let a signal through
-                pass
-            return [found for start in starts if (found := start.result()) is not None]
+            yield pool
     finally:
         torch.set_num_threads(threads)
 
 
-def _breed(pad: Pad, contact: Contact, settings: Search, rules: Rules, note: Note) -> list[Morphology]:
-    from .genetic import breed
+def _run(
+    problem: Problem,
+    states: dict[int, State],
+    pool: Executor,
+    stop: _Stop,
+    report: Report,
+    checkpoints: Checkpoints | None,
+) -> None:
+    """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
+    waiting = list(problem.starts)
+    running: dict[Future[Slice], int] = {}
+    while running or (waiting and not stop):
+        while waiting and not stop and len(running) < _width(pool):
+            start = waiting.pop(0)
+            running[pool.submit(advance, problem, start, states.get(start))] = start
+        for future in wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done:
+            start, reached = running.pop(future), future.result()
+            states[start] = reached.state
+            if checkpoints:
+                checkpoints.save(start, reached.state)
+            report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
+            if not reached.done and not stop:
+                running[pool.submit(advance, problem, start, reached.state)] = start
 
-    total = settings.generations
-    return [breed(pad, contact, settings, lambda generation, best: note("genetic", generation, total, best))]
+
+def _width(pool: Executor) -> int:
+    """How many starts run at once: as many as threads here, all on a cluster."""
+    return (os.cpu_count() or 1) if isinstance(pool, ThreadPoolExecutor) else 10_000
+
+
+def _candidates(problem: Problem, states: dict[int, State], pool: Executor, stop: _Stop) -> list[Morphology]:
+    """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
+    if not states:
+        return [finish(problem, 0, None, mend=False)]
+    if not stop:
+        return [finish(problem, start, state, mend=False) for start, state in sorted(states.items())]
+    best = min(states, key=lambda start: states[start]["history"][-1, 1])
+    return [finish(problem, best, states[best], mend=stop.interrupts < 2)]
+
+
+def _choose(found: list[Morphology], problem: Problem) -> tuple[Morphology, list[Violation]]:
+    """The pad with fewest broken rules, then least mean ambiguity, and what it breaks."""
+    search, enforce = problem.search, problem.rules.enforce
+
+    def rank(pad: Morphology) -> tuple[int, float]:
+        spread = [np.mean(ambiguities(pad, contact, search.lost, search.noise)) for contact in problem.contacts]
+        return len(broken[id(pad)]), float(np.mean(spread))
+
+    broken = {id(pad): check(pad, problem.rules) if enforce else [] for pad in found}
+    best = found[0] if len(found) == 1 else min(found, key=rank)
+    return best, broken[id(best)]
+
+
+def _name(problem: Problem, start: int) -> str:
+    return "genetic" if problem.search.method == "genetic" else f"start {start + 1}"
+
+
+def _history(problem: Problem, states: dict[int, State]) -> list[dict[str, Any]]:
+    return [
+        {"run": _name(problem, start), "step": int(step), "objective": value}
+        for start, state in sorted(states.items())
+        for step, value in state["history"].tolist()
+    ]

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError, field_validator
 
 from .errors import InputError
 
@@ -71,30 +71,83 @@ class Contact(Section):
     )
 
 
+def _tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Share = Annotated[float, Field(ge=0, le=1e6)]
+Lost = Annotated[
+    Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Share, ...], Field(min_length=1, max_length=9)],
+    BeforeValidator(_tuple),
+]
+
+
 class Search(Section):
-    """`[search]`: how the fibres are found."""
+    """`[search]`: how the fibres are found.
+
+    Attributes:
+        lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
+        contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
+    """
 
     method: Literal["descent", "genetic"] = Field(
         default="descent", description="gradient search, or the published one"
     )
-    knots: int = Field(default=5, ge=1, le=64, description="inner knots per fibre (N)")
+    knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
-    steps: int = Field(default=300, ge=1, le=1_000_000, description="steps of a start of the gradient search")
+    steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
-    lost: int = Field(default=2, ge=0, le=8, description="design for up to this many failed fibres")
+    lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
+    noise: float = Field(default=0.2, gt=0, le=100, description="standard deviation of a signal's noise, grid units")
+    sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
+    contacts: Annotated[tuple[Contact, ...], BeforeValidator(_tuple)] = Field(
+        default=(), description="further contacts to serve as well, each a table like [contact]"
+    )
+    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where presses are told apart")
+
+    @field_validator("lost")
+    @classmethod
+    def _some_weight(cls, lost: int | tuple[float, ...]) -> int | tuple[float, ...]:
+        if isinstance(lost, tuple) and sum(lost) == 0:
+            raise ValueError("one of the weights must be above 0")
+        return lost
+
+
+def _any(value: object) -> object:
+    return None if value == "any" else value
+
+
+MaxCrossings = Annotated[
+    Annotated[int, Field(ge=0)] | None,
+    BeforeValidator(_any),
+    PlainSerializer(lambda most: "any" if most is None else most),
+]
 
 
 class Rules(Section):
-    """`[rules]`: what makes a pad buildable; each rule is a penalty in the search and an exact check after it."""
+    """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`rules.check` has the formulas).
+
+    Attributes:
+        max_crossings: greatest number of crossings of a horizontal with a vertical fibre, or None for any number
+            ("any" in pad.toml). Every horizontal has to cross every vertical, so a limit below grid^2 cannot be met.
+    """
 
     enforce: bool = Field(
         default=True, description="false drops every rule: an explicit choice to design the unbuildable"
     )
     min_bend_radius_mm: float = Field(default=1.0, ge=0, le=1000, description="least bend radius of a fibre, mm")
-    min_gap_mm: float = Field(default=0.8, ge=0, le=1000, description="least gap between centre lines of a family, mm")
+    min_gap_mm: float = Field(
+        default=0.8, ge=0, le=1000, description="least gap between centre lines of a family, or folds of a fibre, mm"
+    )
     same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
+    max_crossings: MaxCrossings = Field(
+        default=None, description='crossings of horizontals with verticals allowed (at least grid^2), or "any"'
+    )
+    min_crossing_angle_deg: float = Field(
+        default=0.0, ge=0, le=90, description="least angle at which horizontals cross verticals, degrees"
+    )
     border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
     max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
 

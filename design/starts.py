@@ -1,0 +1,52 @@
+"""A start of either search as a chain of pure steps from state to state, to run on any executor."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from .checkpoint import State
+from .morphology import Morphology
+from .problem import Problem
+
+if TYPE_CHECKING:
+    from .descent import Descent
+    from .genetic import Breeding
+
+SLICE = {"descent": 25, "genetic": 2}  # steps or generations between two looks: about a third of a second
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Where a start has got to: its state, steps done, objective of the last one, and whether nothing is left to do."""
+
+    state: State
+    step: int
+    objective: float
+    done: bool
+
+
+def advance(problem: Problem, start: int, state: State | None) -> Slice:
+    """The next slice of a start, from its beginning if `state` is None."""
+    run = _open(problem, start, state)
+    run.advance(SLICE[problem.search.method])
+    return Slice(run.state(), run.step, run.objective, run.done)
+
+
+def finish(problem: Problem, start: int, state: State | None, mend: bool) -> Morphology:
+    """The fibres of a start as they are, or mended: what is left of it is left out, and what is broken repaired."""
+    run = _open(problem, start, state)
+    if mend:
+        run.finish()
+    return run.morphology()
+
+
+def _open(problem: Problem, start: int, state: State | None) -> "Descent | Breeding":
+    if problem.search.method == "genetic":
+        from .genetic import Breeding
+
+        return Breeding(problem, state)
+    import torch
+
+    from .descent import Descent
+
+    torch.set_num_threads(1)  # starts run beside each other, and sums in another order would give another result
+    return Descent(problem, start, state)
