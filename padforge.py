@@ -74,7 +74,7 @@ def report(folder: Path) -> None:
 
 
 @cli.command()
-@click.argument("name", type=click.Choice(["contact", "objective"]))
+@click.argument("name", type=click.Choice(["contact", "objective", "search"]))
 @out_option("out/bench")
 @json_option
 def bench(name: str, out: Path, as_json: bool) -> None:
@@ -83,9 +83,10 @@ def bench(name: str, out: Path, as_json: bool) -> None:
     Writes NAME.json, NAME.csv and NAME.png.
     """
     from design.bench import bench_contact, bench_objective
+    from design.bench_search import bench_search
     from design.bench_table import lines
 
-    run_bench = {"contact": bench_contact, "objective": bench_objective}[name]
+    run_bench = {"contact": bench_contact, "objective": bench_objective, "search": bench_search}[name]
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
         document = run_bench(out, lambda step: bar.update(task, note=step))

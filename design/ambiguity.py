@@ -5,7 +5,9 @@ still work, the place b drawn from what a noisy reading of press a leaves possib
 
     w_ab = softmax_b(-|s_a - s_b|^2_K / (4 sigma^2)),
 
-where 4 sigma^2, not 2 sigma^2, since the readings of both presses carry noise. The ambiguity is its mean spread,
+where 4 sigma^2, not 2 sigma^2, since the readings of both presses carry noise. sigma is a share of the full scale,
+the mean over fibres of the largest signal, since a converter is matched to what its fibre gives: a longer fibre alone
+tells nothing. The ambiguity is its mean spread,
 
     A = sum_k P(k) mean_{K: k lost} mean_a sum_b w_ab |p_a - p_b|,
 
@@ -28,11 +30,20 @@ def ambiguity(signals: Tensor, presses: Tensor, kept: Tensor, weight: Tensor, no
         kept: (L, 2M), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
         noise: sigma of a signal, grid units, > 0.
     """
-    difference = (signals[:, :, None] - signals[:, None, :]) ** 2
-    apart = (kept @ difference.flatten(1)).view(len(kept), *difference.shape[1:])
-    posterior = torch.softmax(apart * (-1 / (4 * noise**2)), dim=-1)
-    spread = (posterior * torch.cdist(presses, presses)).sum(dim=-1).mean(dim=-1)
+    scaled = kept.double()[:, None, :] * (signals.T.double() / (2 * noise))
+    # |s_a|^2 is the same for every b and falls out of the posterior; what is left is one product of matrices, in
+    # double precision since it cancels
+    likelihood = torch.baddbmm(-(scaled**2).sum(dim=-1)[:, None, :], scaled, scaled.mT, alpha=2)
+    posterior = torch.softmax(likelihood.to(presses.dtype), dim=-1)
+    spread = torch.einsum("lab,ab->l", posterior, torch.cdist(presses, presses)) / len(presses)
     return spread @ weight
+
+
+def full_scale(signals: Tensor) -> float:
+    """Mean over the fibres that are touched at all of the largest of their signals (2M, Q); 1 if none is."""
+    largest = signals.detach().amax(dim=1)
+    touched = largest[largest > 0]
+    return touched.mean().item() if len(touched) else 1.0
 
 
 def sharpness(signals: Tensor) -> Tensor:

@@ -4,8 +4,9 @@ import csv
 import io
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -19,12 +20,12 @@ FORMAT = "padforge-bench/1"
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement.
+    """One measurement; those alike in case, way and size are repetitions, of which tables and figures show the median.
 
     Attributes:
-        case: what was computed. way: how. size: the way's own parameter (samples, tolerance; 0 if it has none).
-        error: against the reference of the case; None where only time is asked for.
-        seconds: median wall time. visited: share of the scene that was looked at.
+        case: what was computed. way: how. size: the way's own parameter (samples, steps; 0 if it has none).
+        error: what the figure's axis says; None where only time is asked for.
+        seconds: median wall time. visited: share of the scene that was looked at; None where that means nothing.
     """
 
     case: str
@@ -32,7 +33,7 @@ class Row:
     size: float
     error: float | None
     seconds: float
-    visited: float
+    visited: float | None
 
 
 def write_bench(
@@ -41,9 +42,9 @@ def write_bench(
     """Write `NAME.json`, `NAME.csv` and `NAME.png` to `out`; each row gets its speed relative to `reference`.
 
     Args:
-        reference: (way, size) of the row of the same case that counts as 1.
+        reference: (way, size) of the rows of the same case whose median time counts as 1.
     """
-    base = {row.case: row.seconds for row in rows if (row.way, row.size) == reference}
+    base = {row.case: row.seconds for row in medians(rows) if (row.way, row.size) == reference}
     table = [asdict(row) | {"speed": base[row.case] / row.seconds if row.case in base else None} for row in rows]
     document = {
         "format": FORMAT,
@@ -63,36 +64,54 @@ def write_bench(
     return document
 
 
+def medians(rows: Sequence[Row]) -> list[Row]:
+    """One row for each case, way and size: medians over its repetitions."""
+    alike: dict[tuple[str, str, float], list[Row]] = {}
+    for row in rows:
+        alike.setdefault((row.case, row.way, row.size), []).append(row)
+    return [
+        Row(*key, _median([r.error for r in same]), median(r.seconds for r in same), _median([r.visited for r in same]))
+        for key, same in alike.items()
+    ]
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
 def lines(document: dict[str, Any]) -> list[str]:
     """A benchmark as a table for people."""
     way, size = document["reference"]
+    rows = medians([Row(**{field.name: row[field.name] for field in fields(Row)}) for row in document["rows"]])
+    base = {row.case: row.seconds for row in rows if (row.way, row.size) == (way, size)}
     head = [f"{document['bench']}: speed relative to {way} at {size:g}", ""]
-    head.append(f"{'case':<20} {'way':<10} {'size':>7} {'error':>9} {'time':>10} {'speed':>8} {'visited':>8}")
-    for row in document["rows"]:
-        error = "-" if row["error"] is None else f"{row['error']:.1e}"
-        speed = "-" if row["speed"] is None else f"{row['speed']:.2f}x"
-        head.append(
-            f"{row['case']:<20} {row['way']:<10} {row['size']:>7g} {error:>9} {1e6 * row['seconds']:>7.1f} us "
-            f"{speed:>8} {100 * row['visited']:>6.1f} %"
-        )
+    head.append(f"{'case':<20} {'way':<13} {'size':>7} {'error':>9} {'time':>10} {'speed':>8} {'visited':>8}")
+    for row in rows:
+        error = "-" if row.error is None else f"{row.error:.1e}" if row.error < 1e-2 else f"{row.error:.3f}"
+        time = f"{1e6 * row.seconds:.1f} us" if row.seconds < 0.1 else f"{row.seconds:.2f} s"
+        speed = f"{base[row.case] / row.seconds:.2f}x" if row.case in base else "-"
+        visited = "-" if row.visited is None else f"{100 * row.visited:.1f} %"
+        head.append(f"{row.case:<20} {row.way:<13} {row.size:>7g} {error:>9} {time:>10} {speed:>8} {visited:>8}")
     return head
 
 
 def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:
-    measured = [row for row in rows if row.error is not None]
+    measured = [row for row in medians(rows) if row.error is not None]
+    scale, unit = (1e3, "ms") if min(row.seconds for row in measured) < 0.1 else (1, "s")
     cases = list(dict.fromkeys(row.case for row in measured))
     figure = Figure(figsize=(4 * len(cases), 3.8), layout="constrained")
     colours = dict(zip(dict.fromkeys(row.way for row in rows), (INK, VERTICAL, HORIZONTAL, ALARM), strict=False))
     panels = figure.subplots(1, len(cases), sharey=True, squeeze=False)[0]
     for axes, case in zip(panels, cases, strict=True):
         for way, colour in colours.items():
-            points = [(1e3 * r.seconds, max(r.error or 0, 1e-16)) for r in measured if (r.case, r.way) == (case, way)]
+            points = [(scale * r.seconds, max(r.error or 0, 1e-16)) for r in measured if (r.case, r.way) == (case, way)]
             if points:
                 marker = "o-" if len(points) > 1 else "D"
                 size = 4 if len(points) > 1 else 8
                 axes.loglog(*zip(*points, strict=True), marker, color=colour, label=way, markersize=size, linewidth=1.4)
         axes.set_title(case, loc="left", color=INK)
-        axes.set_xlabel("run time (ms)")
+        axes.set_xlabel(f"run time ({unit})")
         axes.grid(color=FAINT, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(error_label)

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .ambiguity import ambiguity, sharpness
+from .ambiguity import ambiguity, full_scale, sharpness
 from .checkpoint import State
-from .contact import boustrophedon
+from .contact import boustrophedon, signals
 from .differentiable import ExactSignals, pchip_slopes
 from .fibres import Fibres, border_of, first_course
 from .losses import draw_losses, loss_shares
@@ -25,6 +25,7 @@ from .problem import Problem
 from .rules import check
 
 SIDE = 14  # presses per row and column of the stratified sample a step looks at
+SCALE_SIDE = 24  # presses per row and column by which full scale is known
 WINDOW = 5.0  # side of the part of the pad a step looks at, grid units: presses further apart are seldom confused
 LOUDER = 2.0  # noise of the first step as a multiple of the last one's
 RATE = 0.02
@@ -42,6 +43,7 @@ class Descent:
 
     Attributes:
         step: steps done. objective: ambiguity and sharpness at the last step. done: whether nothing is left to do.
+        scale: full scale of the signals, grid units.
     """
 
     def __init__(self, problem: Problem, start: int, state: State | None = None) -> None:
@@ -53,6 +55,9 @@ class Descent:
         if state is None:
             course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
             self.fibres = Fibres.through(course, border_of(pad, rules))
+            # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
+            presses = boustrophedon(pad.grid, SCALE_SIDE)
+            self.scale = full_scale(torch.tensor(signals(self.fibres.knots()[None], presses, problem.contacts[0])[0].T))
             self._optimiser = self._adam()
         else:
             self._restore(state)
@@ -84,7 +89,7 @@ class Descent:
         state = {
             "spans": self.fibres.spans.detach().numpy().copy(),
             "cross": self.fibres.cross.detach().numpy().copy(),
-            "fixed": np.array([self.fibres.floor, self.fibres.border]),
+            "fixed": np.array([self.fibres.floor, self.fibres.border, self.scale]),
             "progress": np.array([self.step, self.objective, self.done]),
             "history": np.array(self._history).reshape(-1, 2),
             "generator": np.frombuffer(generator, np.uint8).copy(),
@@ -94,7 +99,7 @@ class Descent:
         return state
 
     def _restore(self, state: State) -> None:
-        floor, border = state["fixed"].tolist()
+        floor, border, self.scale = state["fixed"].tolist()
         self.fibres = Fibres(torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border)
         step, self.objective, done = state["progress"].tolist()
         self.step, self.done = int(step), bool(done)
@@ -163,8 +168,8 @@ class Descent:
         there, losses, shares = (torch.tensor(x, dtype=torch.float32, device=device) for x in (places, kept, weight))
         total = torch.zeros((), device=device)
         for contact in self.problem.contacts:
-            signals: Tensor = ExactSignals.apply(travel, cross, slope, places, contact)  # pyright: ignore[reportAssignmentType]
-            total = total + ambiguity(signals.float().to(device), there, losses, shares, noise)
+            found: Tensor = ExactSignals.apply(travel, cross, slope, places, contact)  # pyright: ignore[reportAssignmentType]
+            total = total + ambiguity(found.float().to(device), there, losses, shares, noise * self.scale)
             if search.sharpness > 0:
                 in_order = ExactSignals.apply(travel, cross, slope, boustrophedon(grid, SIDE), contact)
                 total = total + search.sharpness * sharpness(in_order.float().to(device))

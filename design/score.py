@@ -18,11 +18,11 @@ def ambiguities(pad: Morphology, contact: Contact, lost: int | tuple[float, ...]
     """Localisation ambiguity (formula of `ambiguity`) with 0, 1, ... fibres lost, grid units, on a grid of presses.
 
     Args:
-        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, grid units.
+        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
     """
     import torch
 
-    from .ambiguity import ambiguity
+    from .ambiguity import ambiguity, full_scale
 
     line = np.linspace(1, pad.grid, SIDE) if pad.grid > 1 else np.linspace(0.5, 1.5, SIDE)
     presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
@@ -36,7 +36,7 @@ def ambiguities(pad: Morphology, contact: Contact, lost: int | tuple[float, ...]
         for row, loss in enumerate(losses):
             kept[row, list(loss)] = 0
         equal = torch.full((len(losses),), 1 / len(losses))
-        spread.append(ambiguity(found, places, kept, equal, noise).item())
+        spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
     return spread
 
 
@@ -44,7 +44,7 @@ def score(
     pad: Morphology,
     contact: Contact | None = None,
     lost: int | tuple[float, ...] = 3,
-    noise: float = 0.2,
+    noise: float = 0.13,
     rules: Rules | None = None,
 ) -> dict[str, float]:
     """Every term of a pad, by name.

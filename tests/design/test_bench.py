@@ -6,8 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from design import Contact, Morphology, bench, published_objective, signals_quantized
+from design import Contact, Morphology, bench, bench_search, published_objective, signals_quantized
 from design.bench_table import Row, lines, write_bench
+from design.evaluation import LossError
+from design.search import SearchResult
+from design.settings import Rules, Search
 
 
 @pytest.fixture
@@ -45,3 +48,53 @@ def test_speed_is_relative_to_the_reference_of_the_same_case(tmp_path):
     rows = [Row("a", "slow", 1, 0.1, 2.0, 1.0), Row("a", "fast", 1, 0.1, 0.5, 0.1), Row("b", "fast", 1, None, 1.0, 0.1)]
     document = write_bench("x", rows, tmp_path, "error", ("slow", 1))
     assert [row["speed"] for row in document["rows"]] == [1.0, 4.0, None]
+
+
+def test_a_table_shows_the_median_of_repetitions_and_the_file_all(tmp_path):
+    rows = [Row("a", "slow", 1, error, time, None) for error, time in ((0.1, 2.0), (0.3, 9.0), (0.2, 4.0))]
+    document = write_bench("x", rows, tmp_path, "error", ("slow", 1))
+    assert [row["speed"] for row in document["rows"]] == [2.0, pytest.approx(4 / 9), 1.0]
+    assert lines(document)[3:] == [f"{'a':<20} {'slow':<13} {1:>7} {'0.200':>9} {'4.00 s':>10} {'1.00x':>8} {'-':>8}"]
+
+
+def test_the_search_bench_holds_every_way_budget_and_seed(monkeypatch, tmp_path):
+    asked = []
+
+    def search(pad, contact, settings, rules):
+        asked.append((settings.method, settings.knots, settings.seed, rules.enforce))
+        return SearchResult(Morphology.straight(pad.grid), {}, [], seconds=settings.generations + settings.steps)
+
+    levels = [LossError(k, 1, mean, 0, mean) for k, mean in enumerate([0.1, 0.2, 0.3, 0.8])]
+    small = {"KNOTS": (3,), "SEEDS": (0, 1), "GENERATIONS": (1,), "STEPS": (1, 2)}
+    for name, value in {**small, "search": search, "evaluate": lambda *_, **__: levels}.items():
+        monkeypatch.setattr(bench_search, name, value)
+    document = bench_search.bench_search(tmp_path, lambda step: None)
+
+    assert json.loads((tmp_path / "search.json").read_text()) == document
+    ways = [("genetic", 1), ("descent", 1), ("with rules", 1), ("descent", 2), ("with rules", 2)]
+    rows = [(row["way"], row["size"], row["seed"]) for row in document["rows"]]
+    assert rows == [(*way, seed) for way in ways for seed in (0, 1)]
+    measured = asked[3:]  # each way once before the clock
+    assert measured == [
+        (way.replace("with rules", "descent"), 3, seed, way == "with rules") for way, _ in ways for seed in (0, 1)
+    ]
+    for row in document["rows"]:
+        assert row["case"] == "N=3"
+        assert row["error"] == pytest.approx(0.35)
+        assert [row[f"lost_{k}"] for k in range(4)] == [0.1, 0.2, 0.3, 0.8]
+    with (tmp_path / "search.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(document["rows"])
+    assert (tmp_path / "search.png").read_bytes().startswith(b"\x89PNG")
+    assert len(lines(document)) == len(ways) + 3
+
+
+def test_a_search_is_measured_on_the_pad_it_found(monkeypatch):
+    monkeypatch.setattr(bench_search, "SUBSETS", 1)
+    settings = Search(method="genetic", knots=1, population=4, generations=1, seed=5)
+    row = bench_search._row("N=1", "genetic", 1, settings, Rules(enforce=False))
+    assert (row.seed, row.size) == (5, 1)
+    assert row.seconds > 0
+    assert row.violations > 0  # random fibres of one family cross
+    levels = [row.lost_0, row.lost_1, row.lost_2, row.lost_3]
+    assert row.error == pytest.approx(np.mean(levels))
+    assert 0.05 < levels[0] < levels[3] < 1.5

@@ -15,7 +15,8 @@ NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0, border
 
 
 def axes(pad):
-    return tuple(torch.tensor(axis[0], requires_grad=True) for axis in fibre_axes(pad)[:2])
+    travel, cross, _ = fibre_axes(pad)
+    return torch.tensor(travel[0], requires_grad=True), torch.tensor(cross[0], requires_grad=True)
 
 
 def found(pad, rules, margin=1.0):

@@ -81,22 +81,27 @@ class KilledError(Exception):
 def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
     settings = SMALL.model_copy(update={"method": method, "generations": 6, "steps": 75})
-    whole = search(settings=settings)
-    for attempt in range(100):
+    whole, kills = search(settings=settings), 0
+
+    def attempt():
         heard = []
 
-        def report(*step, heard=heard):
+        def report(*step):
             heard.append(step)
             if len(heard) == 2:
                 raise KilledError
 
+        return search(settings=settings, report=report, keep_in=tmp_path / "search", resume=True)
+
+    while kills < 100:
         try:
-            broken = search(settings=settings, report=report, keep_in=tmp_path / "search", resume=True)
-        except KilledError:
-            assert attempt < 99
-        else:
+            broken = attempt()
             break
-    assert attempt > 0
+        except KilledError:
+            kills += 1
+    else:
+        pytest.fail("it does not get on")
+    assert kills > 0
     assert broken.morphology == whole.morphology
     assert broken.history == whole.history
     assert broken.violations == whole.violations
