@@ -193,12 +193,12 @@ def _design(folder: Path, document: dict[str, Any]) -> Pieces:
     broken = [[v["rule"], ", ".join(map(str, v["fibres"])), v["measured"], v["limit"]] for v in document["violations"]]
     enforced = document["provenance"]["settings"]["rules"]["enforce"]
     holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
-    return [(holds, "design rules"), (f"{spread[0]:.3f}", "expected error, grid units")], [
+    return [(holds, "design rules"), (f"{spread[0]:.3f}", "ambiguity, grid units")], [
         heading("Fibres"),
         figures(
             [(folder / "design.svg", "The plan: horizontal and vertical fibres, their crossings, and the contact.")]
         ),
-        table(["fibres lost", "expected error (grid units)"], list(spread.items())),
+        table(["fibres lost", "ambiguity (grid units)"], list(spread.items())),
         paragraph(f"Rules of [rules], checked on the exact curves: {holds}."),
         *([table(["rule", "fibres", "measured", "limit"], broken)] if broken else []),
     ]

@@ -159,7 +159,7 @@ def summary(result: "SearchResult", out: Path) -> list[str]:
     return [
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
         + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
-        f"  expected error {lost} grid units with {' / '.join(map(str, range(len(spread))))} fibres lost",
+        f"  ambiguity {lost} grid units under noise, with {' / '.join(map(str, range(len(spread))))} fibres lost",
         *(broken or ["  all rules hold"]),
         *([f"  ... and {more} more"] if more > 0 else []),
     ]

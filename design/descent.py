@@ -33,7 +33,8 @@ PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
 MARGIN = 1.05  # on the limits of the rules
 NOTED_STEPS = 10  # between entries of the history
 REPAIR_STEPS, REPAIR_CHECKS = 600, 20  # after the last step, until the exact check passes; steps between checks
-REPAIR_RATE, REPAIR_MARGIN = 0.002, 0.01  # and what is added to the margin at each check that does not pass
+REPAIR_MARGIN = 0.01  # added to the margin at each check that does not pass
+REPAIR_RATE, REPAIR_FASTER, REPAIR_FASTEST = 0.002, 1.15, 0.01  # gentle at first, and faster with each such check
 
 
 class Descent:
@@ -90,7 +91,8 @@ class Descent:
             "spans": self.fibres.spans.detach().numpy().copy(),
             "cross": self.fibres.cross.detach().numpy().copy(),
             "fixed": np.array([self.fibres.floor, self.fibres.border, self.scale]),
-            "progress": np.array([self.step, self.objective, self.done]),
+            "progress": np.array([self.step, self.objective]),
+            "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
             "generator": np.frombuffer(generator, np.uint8).copy(),
         }
@@ -101,8 +103,8 @@ class Descent:
     def _restore(self, state: State) -> None:
         floor, border, self.scale = state["fixed"].tolist()
         self.fibres = Fibres(torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border)
-        step, self.objective, done = state["progress"].tolist()
-        self.step, self.done = int(step), bool(done)
+        step, self.objective = state["progress"].tolist()
+        self.step, self.done = int(step), bool(state["done"])
         self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
         self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
         self._optimiser = self._adam()
@@ -139,8 +141,9 @@ class Descent:
     def _repair(self) -> None:
         """One step on the rules alone, which moves only what breaks them, with a margin that grows until they hold."""
         repairs = self.step - self.problem.search.steps
-        margin = MARGIN + REPAIR_MARGIN * (repairs // REPAIR_CHECKS)
-        self._follow(self._penalty(*self.fibres.axes(), margin), REPAIR_RATE)
+        checks = repairs // REPAIR_CHECKS
+        rate = min(REPAIR_RATE * REPAIR_FASTER**checks, REPAIR_FASTEST)
+        self._follow(self._penalty(*self.fibres.axes(), MARGIN + REPAIR_MARGIN * checks), rate)
         self.step += 1
         if (repairs + 1) % REPAIR_CHECKS == 0:
             self.done = repairs + 1 >= REPAIR_STEPS or not self._broken()

@@ -77,11 +77,12 @@ class Breeding:
         """All that the next generations depend on, as arrays.
 
         Returns:
-            "history": (k, 2) generation and best objective; "population": (P, 4MN) coordinates of the pads and
-            "objectives": (P,) theirs, both empty before the first generation; "random": (), state of the generator.
+            "done": (); "history": (k, 2) generation and best objective; "population": (P, 4MN) coordinates of the pads
+            and "objectives": (P,) theirs, both empty before the first generation; "random": (), the generator's state.
         """
         x, objective = self._algorithm.pop.get("X", "F")
         return {
+            "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
             "population": x,
             "objectives": objective.reshape(-1),

@@ -14,7 +14,6 @@ from .differentiable import pchip_sample, span_samples
 from .settings import Pad, Rules
 
 PER_SPAN = 12
-STRIDE = 3  # of the samples crossings are counted by, which need not be as dense as for bends
 ORDER_PER_UNIT = 40
 BLUR = 0.1  # standard deviation of the mollified crossing count, grid units
 
@@ -143,7 +142,7 @@ def _family_crossings(fibres: Samples) -> Tensor:
     """Soft number of crossings within the families."""
     grid = len(fibres.place) // 2
     pairs = [(f, g) for f in range(2 * grid) for g in range(f + 1, grid * (f // grid + 1))]
-    first, second = (fibres.place[list(side), ::STRIDE] for side in zip(*pairs, strict=True))
+    first, second = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
     return _mollified(first, second, 0.0)[0]
 
 
@@ -151,7 +150,7 @@ def _crossings(fibres: Samples, limit: float) -> tuple[Tensor, Tensor]:
     """Soft number of horizontal x vertical crossings, and of those flatter than `limit` radians, by how much."""
     grid = len(fibres.place) // 2
     pairs = [(f, g) for f in range(grid) for g in range(grid, 2 * grid)]
-    horizontal, vertical = (fibres.place[list(side), ::STRIDE] for side in zip(*pairs, strict=True))
+    horizontal, vertical = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
     return _mollified(horizontal, vertical.flip(-1), limit)
 
 

@@ -171,7 +171,7 @@ def _run(
     checkpoints: Checkpoints | None,
 ) -> None:
     """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
-    waiting = list(problem.starts)
+    waiting = [start for start in problem.starts if start not in states or not states[start]["done"]]
     running: dict[Future[Slice], int] = {}
     while running or (waiting and not stop):
         while waiting and not stop and len(running) < _width(pool):
