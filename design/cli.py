@@ -160,7 +160,7 @@ def summary(result: "SearchResult", out: Path) -> list[str]:
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
         + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
         f"  ambiguity {lost} grid units under noise, with {' / '.join(map(str, range(len(spread))))} fibres lost",
-        *(broken or ["  all rules hold"]),
+        *(broken or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
         *([f"  ... and {more} more"] if more > 0 else []),
     ]
 

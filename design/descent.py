@@ -74,10 +74,9 @@ class Descent:
                 self._repair()
 
     def finish(self) -> None:
-        """Leave out what is left of the search, and repair what is broken."""
+        """Leave out what is left of the search, so that the next steps repair what is broken."""
         if self.step < self.problem.search.steps:
             self._begin_repair()
-        self.advance(REPAIR_STEPS)
 
     def morphology(self) -> Morphology:
         """The fibres as they are."""

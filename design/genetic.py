@@ -63,9 +63,10 @@ class Breeding:
             self._history.append((self.step, self.objective))
 
     def finish(self) -> None:
-        """Breed the first generation if there is none; the published search knows no rules, so nothing is repaired."""
+        """Leave out the generations after the first that are not bred yet; there are no rules to repair by."""
         if self.step == 0:
             self.advance(1)
+        self._generations = self.step
 
     def morphology(self) -> Morphology:
         """The best pad so far; there is one once the first generation is done."""

@@ -30,7 +30,8 @@ from .starts import Slice, advance, finish
 Report = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
 
-RESERVE = 0.15  # share of a time budget kept for repairing and scoring
+RESERVE = 0.15  # share of a time budget kept for repairing
+MENDING_S = 3.0  # of repair after Ctrl-C
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class SearchResult:
         terms: every term of `score` for it.
         violations: the rules it breaks; empty where rules are not enforced.
         history: one entry per noted step: {"run", "step", "objective"}.
+        enforced: whether it was to keep to the rules.
         seconds: wall time.
         stopped: why it ended early with the best so far: "interrupted", "out of time", or "" if it did not.
     """
@@ -49,6 +51,7 @@ class SearchResult:
     morphology: Morphology
     terms: dict[str, float]
     violations: list[Violation]
+    enforced: bool = True
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
     stopped: str = ""
@@ -87,7 +90,7 @@ def search(
     problem = _problem(pad or Pad(), contact or Contact(), settings or Search(), rules or Rules(), origin)
     checkpoints = Checkpoints(keep_in, problem.settings()) if keep_in else None
     states = checkpoints.begin(resume) if checkpoints else {}
-    stop = _Stop(None if time_budget is None else begin + (1 - RESERVE) * time_budget)
+    stop = _Stop(begin, time_budget)
     with _stopped_by_interrupt(stop), _threads(executor) as pool:
         _run(problem, states, pool, stop, report, checkpoints)
         found = _candidates(problem, states, pool, stop)
@@ -95,7 +98,8 @@ def search(
     if checkpoints and not stop.reason:
         checkpoints.clear()
     terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
-    return SearchResult(best, terms, violations, _history(problem, states), time.perf_counter() - begin, stop.reason)
+    history, seconds = _history(problem, states), time.perf_counter() - begin
+    return SearchResult(best, terms, violations, problem.rules.enforce, history, seconds, stop.reason)
 
 
 def _problem(pad: Pad, contact: Contact, settings: Search, rules: Rules, origin: Morphology | None) -> Problem:
@@ -120,12 +124,17 @@ def _problem(pad: Pad, contact: Contact, settings: Search, rules: Rules, origin:
 class _Stop:
     """Whether to go on: until Ctrl-C or a deadline of `time.perf_counter`."""
 
-    def __init__(self, deadline: float | None) -> None:
-        self.deadline, self.reason = deadline, ""
-        self.interrupts = 0
+    def __init__(self, begin: float, time_budget: float | None) -> None:
+        self.deadline = None if time_budget is None else begin + (1 - RESERVE) * time_budget
+        self.end = None if time_budget is None else begin + time_budget
+        self.reason = ""
 
     def interrupt(self) -> None:
-        self.interrupts, self.reason = self.interrupts + 1, "interrupted"
+        self.reason = "interrupted"
+
+    def mend_until(self) -> float:
+        """When to end the repair of the best so far."""
+        return self.end if self.reason == "out of time" and self.end else time.perf_counter() + MENDING_S
 
     def __bool__(self) -> bool:
         if not self.reason and self.deadline is not None and time.perf_counter() > self.deadline:
@@ -195,11 +204,11 @@ def _width(pool: Executor) -> int:
 def _candidates(problem: Problem, states: dict[int, State], pool: Executor, stop: _Stop) -> list[Morphology]:
     """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
     if not states:
-        return [finish(problem, 0, None, mend=False)]
+        return [finish(problem, 0, None)]
     if not stop:
-        return [finish(problem, start, state, mend=False) for start, state in sorted(states.items())]
+        return [finish(problem, start, state) for start, state in sorted(states.items())]
     best = min(states, key=lambda start: states[start]["history"][-1, 1])
-    return [finish(problem, best, states[best], mend=stop.interrupts < 2)]
+    return [finish(problem, best, states[best], stop.mend_until())]
 
 
 def _choose(found: list[Morphology], problem: Problem) -> tuple[Morphology, list[Violation]]:

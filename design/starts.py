@@ -1,5 +1,6 @@
 """A start of either search as a chain of pure steps from state to state, to run on any executor."""
 
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -31,11 +32,12 @@ def advance(problem: Problem, start: int, state: State | None) -> Slice:
     return Slice(run.state(), run.step, run.objective, run.done)
 
 
-def finish(problem: Problem, start: int, state: State | None, mend: bool) -> Morphology:
-    """The fibres of a start as they are, or mended: what is left of it is left out, and what is broken repaired."""
+def finish(problem: Problem, start: int, state: State | None, until: float = 0.0) -> Morphology:
+    """The fibres of a start as they are, what is broken being repaired `until` then by `time.perf_counter`."""
     run = _open(problem, start, state)
-    if mend:
-        run.finish()
+    run.finish()
+    while not run.done and time.perf_counter() < until:
+        run.advance(1)
     return run.morphology()
 
 
