@@ -44,7 +44,7 @@ def score(
     pad: Morphology,
     contact: Contact | None = None,
     lost: int | tuple[float, ...] = 3,
-    noise: float = 0.13,
+    noise: float = 0.11,
     rules: Rules | None = None,
 ) -> dict[str, float]:
     """Every term of a pad, by name.

@@ -95,12 +95,12 @@ class Search(Section):
     )
     knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
-    steps: int = Field(default=800, ge=1, le=1_000_000, description="steps of a start of the gradient search")
+    steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
     lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
-    noise: float = Field(default=0.13, gt=0, le=10, description="standard deviation of a signal's noise, of full scale")
+    noise: float = Field(default=0.11, gt=0, le=10, description="standard deviation of a signal's noise, of full scale")
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
     contacts: Annotated[tuple[Contact, ...], BeforeValidator(_tuple)] = Field(
         default=(), description="further contacts to serve as well, each a table like [contact]"

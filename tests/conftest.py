@@ -1,12 +1,11 @@
 """Fixtures shared by all tests."""
 
-import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-settings.register_profile("padforge", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile("padforge", deadline=None, derandomize=True)
 settings.load_profile("padforge")
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"

@@ -154,7 +154,7 @@ def test_init_writes_settings_that_every_command_reads(tmp_path):
     again = padforge("init", cwd=tmp_path)
     assert again.returncode == 2
     assert "exists already" in again.stderr
-    (tmp_path / "pad.toml").write_text(text.replace("steps = 800", "steps = 0"))
+    (tmp_path / "pad.toml").write_text(text.replace("steps = 1000", "steps = 0"))
     result = padforge("run", cwd=tmp_path)
     assert result.returncode == 2
     assert "pad.toml: [search] steps: got 0" in result.stderr

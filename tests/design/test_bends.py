@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
@@ -100,6 +100,7 @@ def test_a_circle_through_knots_has_its_radius(radius):
 def test_traced_points_lie_on_the_curve_with_its_headings(seed, knots, step):
     pad = Morphology.random(1, knots, seed)
     for fibre, axis in ((0, 0), (1, 1)):
+        assume(np.diff(pad.knots[fibre, :, axis]).min() > 1e-3)  # closer ones cost the oracle its own digits
         points, headings = traced(pad, fibre, step)
         curve = PchipInterpolator(pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis])
         np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)

@@ -117,11 +117,12 @@ def test_finer_sampling_comes_closer(contact, grid, knots, seed):
         warnings.simplefilter("error")
         found = signals(pad, presses, contact)
     sampled = signals_quantized(pad, presses, contact, samples=200_001)
+    # secants; a PCHIP curve is up to three times as steep, and a sample more or less there counts as much
     slopes = np.abs(np.diff(pad.knots, axis=1)).max() / np.diff(pad.knots, axis=1).max(axis=2).min()
     heaviest = {"uniform": 1, "inverse_square": 1 / contact.radius, "inverse": 100 / contact.radius}[contact.weight]
     assert np.isfinite(found).all()
     assert (found >= 0).all()
-    np.testing.assert_allclose(found, sampled, atol=(1e-3 + 1e-4 * slopes) * heaviest, rtol=1e-2)
+    np.testing.assert_allclose(found, sampled, atol=(1e-3 + 3e-4 * slopes) * heaviest, rtol=1e-2)
 
 
 @pytest.mark.parametrize("radius", [1e-9, 1e-6, 1e-3, 0.4])
