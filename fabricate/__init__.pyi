@@ -1,7 +1,7 @@
 from .export import build as build
+from .findings import Finding as Finding
 from .mould import build_mould as build_mould
 from .outlines import Plan as Plan
-from .printability import Finding as Finding
 from .printability import check as check
 from .printability import check_mesh as check_mesh
 from .settings import Mould as Mould

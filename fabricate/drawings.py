@@ -9,8 +9,8 @@ import numpy as np
 from design.curves import beziers
 from design.palette import FAINT, HORIZONTAL, PAPER, VERTICAL
 
+from .findings import Finding
 from .outlines import Plan, polygon_rings
-from .printability import Finding
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry

@@ -16,9 +16,10 @@ from design.files import atomic, provenance, write_json, write_text
 from design.morphology import Morphology
 
 from .drawings import FAMILIES, draw_mould, tracks_svg
+from .findings import Finding
 from .mould import build_mould
 from .outlines import Plan
-from .printability import Finding, planned, unsound
+from .printability import planned, unsound
 from .settings import DEFAULTS, Settings
 
 if TYPE_CHECKING:

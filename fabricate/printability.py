@@ -5,9 +5,8 @@ Nothing here changes a mould or stops its making: a pass, warn or fail with what
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import shapely
@@ -17,13 +16,10 @@ from shapely.geometry.base import BaseGeometry
 from design.errors import InputError
 from design.morphology import Morphology
 
+from .findings import Finding, Status, as_places, graded, verdict
 from .mould import plan_mesh
 from .outlines import INTO_WALL_MM, Plan, areas, overlap, without
 from .settings import DEFAULTS, Printer, Settings
-
-Status = Literal["pass", "warn", "fail"]
-Number = float | list[float]
-Place = tuple[float, float]
 
 SOUND = ("manifold", "watertight", "bodies", "volume", "genus")
 """The checks a mesh must pass to be a solid at all."""
@@ -32,30 +28,6 @@ _LARGEST_MM = 1e6
 
 _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """The outcome of one check.
-
-    Attributes:
-        name: of the check.
-        status: "pass", "warn" (it works, with care) or "fail".
-        measured, limit: in the unit the message says; mm unless it says otherwise.
-        message: one sentence for people.
-        places_mm: where, in mm from the pad's centre; empty where a place means nothing.
-    """
-
-    name: str
-    status: Status
-    measured: Number
-    limit: Number
-    message: str
-    places_mm: tuple[Place, ...] = ()
-
-    def document(self) -> dict[str, Any]:
-        """The finding as JSON, places rounded to the micrometre."""
-        return asdict(self) | {"places_mm": [[round(x, 3), round(y, 3)] for x, y in self.places_mm]}
 
 
 def check(pad: Morphology, settings: Settings = DEFAULTS) -> list[Finding]:
@@ -147,11 +119,11 @@ def inspect_mesh(vertices: np.ndarray, triangles: np.ndarray, printer: Printer) 
     turned = zip([*sorted(size[:2]), size[2]], [*sorted(bed[:2]), bed[2]], strict=True)
     fits = all(extent <= room for extent, room in turned)
     return [
-        _verdict("manifold", status == "NoError", int(status == "NoError"), 1, f"manifold3d says {status}"),
-        _verdict("watertight", closed, len(loose), 0, edges, middles),
-        _verdict("bodies", bodies == 1, bodies, 1, "one body" if bodies == 1 else f"the mesh has {bodies} bodies"),
-        _verdict("volume", volume > 0, volume, 0, f"the solid holds {volume:.1f} mm³"),
-        _verdict("bed", fits, size, bed, f"{_by(size)} mm to print on a bed of {_by(bed)} mm"),
+        verdict("manifold", status == "NoError", int(status == "NoError"), 1, f"manifold3d says {status}"),
+        verdict("watertight", closed, len(loose), 0, edges, middles),
+        verdict("bodies", bodies == 1, bodies, 1, "one body" if bodies == 1 else f"the mesh has {bodies} bodies"),
+        verdict("volume", volume > 0, volume, 0, f"the solid holds {volume:.1f} mm³"),
+        verdict("bed", fits, size, bed, f"{_by(size)} mm to print on a bed of {_by(bed)} mm"),
     ]
 
 
@@ -163,7 +135,7 @@ def _manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
 
 def _genus(vertices: np.ndarray, triangles: np.ndarray) -> Finding:
     genus = _manifold(vertices, triangles).genus()
-    return _verdict(
+    return verdict(
         "genus", genus == 0, genus, 0, "no hole through it" if genus == 0 else f"{genus} holes lead through the solid"
     )
 
@@ -174,7 +146,7 @@ def _ridge_width(settings: Settings) -> Finding:
     least = printer.nozzle_mm * (2 if printer.resin else 1)
     reason = "two pixels" if printer.resin else "the nozzle"
     message = f"ridges are {width:g} mm wide, {reason} {least:g} mm"
-    return _verdict("ridge_width", width >= least - 1e-9, width, least, message)
+    return verdict("ridge_width", width >= least - 1e-9, width, least, message)
 
 
 def _track_size(settings: Settings) -> Finding:
@@ -182,7 +154,7 @@ def _track_size(settings: Settings) -> Finding:
     room = min(settings.mould.ridge_width_mm, settings.mould.shallow_ridge_height_mm)
     fibre = settings.pad.fibre_diameter_mm
     message = f"the tightest track is {room:g} mm, the fibre {fibre:g} mm"
-    return _verdict("track_size", room >= fibre, room, fibre, message)
+    return verdict("track_size", room >= fibre, room, fibre, message)
 
 
 def _layers(settings: Settings) -> Finding:
@@ -207,7 +179,7 @@ def _crossing_gap(settings: Settings) -> Finding:
     mould = settings.mould
     gap = mould.deep_ridge_height_mm - settings.pad.fibre_diameter_mm - mould.shallow_ridge_height_mm
     message = f"{gap:.3f} mm lie between fibres of different families where they cross"
-    return Finding("crossing_gap", _graded(gap, mould.min_silicone_mm), gap, mould.min_silicone_mm, message)
+    return Finding("crossing_gap", graded(gap, mould.min_silicone_mm), gap, mould.min_silicone_mm, message)
 
 
 def _same_family_crossings(plan: Plan) -> Finding:
@@ -216,7 +188,7 @@ def _same_family_crossings(plan: Plan) -> Finding:
     allowed = plan.settings.rules.same_family_crossings
     status: Status = "fail" if len(places) > allowed else "warn" if len(places) else "pass"
     message = f"{len(places)} crossings of fibres of one family, whose tracks merge; allowed are {allowed}"
-    return Finding("same_family_crossings", status, len(places), allowed, message, _places(places))
+    return Finding("same_family_crossings", status, len(places), allowed, message, as_places(places))
 
 
 def _silicone_walls(plan: Plan) -> list[Finding]:
@@ -239,8 +211,8 @@ def _silicone_walls(plan: Plan) -> list[Finding]:
             low, high = (low, middle) if _thinner(silicone, middle, within) else (middle, high)
         message = f"the thinnest silicone between {name} tracks is {high:.2f} mm"
         places = [patch.representative_point().coords[0] for patch in patches]
-        status = _graded(low, limit) if patches else "pass"
-        findings.append(Finding(f"silicone_wall_{name}", status, high, limit, message, _places(places)))
+        status = graded(low, limit) if patches else "pass"
+        findings.append(Finding(f"silicone_wall_{name}", status, high, limit, message, as_places(places)))
     return findings
 
 
@@ -268,22 +240,7 @@ def _tray_wall(plan: Plan) -> Finding:
     least = min(gaps, default=min(middle.distance(wall) - half for middle in middles))
     places = [ops.nearest_points(part, wall)[0].coords[0] for part in near]
     message = f"ridges between their ends come within {least:.2f} mm of the tray's wall"
-    return Finding("tray_wall", _graded(least, limit), least, limit, message, _places(places))
-
-
-def _graded(measured: float, limit: float) -> Status:
-    """Pass from `limit` up, warn below it, fail where nothing is left."""
-    return "pass" if measured >= limit - 1e-9 else "warn" if measured > 0 else "fail"
-
-
-def _verdict(
-    name: str, passed: bool, measured: Number, limit: Number, message: str, places: Iterable[Any] = ()
-) -> Finding:
-    return Finding(name, "pass" if passed else "fail", measured, limit, message, _places(places))
-
-
-def _places(places: Iterable[Any]) -> tuple[Place, ...]:
-    return tuple((float(x), float(y)) for x, y in places)
+    return Finding("tray_wall", graded(least, limit), least, limit, message, as_places(places))
 
 
 def _by(sizes: list[float]) -> str:

@@ -7,8 +7,9 @@ import trimesh
 from design.errors import InputError
 from design.morphology import Morphology
 from fabricate.export import build
+from fabricate.findings import Finding
 from fabricate.outlines import Plan
-from fabricate.printability import SOUND, Finding, check, check_mesh, inspect, inspect_mesh
+from fabricate.printability import SOUND, check, check_mesh, inspect, inspect_mesh
 from fabricate.settings import DEFAULTS, Printer, Settings
 
 from .planted import level_pad, with_settings
