@@ -74,7 +74,7 @@ def report(folder: Path) -> None:
 
 
 @cli.command()
-@click.argument("name", type=click.Choice(["contact", "objective", "search"]))
+@click.argument("name", type=click.Choice(["contact", "objective", "search", "mould"]))
 @out_option("out/bench")
 @json_option
 def bench(name: str, out: Path, as_json: bool) -> None:
@@ -85,11 +85,12 @@ def bench(name: str, out: Path, as_json: bool) -> None:
     from design.bench import bench_contact, bench_objective
     from design.bench_search import bench_search
     from design.bench_table import lines
+    from fabricate.bench import bench_mould
 
-    run_bench = {"contact": bench_contact, "objective": bench_objective, "search": bench_search}[name]
+    benches = {"contact": bench_contact, "objective": bench_objective, "search": bench_search, "mould": bench_mould}
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
-        document = run_bench(out, lambda step: bar.update(task, note=step))
+        document = benches[name](out, lambda step: bar.update(task, note=step))
     show_result(document, lines(document), as_json)
 
 

@@ -66,7 +66,7 @@ def check(pad: Morphology, rules: Rules) -> list[Violation]:
     """
     lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.pitch_mm)]
     return [
-        *_bends(pad, rules.min_bend_radius_mm),
+        *tight_bends(pad, rules.min_bend_radius_mm),
         *_gaps(lines, rules.min_gap_mm),
         *_folds(pad, lines, rules.min_gap_mm),
         *_crossings(pad, rules),
@@ -75,7 +75,8 @@ def check(pad: Morphology, rules: Rules) -> list[Violation]:
     ]
 
 
-def _bends(pad: Morphology, limit: float) -> list[Violation]:
+def tight_bends(pad: Morphology, limit: float) -> list[Violation]:
+    """The tightest bend of every fibre that breaks `min_bend_radius_mm` = `limit`."""
     if limit == 0:
         return []
     window = min(limit / 2, pad.size_mm)  # no fibre is shorter than the pad

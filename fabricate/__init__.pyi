@@ -3,7 +3,7 @@ from .findings import Finding as Finding
 from .mould import build_mould as build_mould
 from .outlines import Plan as Plan
 from .printability import check as check
-from .printability import check_mesh as check_mesh
 from .settings import Mould as Mould
 from .settings import Printer as Printer
 from .settings import Settings as Settings
+from .soundness import check_mesh as check_mesh

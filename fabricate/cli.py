@@ -7,6 +7,7 @@ import click
 
 from design.console import json_option, load_spec, show_result, spec_option
 
+MESHES = (".stl", ".3mf")
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
 
@@ -35,7 +36,7 @@ def fabricate() -> None:
 @fabricate.command()
 @click.argument("morphology", type=click.Path(path_type=Path))
 @click.option(
-    "--formats", default="stl,step,svg,png", show_default=True, help="Which to write, of stl, 3mf, step, svg and png."
+    "--formats", default="stl,step,svg,png", show_default=True, help="Which to write, of stl, 3mf, step, svg, dxf, png."
 )
 @spec_option
 @click.option(
@@ -79,20 +80,30 @@ def summary(document: dict[str, Any], out: Path) -> list[str]:
 @fabricate.command()
 @click.argument("mesh_or_morphology", type=click.Path(path_type=Path))
 @spec_option
+@click.option(
+    "--picture", type=click.Path(dir_okay=False, path_type=Path), help="PNG to draw, with the places found marked."
+)
 @json_option
 @click.pass_context
-def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, as_json: bool) -> None:
+def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, picture: Path | None, as_json: bool) -> None:
     """Check a mesh, or the mould of a morphology; exit 1 when a check fails."""
+    from design.files import atomic
     from design.morphology import Morphology
 
-    from . import printability
+    from . import drawings, soundness
+    from .outlines import Plan
+    from .printability import meshed
     from .settings import Settings
 
     settings = Settings.from_spec(load_spec(spec))
-    if mesh_or_morphology.suffix.lower() in (".stl", ".3mf"):
-        findings = printability.check_mesh(mesh_or_morphology, settings.printer)
+    if mesh_or_morphology.suffix.lower() in MESHES:
+        vertices, triangles = soundness.read_mesh(mesh_or_morphology)
+        findings = soundness.inspect_mesh(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)
     else:
-        findings = printability.check(Morphology.load(mesh_or_morphology), settings)
+        vertices, triangles, findings = meshed(Plan(Morphology.load(mesh_or_morphology), settings))
+    if picture is not None:
+        with atomic(picture) as temporary:
+            drawings.draw_findings(vertices, triangles, findings, temporary)
     passed = all(finding.status != "fail" for finding in findings)
     documents = [finding.document() for finding in findings]
     show_result({"passed": passed, "findings": documents}, list(map(_line, documents)), as_json)

@@ -1,123 +1,270 @@
-"""Drawings of a mould: the tracks as exact curves, and the mould as a shaded height map."""
+"""Pictures of a mould, of the tracks it leaves, and of any mesh with what the checks found on it: PNGs.
 
+All are seen from above. The same input gives the same bytes; files are small, for some are kept in git.
+"""
+
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from design.curves import beziers
-from design.palette import FAINT, HORIZONTAL, PAPER, VERTICAL
+from design.palette import ALARM, FAINT, INK, PAPER
 
 from .findings import Finding
-from .outlines import Plan, polygon_rings
+from .layers import COLOURS, FAMILIES, Layer, layers, pale
+from .outlines import INTO_WALL_MM, Plan, polygon_rings
+from .relief import RIDGE, lit, mesh_relief, mould_relief
+from .tracks import SCALE_MM
 
 if TYPE_CHECKING:
-    from shapely.geometry.base import BaseGeometry
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-FAMILIES = ("horizontal", "vertical")
-_COLOURS = (HORIZONTAL, VERTICAL)
-_PIXELS = 1000
-"""Side of the height map, about what the page shows: 17 pixels a mm for the published pad."""
+CARE = "#7b3fa0"
+"""Colour of what a check warns of: unlike both families, and unlike what fails."""
 
+_NUMBER, _EDGE, _GREY = "#8a867d", "#a7a49c", "#77746c"
+"""Greys of the numbers on the floor, of outlines, and of what stands beside a picture."""
 
-def tracks_svg(plan: Plan) -> str:
-    """The fibres as an SVG of true size (1 user unit = 1 mm), seen as they lie in the tray.
+_RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
+"""Colours of a mesh from its lowest visible height to its highest."""
 
-    Every PCHIP span is one cubic Bezier segment, so nothing is approximated. Each family is a group, each fibre a
-    path that begins and ends at the silicone's edge; the rectangle is that edge.
-    """
-    low, _, high, _ = plan.cavity.bounds
-    side = high - low
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{side:.6g}mm" height="{side:.6g}mm" '
-        f'viewBox="{low:.6g} {low:.6g} {side:.6g} {side:.6g}" fill="none" '
-        f'stroke-width="{plan.settings.pad.fibre_diameter_mm:g}">',
-        f'<rect id="silicone" x="{low:.6g}" y="{low:.6g}" width="{side:.6g}" height="{side:.6g}" stroke="#888"/>',
-    ]
-    spans = plan.pad.to_mm(beziers(plan.pad)) * (1, -1)  # y points down in SVG
-    border = plan.settings.mould.border_mm
-    for family, (name, colour) in enumerate(zip(FAMILIES, _COLOURS, strict=True)):
-        lines.append(f'<g id="{name}" stroke="{colour}">')
-        ahead = border * np.array([(1, 0), (0, -1)][family])
-        for number, fibre in enumerate(spans[family * plan.pad.grid :][: plan.pad.grid], 1):
-            curves = "".join(f"C{_pair(a)} {_pair(b)} {_pair(c)}" for _, a, b, c in fibre)
-            start, end = f"M{_pair(fibre[0, 0] - ahead)}L{_pair(fibre[0, 0])}", f"L{_pair(fibre[-1, -1] + ahead)}"
-            lines.append(f'<path id="{name}-{number}" d="{start}{curves}{end}"/>')
-        lines.append("</g>")
-    return "\n".join([*lines, "</svg>\n"])
+_DPI = 100
+
+_PIXELS = 900
+"""Longer side of what is shown: 14 pixels a mm for the published pad, about six for a ridge."""
+
+_NARROWEST = 600
+"""Least width in pixels: room for a title and a legend."""
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 66, 24, 44, 62
+"""Pixels around it for title, ticks and axis labels; the rows of the legend come below."""
+
+_ROW, _COLUMNS = 21, 3
+"""Height of a row of the legend in pixels, and entries in one."""
+
+_EXACT, _COLOURS = 32, 64
+"""Colours of a picture that it keeps as they are, the commonest, and what the others are reduced to."""
+
+_FAIL_MARKS, _CARE_MARKS = "osp8H", "D^v<>"
+"""A mark of its own for every check, as long as they last."""
 
 
 def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
-    """Write the mould seen from above as PNG: colour tells the height, shade the slope, rings what failed."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Write the mould from above as PNG: colour tells family and height, shade the slope.
+
+    Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
+    """
     from matplotlib.colors import to_rgb
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    names = ("tray floor", *(f"{name} ridges" for name in FAMILIES), "tray wall")
-    colours = (PAPER, *_COLOURS, FAINT)
-    heights = (0.0, *plan.settings.ridge_heights_mm, plan.settings.mould.silicone_mm)
-    zones = _zones(plan)
-    shaded = _lit(np.array([to_rgb(colour) for colour in colours])[zones], np.array(heights)[zones])
-    half = plan.tray.bounds[2]
+    heights, shown = mould_relief(plan, _PIXELS)
+    order = layers(plan)
+    tints = [PAPER, FAINT, _NUMBER, *[PAPER] * len(plan.heights_mm)]
+    for layer in order:
+        tints[RIDGE + layer.level] = layer.colour
+    entries = [(PAPER, "floor"), (FAINT, f"wall, {plan.silicone_mm:g} mm")]
+    if any(plan.numbers):
+        entries.append((_NUMBER, f"mirrored numbers, {plan.settings.mould.shallow_ridge_height_mm:g} mm"))
+    entries += [(layer.colour, f"{FAMILIES[layer.family]} ridges, {layer.depth_mm:g} mm") for layer in order]
+    handles = [Patch(facecolor=colour, edgecolor=_GREY, label=label) for colour, label in entries]
 
-    figure = Figure(figsize=(7.5, 8.2), dpi=140, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.imshow(shaded, extent=(-half, half, -half, half), interpolation="antialiased")
-    legend: list[object] = [
-        Patch(facecolor=colour, edgecolor="#555", label=f"{name}, {height:g} mm")
-        for name, colour, height in zip(names, colours, heights, strict=True)
-    ]
-    places = np.array([place for finding in findings if finding.status == "fail" for place in finding.places_mm])
+    left, low, right, high = plan.tray.bounds
+    depth_mm = plan.settings.mould.floor_mm + plan.silicone_mm
+    title = f"Mould from above, {right - left:.4g} x {high - low:.4g} x {depth_mm:.4g} mm"
+    sheet = _sheet((left, right, low, high), title, len(handles) + len(_marked(findings)))
+    sheet.show(lit(np.array(list(map(to_rgb, tints)))[shown], heights))
+    sheet.save(path, [*handles, *sheet.mark(findings)])
+
+
+def draw_tracks(plan: Plan, path: Path) -> None:
+    """Write the plan of the fibres as PNG, as they lie in the tray, seen from above.
+
+    Where two cross, the deeper one, which is nearer to whoever looks down into the tray, interrupts the other.
+    """
+    left, low, right, high = plan.silicone.bounds
+    room = 0.06 * (right - left)
+    order = layers(plan)
+    places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
+    title = f"Fibres as they lie in the tray, from above: {2 * plan.pad.grid} fibres, {len(plan.crossings)} crossings"
+    bounds = (left - room, right + room, low - room, high + room)
+    sheet = _sheet(bounds, title, len(order) + (len(places) > 0))
+    for area in (plan.silicone, plan.cavity):
+        for ring in (ring for polygon in polygon_rings(area) for ring in polygon):
+            sheet.axes.fill(*ring.T, facecolor=PAPER, edgecolor=_EDGE, linewidth=1, zorder=1)
+    handles = [h for layer in reversed(order) for h in _draw_layer(sheet, plan, layer)][::-1]
     if len(places):
-        label = f"{len(places)} places that fail"
-        legend += axes.plot(*places.T, "o", mfc="none", mec="#c4001a", ms=9, mew=1.3, label=label)
-    depth = plan.settings.mould.floor_mm + plan.settings.mould.silicone_mm
-    axes.set(title=f"Mould from above, {2 * half:g} x {2 * half:g} x {depth:g} mm", xlabel="x (mm)", ylabel="y (mm)")
-    figure.legend(handles=legend, loc="outside lower center", ncols=3, frameon=False)
-    figure.savefig(path, metadata={"Software": None})
+        label = f"{len(places)} crossings of one family"
+        handles += sheet.axes.plot(*places.T, "o", mfc="none", mec=INK, ms=9, mew=1, label=label, zorder=4)
+    sheet.scale_bar()
+    sheet.save(path, handles)
 
 
-def _zones(plan: Plan) -> np.ndarray:
-    """(_PIXELS, _PIXELS) what each pixel shows: 0 floor, 1 horizontal ridge, 2 vertical ridge, 3 wall; top first."""
-    zone = np.full((_PIXELS, _PIXELS), 3)
-    cavity = _mask(plan, plan.cavity)
-    zone[cavity] = 0
-    for family in np.argsort(plan.settings.ridge_heights_mm):  # the taller one shows where they cross
-        zone[cavity & _mask(plan, plan.ridges[family])] = 1 + family
-    return zone
+def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
+    """Write any mesh from above as PNG: colour tells the height, shade the slope, marks what the checks found.
+
+    Args:
+        vertices: (n, 3) mm, finite. triangles: (m, 3) vertex numbers, m >= 1.
+        findings: with places in the frame of the mesh. path: to write to.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    corners = np.asarray(vertices, dtype=float)
+    heights, extent = mesh_relief(corners, np.asarray(triangles, dtype=np.intp), _PIXELS)
+    seen = np.isfinite(heights)
+    low, high = (float(heights[seen].min()), float(heights[seen].max())) if seen.any() else (0.0, 0.0)
+    heights[~seen] = low
+    ramp = LinearSegmentedColormap.from_list("heights", _RAMP)
+    colours = lit(ramp((heights - low) / ((high - low) or 1.0))[..., :3], heights)
+    colours[~seen] = 1
+
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(corners, axis=0))
+    sheet = _sheet(extent, f"Mesh from above, {size} mm", len(_marked(findings)))
+    sheet.show(colours)
+    ground = float(corners[:, 2].min())
+    sheet.ramp(ramp, f"{low - ground:.3g} mm", f"{high - ground:.3g} mm above the lowest point")
+    sheet.save(path, sheet.mark(findings))
 
 
-def _mask(plan: Plan, area: "BaseGeometry") -> np.ndarray:
-    """(_PIXELS, _PIXELS) bool: whether the pixel's centre lies in `area`."""
-    from PIL import Image, ImageDraw
+def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
+    """Draw the fibres of a depth with their numbers; the first of their lines stands for them in the legend."""
+    from matplotlib.patheffects import withStroke
+    from shapely.ops import substring
 
-    image = Image.new("1", (_PIXELS, _PIXELS))
-    pen = ImageDraw.Draw(image)
-    low, _, high, _ = plan.tray.bounds
-    polygons = sorted(polygon_rings(area), key=lambda rings: -np.ptp(rings[0], axis=0).prod())  # islands after lakes
-    for rings in polygons:
-        for hole, ring in enumerate(rings):
-            pixels = (ring - low) / (high - low) * _PIXELS - 0.5
-            pixels[:, 1] = _PIXELS - 1 - pixels[:, 1]
-            pen.polygon([tuple(pixel) for pixel in pixels], fill=not hole)
-    return np.array(image, dtype=bool)
-
-
-def _lit(colours: np.ndarray, heights_mm: np.ndarray) -> np.ndarray:
-    """(n, n, 3) colours with light from the upper left falling on heights (n, n); flat places keep theirs."""
-    from scipy.ndimage import uniform_filter
-
-    eased: np.ndarray = uniform_filter(uniform_filter(heights_mm, 3, mode="nearest"), 3, mode="nearest")
-    slope = np.clip(2 * np.add(*np.gradient(eased)), -1, 1)
-    lit = colours.copy()
-    bright, dark = slope > 0, slope < 0
-    lit[bright] += 0.6 * slope[bright, None] * (1 - lit[bright])
-    lit[dark] *= 1 + 0.45 * slope[dark, None]
-    return lit
+    width = max(1.3, sheet.points(plan.settings.pad.fibre_diameter_mm))
+    size = min(11.0, 0.5 * sheet.points(plan.pad.pitch_mm))
+    drawn = []
+    for fibre in layer.fibres:
+        line = substring(plan.lines[fibre], INTO_WALL_MM, plan.lines[fibre].length - INTO_WALL_MM)
+        edged = [withStroke(linewidth=width + 2, foreground=PAPER)]
+        style = {"linewidth": width, "color": layer.colour, "zorder": 2, "path_effects": edged}
+        drawn += sheet.axes.plot(*np.array(line.coords).T, label=_depth(layer), solid_capstyle="butt", **style)
+        (x, y), *_ = line.coords
+        away, place = ((0, -5), ("center", "top")) if layer.family else ((-5, 0), ("right", "center"))
+        sheet.axes.annotate(
+            str(fibre + 1), (x, y), away, textcoords="offset points", ha=place[0], va=place[1],
+            color=COLOURS[layer.family], fontsize=size, fontweight="bold",
+        )  # fmt: skip
+    return drawn[:1]
 
 
-def _pair(place: np.ndarray) -> str:
-    return f"{place[0]:.6g},{place[1]:.6g}"
+def _depth(layer: Layer) -> str:
+    return f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
+
+
+def _marked(findings: Sequence[Finding]) -> list[Finding]:
+    """The findings that have something to show, those that fail first."""
+    worth = [finding for finding in findings if finding.status != "pass" and finding.places_mm]
+    return sorted(worth, key=lambda finding: finding.status)
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """A picture in the making: its axes are in mm and cover whole pixels.
+
+    Attributes:
+        extent: left, right, low and high of the axes, mm. pixels: their width and height.
+    """
+
+    figure: "Figure"
+    axes: "Axes"
+    extent: tuple[float, float, float, float]
+    pixels: tuple[int, int]
+
+    def points(self, length_mm: float) -> float:
+        """A length on the picture in typographic points."""
+        left, right, *_ = self.extent
+        return length_mm * self.pixels[0] / (right - left) * 72 / _DPI
+
+    def show(self, colours: np.ndarray) -> None:
+        """Fill the axes with colours (rows, columns, 3), 0..1."""
+        self.axes.imshow(colours, extent=self.extent, interpolation="nearest", aspect="auto")
+
+    def mark(self, findings: Sequence[Finding]) -> list[Any]:
+        """Mark the places of the findings that fail or warn; what explains the marks in the legend."""
+        marks = {"fail": (ALARM, iter(_FAIL_MARKS)), "warn": (CARE, iter(_CARE_MARKS))}
+        handles = []
+        for finding in _marked(findings):
+            colour, shapes = marks[finding.status]
+            shape, places = next(shapes, "X"), np.array(finding.places_mm).T
+            label = f"{finding.status}: {finding.name} ({len(finding.places_mm)})"
+            style = {"marker": shape, "mfc": "none", "linestyle": "none", "ms": 10, "zorder": 5}
+            self.axes.plot(*places, mec="white", mew=3.4, **style)  # keeps the mark off whatever it lies on
+            handles += self.axes.plot(*places, mec=colour, mew=1.5, label=label, **style)
+        return handles
+
+    def scale_bar(self) -> None:
+        """Put a bar of known length under the lower right corner."""
+        right, y = self.extent[1], -46 / self.pixels[1]
+        style = {"color": INK, "clip_on": False, "transform": self.axes.get_xaxis_transform()}
+        self.axes.plot([right - SCALE_MM, right], [y, y], "|-", linewidth=1.2, ms=8, **style)
+        self.axes.annotate(
+            f"{SCALE_MM:g} mm", (right - SCALE_MM, y), (-8, 0), xycoords=self.axes.get_xaxis_transform(),
+            textcoords="offset points", ha="right", va="center", fontsize=9, color=INK, annotation_clip=False,
+        )  # fmt: skip
+
+    def ramp(self, colours: Any, low: str, high: str) -> None:
+        """Put a bar of the colours of heights under the lower left corner."""
+        width, height = self.figure.get_size_inches() * _DPI
+        y = self.axes.get_position().y0 * height - 52
+        bar = self.figure.add_axes((_LEFT / width + 50 / width, y / height, 120 / width, 12 / height))
+        bar.imshow(np.linspace(0, 1, 120)[None], cmap=colours, aspect="auto")
+        bar.set(xticks=[], yticks=[])
+        bar.text(-0.05, 0.5, low, ha="right", va="center", fontsize=9, color=INK, transform=bar.transAxes)
+        bar.text(1.05, 0.5, high, ha="left", va="center", fontsize=9, color=INK, transform=bar.transAxes)
+
+    def save(self, path: Path, handles: list[Any]) -> None:
+        """Write the picture with its legend as PNG, in few colours."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        if handles:
+            style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.2, "handlelength": 1.6}
+            self.figure.legend(handles=handles, loc="lower center", ncols=_COLUMNS, **style)
+        canvas = FigureCanvasAgg(self.figure)
+        canvas.draw()
+        _few_colours(np.asarray(canvas.buffer_rgba())).save(path, format="PNG", optimize=True)
+
+
+def _sheet(extent: tuple[float, float, float, float], title: str, entries: int) -> _Sheet:
+    """An empty picture of `extent` (left, right, low, high) mm with room for the legend's entries."""
+    from matplotlib.figure import Figure
+
+    left, right, low, high = extent
+    scale = _PIXELS / max(right - left, high - low)
+    wide, tall = max(1, round(scale * (right - left))), max(1, round(scale * (high - low)))
+    below = _BOTTOM + _ROW * math.ceil(entries / _COLUMNS) + 6 * (entries > 0)
+    width, height = _LEFT + max(wide, _NARROWEST) + _RIGHT, below + tall + _TOP
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    axes = figure.add_axes((_LEFT / width, below / height, wide / width, tall / height))
+    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x (mm)", ylabel="y (mm)")
+    axes.set_title(title, fontsize=11, color=INK, loc="left")
+    axes.tick_params(colors=_GREY, labelsize=9)
+    axes.spines[:].set_color(_EDGE)
+    return _Sheet(figure, axes, extent, (wide, tall))
+
+
+def _few_colours(pixels: NDArray[np.uint8]) -> Any:
+    """Pixels (rows, columns, 4), opaque, as a PIL image in few colours; the commonest and the marks' are exact."""
+    from PIL import Image, ImageColor
+
+    picture: Any = Image.fromarray(pixels).convert("RGB")
+    few = picture.quantize(_COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    palette = [tuple(few.getpalette()[i : i + 3]) for i in range(0, 3 * len(few.getcolors()), 3)]
+    # marks have too few pixels for a place in it, whose edges are paler
+    palette += [ImageColor.getrgb(pale(mark, white)) for mark in (ALARM, CARE) for white in (0, 0.25, 0.5, 0.75)]
+    common = sorted(picture.getcolors(picture.width * picture.height), reverse=True)[:_EXACT]
+    exact = [ImageColor.getrgb(ALARM), ImageColor.getrgb(CARE), *(colour for _, colour in common)]
+
+    colours = Image.new("P", (1, 1))
+    colours.putpalette([part for colour in palette for part in colour])
+    index = np.array(picture.quantize(palette=colours, dither=Image.Dither.NONE))
+    packed = pixels.view(np.uint32)[..., 0]
+    for number, colour in enumerate(exact, len(palette)):  # the nearest that quantize finds is only near
+        index[packed == np.frombuffer(bytes((*colour, 255)), np.uint32)] = number
+    out = Image.fromarray(index, "P")
+    out.putpalette([part for colour in (*palette, *exact) for part in colour])
+    return out

@@ -1,28 +1,38 @@
-"""The mould as a solid: a tray with ridges on its floor, once as a triangle mesh and once as an exact solid.
+"""The bodies of a mould, put together from their parts, and the mould as a CAD solid.
 
-z = 0 is the underside of the tray, which lies on the print bed; the floor's top is at `floor_mm` and the walls end
-at `floor_mm + silicone_mm`. Lengths are mm. Both ways start from the same `Plan` and share nothing after it, so
-that one checks the other.
+z = 0 is the underside of a body, which lies on the print bed; the tray's floor has its top at `floor_mm`. Lengths
+are mm.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-import shapely
+from shapely.geometry.base import BaseGeometry
 
 from design.errors import InputError
 from design.morphology import Morphology
 
-from .outlines import SNAP_MM, Plan, overlap, polygon_rings
+from . import parts
+from .bodies import Body
+from .outlines import Plan
 from .settings import DEFAULTS, Settings
 
 if TYPE_CHECKING:
     from build123d import Solid
     from manifold3d import Manifold
-    from shapely.geometry.base import BaseGeometry
 
-INTO_FLOOR_MM = 0.2
-"""How far ridges sink into the floor before they are joined to it."""
+WELL_MM = 3.0
+"""Diameter of the wells for conductive material."""
+
+_WELL_RIM_MM = 1.0
+"""Silicone around a well."""
+
+_VENT_INSET_MM = 3.0
+"""How far from the cavity's rim the lid's vents lie."""
+
+LID_MM = 3.0
+"""Thickness of the lid."""
 
 
 def build_mould(pad: Morphology, settings: Settings = DEFAULTS) -> "Solid":
@@ -36,58 +46,131 @@ def build_mould(pad: Morphology, settings: Settings = DEFAULTS) -> "Solid":
         One closed solid, mm.
 
     Raises:
-        InputError: settings that contradict each other, or no closed solid comes out.
+        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out.
     """
-    reason = InputError()
-    for plan in Plan.tries(pad, settings):
-        try:
-            return plan_solid(plan)
-        except InputError as error:
-            reason = error
-    raise reason
+    plan = Plan(pad, settings)
+    plan.require_levels()
+    return valid_solid(plan_mesh(plan))
 
 
-def plan_solid(plan: Plan) -> "Solid":
-    """The solid of one plan; raises InputError where outlines touch."""
-    from .plateaus import stepped_solid
+def valid_solid(mesh: "Manifold") -> "Solid":
+    """The CAD solid of a mesh; raises InputError where the CAD kernel finds it invalid."""
+    from .facets import faceted_solid
 
-    return stepped_solid(plateaus(plan), SNAP_MM)
+    solid = faceted_solid(mesh)
+    if not solid.is_valid:
+        raise InputError("mould: the CAD kernel finds the solid invalid; try another [mould] tolerance_mm")
+    return solid
 
 
 def plan_mesh(plan: Plan) -> "Manifold":
-    """The mould as a manifold3d mesh: extruded outlines, joined."""
-    from manifold3d import CrossSection, Manifold, OpType
+    """The mould of a plan as a manifold3d mesh."""
+    from .meshes import mesh
 
-    def prism(area: "BaseGeometry", bottom: float, top: float) -> Manifold:
-        rings = [ring for polygon in polygon_rings(area) for ring in polygon]
-        return Manifold.extrude(CrossSection(rings), top - bottom).translate((0, 0, bottom))
-
-    floor, top = _floor_and_top(plan.settings)
-    tray = prism(plan.tray, 0, top) - prism(plan.cavity, floor, top + 1)
-    heights = plan.settings.ridge_heights_mm
-    ridges = [prism(r, floor - INTO_FLOOR_MM, floor + h) for r, h in zip(plan.ridges, heights, strict=True)]
-    return Manifold.batch_boolean([tray, *ridges], OpType.Add)
+    return mesh(mould_body(plan))
 
 
-def plateaus(plan: Plan) -> list[tuple["BaseGeometry", float]]:
-    """The mould as a height map: areas with the z of their top, mm; together they tile the tray.
+def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
+    """The inverse mould: tray, ridges, exits, numbers and pins.
 
-    Neighbouring areas share every vertex of the border between them, and vertices lie on a grid of `SNAP_MM`.
+    Args:
+        wells: outlines that belong to the ridges of each level, mm; none for a pad whose fibres are laid.
+
+    Raises:
+        InputError: pins that find no room on the walls.
     """
-    floor, top = _floor_and_top(plan.settings)
-    levels = sorted(zip(plan.settings.ridge_heights_mm, plan.ridges, strict=True), key=lambda level: level[0])
-    outlines = [plan.tray.boundary, plan.cavity.boundary]
-    outlines += [overlap(ridge, plan.cavity).boundary for _, ridge in levels]
-    cells = shapely.get_parts(shapely.polygonize([shapely.union_all(outlines, grid_size=SNAP_MM)]))
-    x, y = shapely.get_coordinates(shapely.point_on_surface(cells)).T
-    z = np.full(len(cells), floor)
-    for height, ridge in levels:
-        shapely.prepare(ridge)
-        z[shapely.contains_xy(ridge, x, y)] = floor + height
-    z[~shapely.contains_xy(plan.cavity, x, y)] = top
-    return [(shapely.coverage_union_all(cells[z == height]), float(height)) for height in np.unique(z)]
+    mould = plan.settings.mould
+    floor, hollows = mould.floor_mm, [plan.cavity, *plan.exits]
+    body = parts.tray(plan.tray, hollows, floor_mm=floor, depth_mm=plan.silicone_mm, flare_mm=plan.flare_mm)
+    for level, height in enumerate(plan.heights_mm):
+
+        def outline(below: float, level: int = level) -> BaseGeometry:
+            ridge = plan.outline(level, below) if below else plan.ridges[level]
+            return ridge | wells[level] if wells else ridge
+
+        ridges = parts.ridge(outline, floor_mm=floor, height_mm=height, terrace_mm=plan.settings.terrace_mm)
+        body = body.with_adds(ridges)
+    written = [outline for outline in plan.numbers if outline is not None]
+    body = body.with_adds(parts.numbers(written, floor_mm=floor, height_mm=mould.shallow_ridge_height_mm))
+    if mould.pins:
+        top = floor + plan.silicone_mm
+        body = body.with_adds(parts.pins(_pin_places(plan), top_mm=top, diameter_mm=_pin_mm(plan)))
+    return body
 
 
-def _floor_and_top(settings: Settings) -> tuple[float, float]:
-    """z of the tray's floor and of the top of its walls, mm."""
-    return settings.mould.floor_mm, settings.mould.floor_mm + settings.mould.silicone_mm
+def sizes(plan: Plan) -> dict[str, float]:
+    """What the parts came out as, mm: where the settings leave it open or the pad needs more than they say."""
+    mould = plan.settings.mould
+    _, _, edge, _ = plan.cavity.bounds
+    achieved = {
+        "pad_mm": 2 * edge,
+        "pad_thickness_mm": plan.silicone_mm,
+        "rim_mm": 2 * (edge + plan.flare_mm),
+        "tray_mm": 2 * plan.tray.bounds[2],
+        "tray_height_mm": mould.floor_mm + plan.silicone_mm,
+        "ridge_foot_mm": mould.ridge_width_mm + 2 * plan.heights_mm[-1] * plan.settings.ridge_slope,
+    }
+    if mould.pins:
+        achieved["pin_mm"] = _pin_mm(plan)
+    if mould.lid:
+        achieved["lid_mm"] = LID_MM
+    if mould.conductive:
+        achieved["well_mm"] = WELL_MM
+    return {name: round(size, 6) for name, size in achieved.items()}
+
+
+def lid_body(plan: Plan) -> Body:
+    """The lid that lies on the tray's walls; its holes fit the pins, if there are any."""
+    mould, (_, _, edge, _) = plan.settings.mould, plan.cavity.bounds
+    inset = edge - min(_VENT_INSET_MM, edge / 2)
+    body = parts.lid(
+        plan.tray,
+        [(x, y) for x in (-inset, inset) for y in (-inset, inset)],
+        thickness_mm=LID_MM,
+        pin_places=_pin_places(plan) if mould.pins else (),
+        pin_mm=_pin_mm(plan) if mould.pins else 0.0,
+    )
+    return parts.spout(body, thickness_mm=LID_MM) if mould.spout else body
+
+
+def conductive_plan(plan: Plan) -> Plan:
+    """The plan of the second mould: exits large enough for wells, everything else alike.
+
+    Raises:
+        InputError: exits that large do not fit the pitch.
+    """
+    side = WELL_MM + 2 * _WELL_RIM_MM
+    mould = plan.settings.mould.model_copy(update={"exit_mm": side, "exit_width_mm": side})
+    return replace(plan, settings=replace(plan.settings, mould=mould))
+
+
+def conductive_body(plan: Plan) -> Body:
+    """The mould whose casting has a well at both ends of every track.
+
+    Args:
+        plan: of the second mould.
+    """
+    away = plan.cavity.bounds[2] + _WELL_RIM_MM + WELL_MM / 2
+    places: list[list[tuple[float, float]]] = [[] for _ in plan.heights_mm]
+    for fibre, line in enumerate(plan.lines):
+        for end, side in ((0, -away), (-1, away)):
+            across = line.coords[end][1 - plan.family(fibre)]
+            places[plan.levels[fibre]].append((across, side) if plan.family(fibre) else (side, across))
+    return mould_body(plan, [parts.wells(own, diameter_mm=WELL_MM) for own in places])
+
+
+def _pin_mm(plan: Plan) -> float:
+    """Diameter of the pins: half of the corner they stand on, in tenths of a millimetre."""
+    diameter = int(5 * plan.corner_mm + 1e-9) / 10
+    if diameter < 1:
+        raise InputError(
+            f"[mould] pins: the walls' corners are {plan.corner_mm:g} mm wide, allowed are 2 mm or more"
+            " (wall_mm + exit_mm)"
+        )
+    return diameter
+
+
+def _pin_places(plan: Plan) -> list[tuple[float, float]]:
+    """Three corners of the tray, so that a lid fits one way only."""
+    away = plan.tray.bounds[2] - plan.corner_mm / 2
+    return [(-away, -away), (away, -away), (-away, away)]

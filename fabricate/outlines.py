@@ -5,7 +5,6 @@ down. Turned over for laying, the tracks are the mirror image of the plan.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,17 +13,26 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.curves import Crossing, crossings, flatten
+from design.errors import InputError
 from design.morphology import Morphology
 
+from .levels import fibre_levels
+from .numbers import number_strokes, with_room
 from .settings import DEFAULTS, Settings
 
 INTO_WALL_MM = 0.5
 """How far ridges run into the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
 
+COVER_MM = 1.0
+"""Least silicone over the deepest track; a pad of many levels is made thicker for it."""
+
 SNAP_MM = 1e-4
 """Grid that areas are snapped to where they are cut and joined, mm.
 
 No edge of the solid is shorter; and without a grid, outlines that almost coincide can defeat the cut."""
+
+_BESIDE = 5
+"""Further from a fibre's start than so many times its height a number is no longer seen to belong to it."""
 
 _CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
 """How the tolerance is shared: most thins out the outline, which sets the size of every file."""
@@ -34,75 +42,149 @@ _CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
 class Plan:
     """A morphology with the settings of its mould; what is derived from them is computed when first asked for.
 
-    Attributes:
-        share: of the allowed tolerance, what the outlines use of it.
-
     Raises:
         InputError: settings that contradict each other or the pitch.
     """
 
     pad: Morphology
     settings: Settings = DEFAULTS
-    share: float = 1.0
-
-    @classmethod
-    def tries(cls, pad: Morphology, settings: Settings) -> Iterator["Plan"]:
-        """Plans of ever finer outlines, for whoever finds that one makes no closed solid.
-
-        Among thousands of dense outlines two may meet within the precision of a float, by chance; with a few less
-        or more points on them they lie clear of each other.
-        """
-        for share in (1.0, 0.9, 0.8, 0.7):
-            yield cls(pad, settings, share)
 
     def __post_init__(self) -> None:
         self.settings.require_consistent(self.pad.pitch_mm)
 
-    @property
-    def tolerance_mm(self) -> float:
-        """Greatest deviation of a ridge from its curve in this plan, mm."""
-        return self.share * self.settings.mould.tolerance_mm
-
     @cached_property
     def lines(self) -> list[shapely.LineString]:
         """2M centre lines, mm: each within a fifth of the tolerance, continued straight through border and wall."""
-        tolerance = _CENTRE_SHARE * self.tolerance_mm / self.pad.pitch_mm
-        reach = self.settings.mould.border_mm + INTO_WALL_MM
+        mould = self.settings.mould
+        tolerance = _CENTRE_SHARE * mould.tolerance_mm / self.pad.pitch_mm
+        reach = mould.border_mm + mould.exit_mm + INTO_WALL_MM
         lines = []
         for fibre, points in enumerate(flatten(self.pad, tolerance)):
             places = self.pad.to_mm(points)
-            ahead = reach * np.eye(2)[fibre // self.pad.grid]
+            ahead = reach * np.eye(2)[self.family(fibre)]
             lines.append(shapely.LineString(np.vstack([places[0] - ahead, places, places[-1] + ahead])))
         return lines
-
-    @cached_property
-    def ridges(self) -> tuple[BaseGeometry, BaseGeometry]:
-        """Outlines of the ridges of the horizontal and of the vertical family, mm, ends inside the walls."""
-        mould, grid = self.settings.mould, self.pad.grid
-        half, spare = mould.ridge_width_mm / 2, _OUTLINE_SHARE * self.tolerance_mm
-        chord = 2 * math.acos(1 - _ARC_SHARE * self.tolerance_mm / half)
-        bands = shapely.buffer(self.lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
-        first, second = (shapely.union_all(family).simplify(spare) for family in (bands[:grid], bands[grid:]))
-        return first, second
-
-    @cached_property
-    def cavity(self) -> shapely.Polygon:
-        """What the silicone fills, seen from above, mm."""
-        return _square(self.pad.size_mm / 2 + self.settings.mould.border_mm)
-
-    @cached_property
-    def tray(self) -> shapely.Polygon:
-        """The mould seen from above, walls included, mm."""
-        return _square(self.pad.size_mm / 2 + self.settings.mould.border_mm + self.settings.mould.wall_mm)
 
     @cached_property
     def crossings(self) -> list[Crossing]:
         """Every place where two fibres meet; `place` in grid units."""
         return crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.pitch_mm)
 
-    def same_family(self, crossing: Crossing) -> bool:
-        """Whether both fibres of a crossing run at the same depth."""
-        return (crossing.first < self.pad.grid) == (crossing.second < self.pad.grid)
+    @cached_property
+    def clashes(self) -> list[Crossing]:
+        """The crossings of fibres of one family."""
+        return [c for c in self.crossings if self.family(c.first) == self.family(c.second)]
+
+    def family(self, fibre: int) -> int:
+        """0 for a horizontal fibre, 1 for a vertical one."""
+        return fibre // self.pad.grid
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        """(2M,) level of every fibre, 0 the shallowest; fibres that cross differ, if the settings allow for it."""
+        clashes = self.clashes if self.settings.mould.levels == "as_needed" else []
+        return fibre_levels(self.pad.grid, clashes, self.settings.pad.deep_family == "horizontal")
+
+    def require_levels(self) -> None:
+        """Refuse a pad whose fibres need more levels than the settings grant.
+
+        Raises:
+            InputError: lists the crossings of fibres of one family.
+        """
+        if self.clashes and self.settings.mould.levels == "two":
+            places = [self.pad.to_mm(c.place) for c in self.clashes]
+            listed = ", ".join(
+                f"{c.first + 1} x {c.second + 1} at ({x:.1f}, {y:.1f}) mm"
+                for c, (x, y) in zip(self.clashes, places, strict=True)
+            )
+            raise InputError(
+                f'[mould] levels: got "two", allowed for pads without crossings of one family, or "as_needed"; '
+                f"{len(self.clashes)} crossings: fibres {listed}"
+            )
+
+    @cached_property
+    def heights_mm(self) -> tuple[float, ...]:
+        """Ridge height of every level, ascending, mm above the tray's floor."""
+        mould = self.settings.mould
+        return tuple(
+            round(mould.shallow_ridge_height_mm + level * mould.level_step_mm, 9)
+            for level in range(1 + max(self.levels))
+        )
+
+    @cached_property
+    def silicone_mm(self) -> float:
+        """Thickness of the cast pad, mm: as set, or more where many levels need it."""
+        least = self.heights_mm[-1] + COVER_MM if len(self.heights_mm) > 2 else 0
+        return max(self.settings.mould.silicone_mm, least)
+
+    def outline(self, level: int, below_mm: float = 0.0) -> BaseGeometry:
+        """Outline of the ridges of a level `below_mm` under their tops, mm, ends inside the walls."""
+        mould = self.settings.mould
+        half = mould.ridge_width_mm / 2 + below_mm * self.settings.ridge_slope
+        chord = 2 * math.acos(1 - _ARC_SHARE * mould.tolerance_mm / half)
+        lines = [line for line, own in zip(self.lines, self.levels, strict=True) if own == level]
+        bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
+        return shapely.union_all(bands).simplify(_OUTLINE_SHARE * mould.tolerance_mm)
+
+    @cached_property
+    def ridges(self) -> tuple[BaseGeometry, ...]:
+        """Outlines of the tops of the ridges of every level, mm."""
+        return tuple(map(self.outline, range(len(self.heights_mm))))
+
+    @cached_property
+    def numbers(self) -> list[BaseGeometry | None]:
+        """Strokes of every fibre's number, 1..2M, beside its start, mirrored; None without room, empty if unwanted."""
+        mould = self.settings.mould
+        if not mould.number_mm:
+            return []
+        strokes = [number_strokes(n, mould.number_mm, mould.ridge_width_mm) for n in range(1, 2 * self.pad.grid + 1)]
+        clear = mould.ridge_width_mm / 2 + self.heights_mm[-1] * self.settings.ridge_slope + mould.min_silicone_mm
+        return with_room(strokes, self.lines, self.cavity, clear, min(self.pad.pitch_mm, _BESIDE * mould.number_mm))
+
+    @cached_property
+    def cavity(self) -> shapely.Polygon:
+        """What the silicone fills on the floor but for the exits, seen from above, mm."""
+        return square(self.pad.size_mm / 2 + self.settings.mould.border_mm)
+
+    @cached_property
+    def exits(self) -> list[shapely.Polygon]:
+        """Slots in the wall around both ends of every fibre, mm: in the order of the fibres, starts first.
+
+        They begin within the cavity, so that no face of theirs coincides with one of its own.
+        """
+        mould = self.settings.mould
+        if not mould.exit_mm:
+            return []
+        edge, half = self.cavity.bounds[2], mould.exit_width_mm / 2
+        boxes = []
+        for end, outward in ((0, -1), (-1, 1)):
+            for fibre, line in enumerate(self.lines):
+                axis = self.family(fibre)
+                corners = np.empty((2, 2))
+                corners[:, axis] = outward * (edge - half), outward * (edge + mould.exit_mm)
+                corners[:, 1 - axis] = line.coords[end][1 - axis] + np.array([-half, half])
+                boxes.append(shapely.box(*corners.min(axis=0), *corners.max(axis=0)))
+        return boxes
+
+    @cached_property
+    def silicone(self) -> BaseGeometry:
+        """All that the silicone fills on the floor, exits included, seen from above, mm."""
+        return shapely.union_all([self.cavity, *self.exits])
+
+    @property
+    def flare_mm(self) -> float:
+        """How far the walls lean outwards from the floor to their top, mm."""
+        return self.silicone_mm * math.tan(math.radians(self.settings.mould.wall_draft_deg))
+
+    @property
+    def corner_mm(self) -> float:
+        """Side of the solid square between a corner of the cavity's rim and that of the tray, mm."""
+        return self.settings.mould.exit_mm + self.settings.mould.wall_mm
+
+    @cached_property
+    def tray(self) -> shapely.Polygon:
+        """The mould seen from above, walls included, mm."""
+        return square(self.cavity.bounds[2] + self.flare_mm + self.corner_mm)
 
 
 def overlap(first: BaseGeometry, second: BaseGeometry) -> BaseGeometry:
@@ -130,5 +212,6 @@ def polygon_rings(area: BaseGeometry) -> list[list[np.ndarray]]:
     return [[shapely.get_coordinates(ring)[:-1] for ring in shapely.get_rings(polygon)] for polygon in polygons]
 
 
-def _square(half_mm: float) -> shapely.Polygon:
+def square(half_mm: float) -> shapely.Polygon:
+    """A square around the pad's centre, mm."""
     return shapely.box(-half_mm, -half_mm, half_mm, half_mm)

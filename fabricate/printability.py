@@ -1,33 +1,36 @@
 """Whether a mould prints, demoulds and lets the fibres be laid: each check one finding with its places.
 
-Nothing here changes a mould or stops its making: a pass, warn or fail with what was measured is all there is.
+Nothing here changes a mould or stops its making: a pass, warn or fail with what was measured is all there is. The
+checks here need the plan; those that a mesh of any origin goes through are in `soundness`.
 """
 
-import math
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely import ops
 from shapely.geometry.base import BaseGeometry
 
-from design.errors import InputError
 from design.morphology import Morphology
+from design.rules import tight_bends
 
+from . import soundness
 from .findings import Finding, Status, as_places, graded, verdict
 from .mould import plan_mesh
-from .outlines import INTO_WALL_MM, Plan, areas, overlap, without
-from .settings import DEFAULTS, Printer, Settings
-
-SOUND = ("manifold", "watertight", "bodies", "volume", "genus")
-"""The checks a mesh must pass to be a solid at all."""
-
-_LARGEST_MM = 1e6
+from .outlines import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
+from .settings import DEFAULTS, Settings
+from .thickness import least_line_mm
 
 _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""
+
+_SLENDER, _TOO_SLENDER = 5.0, 10.0
+"""Ridges taller than so many times their width may break off in demoulding, or do not print upright at all."""
+
+
+_NAMED = 8
+"""More fibres than this are counted instead of named."""
 
 
 def check(pad: Morphology, settings: Settings = DEFAULTS) -> list[Finding]:
@@ -36,117 +39,48 @@ def check(pad: Morphology, settings: Settings = DEFAULTS) -> list[Finding]:
     Raises:
         InputError: settings that contradict each other.
     """
-    return planned(pad, settings)[-1]
+    return meshed(Plan(pad, settings))[-1]
 
 
-def planned(pad: Morphology, settings: Settings) -> tuple[Plan, np.ndarray, np.ndarray, list[Finding]]:
-    """The plan of a mould, its mesh as vertices (n, 3) mm and triangles (m, 3), and every check on them.
+def meshed(plan: Plan) -> tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]:
+    """The mesh of a plan, vertices (n, 3) mm and triangles (m, 3) vertex numbers, and every check on both."""
+    from .meshes import arrays
 
-    The first plan whose mesh is sound, or the last one tried.
-    """
-    plans = Plan.tries(pad, settings)
-    plan = next(plans)
-    vertices, triangles, solid = _meshed(plan)
-    for finer in plans:
-        if not unsound(solid):
-            break
-        plan, (vertices, triangles, solid) = finer, _meshed(finer)
-    return plan, vertices, triangles, [*solid, *inspect(plan, vertices, triangles)]
+    vertices, triangles = arrays(plan_mesh(plan))
+    return vertices, triangles, inspect(plan, vertices, triangles)
 
 
-def _meshed(plan: Plan) -> tuple[np.ndarray, np.ndarray, list[Finding]]:
-    mesh = plan_mesh(plan).to_mesh()
-    vertices, triangles = np.asarray(mesh.vert_properties), np.asarray(mesh.tri_verts)
-    return vertices, triangles, inspect_mesh(vertices, triangles, plan.settings.printer)
+def inspect(plan: Plan, vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> list[Finding]:
+    """Every check on a plan and its mesh: vertices (n, 3) mm, triangles (m, 3) vertex numbers."""
+    of_mesh = soundness.inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, widths=False)
+    return [*of_mesh, *check_plan(plan)]
 
 
-def unsound(findings: Iterable[Finding]) -> list[Finding]:
-    """Those of the findings by which a mesh is no solid at all."""
-    return [finding for finding in findings if finding.name in SOUND and finding.status == "fail"]
-
-
-def check_mesh(path: Path, printer: Printer = DEFAULTS.printer) -> list[Finding]:
-    """The checks that need no plan, on a mesh file (.stl, .3mf) of any origin.
-
-    Raises:
-        InputError: the file is missing or holds no triangles.
-    """
-    import trimesh
-
-    if not path.is_file():
-        raise InputError(f"{path}: {'a folder, expected a mesh file' if path.is_dir() else 'no such file'}")
-    try:
-        with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(path)
-    except Exception as error:  # readers of broken files raise whatever comes
-        raise InputError(f"{path}: not a mesh that can be read ({error or type(error).__name__})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{path}: holds no triangles that can be read, or is torn")
-    if not np.isfinite(mesh.vertices).all() or np.abs(mesh.vertices).max() > _LARGEST_MM:
-        raise InputError(f"{path}: vertices hold NaN, infinity or more than {_LARGEST_MM:g}")
-    if mesh.units:  # a 3MF says its unit; an STL has none and counts as mm
-        mesh.convert_units("millimeters")
-    return inspect_mesh(mesh.vertices, mesh.faces, printer)
-
-
-def inspect(plan: Plan, vertices: np.ndarray, triangles: np.ndarray) -> list[Finding]:
-    """The checks that need the plan beside its mesh: vertices (n, 3) mm, triangles (m, 3) vertex numbers."""
-    settings = plan.settings
+def check_plan(plan: Plan) -> list[Finding]:
+    """The checks that need no mesh."""
     return [
-        _genus(vertices, triangles),
-        _ridge_width(settings),
-        _track_size(settings),
-        _layers(settings),
-        _crossing_gap(settings),
+        _ridge_width(plan),
+        _track_size(plan.settings),
+        _layers(plan),
+        _slenderness(plan),
+        _crossing_gap(plan),
         _same_family_crossings(plan),
-        *_silicone_walls(plan),
+        _silicone_wall(plan),
         _tray_wall(plan),
+        _cover(plan),
+        _fibre_bend(plan),
+        _numbers(plan),
     ]
 
 
-def inspect_mesh(vertices: np.ndarray, triangles: np.ndarray, printer: Printer) -> list[Finding]:
-    """Whether a mesh is one closed body that fits the printer: vertices (n, 3) mm, triangles (m, 3)."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(vertices, triangles)  # joins equal vertices, as whoever reads the file will
-    status = _manifold(vertices, triangles).status().name
-    loose = mesh.edges_unique[np.bincount(mesh.edges_unique_inverse) != 2]
-    middles = mesh.vertices[loose].mean(axis=1)[:, :2]
-    closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
-    edges = f"{len(loose)} edges without exactly two faces" if len(loose) or closed else "faces turn both ways"
-    bodies, volume = int(mesh.body_count), float(mesh.volume)
-    size, bed = np.ptp(mesh.vertices, axis=0).tolist(), printer.bed_mm
-    turned = zip([*sorted(size[:2]), size[2]], [*sorted(bed[:2]), bed[2]], strict=True)
-    fits = all(extent <= room for extent, room in turned)
-    return [
-        verdict("manifold", status == "NoError", int(status == "NoError"), 1, f"manifold3d says {status}"),
-        verdict("watertight", closed, len(loose), 0, edges, middles),
-        verdict("bodies", bodies == 1, bodies, 1, "one body" if bodies == 1 else f"the mesh has {bodies} bodies"),
-        verdict("volume", volume > 0, volume, 0, f"the solid holds {volume:.1f} mm³"),
-        verdict("bed", fits, size, bed, f"{_by(size)} mm to print on a bed of {_by(bed)} mm"),
-    ]
-
-
-def _manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
-    from manifold3d import Manifold, Mesh64
-
-    return Manifold(Mesh64(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(triangles, np.uint64)))
-
-
-def _genus(vertices: np.ndarray, triangles: np.ndarray) -> Finding:
-    genus = _manifold(vertices, triangles).genus()
-    return verdict(
-        "genus", genus == 0, genus, 0, "no hole through it" if genus == 0 else f"{genus} holes lead through the solid"
-    )
-
-
-def _ridge_width(settings: Settings) -> Finding:
+def _ridge_width(plan: Plan) -> Finding:
     """A printer draws nothing narrower than its nozzle, or than two pixels of its screen."""
-    width, printer = settings.mould.ridge_width_mm, settings.printer
-    least = printer.nozzle_mm * (2 if printer.resin else 1)
-    reason = "two pixels" if printer.resin else "the nozzle"
+    width, least = plan.settings.mould.ridge_width_mm, least_line_mm(plan.settings.printer)
+    reason = "two pixels" if plan.settings.printer.resin else "the nozzle"
     message = f"ridges are {width:g} mm wide, {reason} {least:g} mm"
-    return verdict("ridge_width", width >= least - 1e-9, width, least, message)
+    wide = width >= least - 1e-9
+    places = [] if wide else [place for level in range(len(plan.heights_mm)) for place in _middles(plan, level)]
+    return verdict("ridge_width", wide, width, least, message, places)
 
 
 def _track_size(settings: Settings) -> Finding:
@@ -157,9 +91,9 @@ def _track_size(settings: Settings) -> Finding:
     return verdict("track_size", room >= fibre, room, fibre, message)
 
 
-def _layers(settings: Settings) -> Finding:
+def _layers(plan: Plan) -> Finding:
     """Ridges of less than two layers do not print; heights between layers come out rounded."""
-    layer, mould = settings.printer.layer_mm, settings.mould
+    layer, mould = plan.settings.printer.layer_mm, plan.settings.mould
     heights = {
         "floor_mm": mould.floor_mm,
         "shallow_ridge_height_mm": mould.shallow_ridge_height_mm,
@@ -174,46 +108,61 @@ def _layers(settings: Settings) -> Finding:
     return Finding("layers", "pass", least, 2.0, f"every step is a whole number of {layer:g} mm layers")
 
 
-def _crossing_gap(settings: Settings) -> Finding:
-    """Where families cross, silicone or adhesive between the fibres keeps them from shorting."""
-    mould = settings.mould
-    gap = mould.deep_ridge_height_mm - settings.pad.fibre_diameter_mm - mould.shallow_ridge_height_mm
-    message = f"{gap:.3f} mm lie between fibres of different families where they cross"
+def _slenderness(plan: Plan) -> Finding:
+    """A thin and tall ridge bends when it is printed and breaks when the casting is pulled off."""
+    tallest, width = plan.heights_mm[-1], plan.settings.mould.ridge_width_mm
+    ratio = tallest / width
+    status: Status = "pass" if ratio <= _SLENDER + 1e-9 else "warn" if ratio <= _TOO_SLENDER + 1e-9 else "fail"
+    message = f"the tallest ridges, {tallest:g} mm, are {ratio:.1f} times as tall as wide"
+    places = [] if status == "pass" else _middles(plan, len(plan.heights_mm) - 1)
+    return Finding("slenderness", status, ratio, _SLENDER, message, as_places(places))
+
+
+def _crossing_gap(plan: Plan) -> Finding:
+    """Where fibres cross, silicone or adhesive between them keeps them from shorting."""
+    mould = plan.settings.mould
+    gap = mould.level_step_mm - plan.settings.pad.fibre_diameter_mm
+    message = f"{gap:.3f} mm lie between fibres of neighbouring depths where they cross"
     return Finding("crossing_gap", graded(gap, mould.min_silicone_mm), gap, mould.min_silicone_mm, message)
 
 
 def _same_family_crossings(plan: Plan) -> Finding:
-    """Tracks of one depth that cross become one: the fibres in them touch."""
-    places = plan.pad.to_mm([c.place for c in plan.crossings if plan.same_family(c)]).reshape(-1, 2)
-    allowed = plan.settings.rules.same_family_crossings
-    status: Status = "fail" if len(places) > allowed else "warn" if len(places) else "pass"
-    message = f"{len(places)} crossings of fibres of one family, whose tracks merge; allowed are {allowed}"
-    return Finding("same_family_crossings", status, len(places), allowed, message, as_places(places))
+    """Tracks of one depth that cross become one, and the fibres in them touch; each further depth is more work."""
+    places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
+    message = f"{len(places)} crossings of fibres of one family"
+    if plan.settings.mould.levels == "two":
+        status: Status = "fail" if len(places) else "pass"
+        message += ", whose tracks merge" if len(places) else ""
+    else:
+        status = "warn" if len(places) else "pass"
+        message += f", kept apart by {len(plan.heights_mm)} depths instead of 2" if len(places) else ""
+    return Finding("same_family_crossings", status, len(places), 0, message, as_places(places))
 
 
-def _silicone_walls(plan: Plan) -> list[Finding]:
+def _silicone_wall(plan: Plan) -> Finding:
     """The thinnest silicone between tracks of equal depth, of two fibres or of one that turns back.
 
     Silicone beside the tray's walls is left to the check of those. Found by bisection to 2 % or 10 µm.
     """
     limit, pitch = plan.settings.mould.min_silicone_mm, plan.pad.pitch_mm
     around = plan.cavity.buffer(2 * pitch, join_style="mitre")
-    findings = []
-    for name, ridge in zip(("horizontal", "vertical"), plan.ridges, strict=True):
-        silicone = without(around, ridge)
-        patches = _thinner(silicone, limit, plan.cavity)
-        within, low, high = plan.cavity, limit, pitch
-        if patches:  # the thinnest place lies in one of them: look no further than their surroundings
-            within, low, high = shapely.union_all(patches), 0.0, limit
-            silicone = overlap(silicone, within.buffer(2 * limit))
-        while high - low > max(0.01, 0.02 * low):
-            middle = (low + high) / 2
-            low, high = (low, middle) if _thinner(silicone, middle, within) else (middle, high)
-        message = f"the thinnest silicone between {name} tracks is {high:.2f} mm"
-        places = [patch.representative_point().coords[0] for patch in patches]
-        status = graded(low, limit) if patches else "pass"
-        findings.append(Finding(f"silicone_wall_{name}", status, high, limit, message, as_places(places)))
-    return findings
+    silicones = [without(around, plan.outline(level, foot)) for level, foot in enumerate(plan.heights_mm)]
+    patches = [_thinner(silicone, limit, plan.cavity) for silicone in silicones]
+    within: list[BaseGeometry] = [plan.cavity] * len(silicones)
+    low, high = limit, pitch
+    if any(patches):  # the thinnest place lies in one of them: look no further than their surroundings
+        low, high = 0.0, limit
+        thin = [level for level, found in enumerate(patches) if found]
+        within = [shapely.union_all(patches[level]) for level in thin]
+        silicones = [overlap(silicones[level], own.buffer(2 * limit)) for level, own in zip(thin, within, strict=True)]
+    while high - low > max(0.01, 0.02 * low):
+        middle = (low + high) / 2
+        thinner = any(_thinner(silicone, middle, own) for silicone, own in zip(silicones, within, strict=True))
+        low, high = (low, middle) if thinner else (middle, high)
+    message = f"the thinnest silicone between tracks of one depth is {high:.2f} mm"
+    places = [patch.representative_point().coords[0] for found in patches for patch in found]
+    status = graded(low, limit) if places else "pass"
+    return Finding("silicone_wall", status, high, limit, message, as_places(places))
 
 
 def _thinner(area: BaseGeometry, width: float, within: BaseGeometry) -> list[BaseGeometry]:
@@ -233,7 +182,7 @@ def _tray_wall(plan: Plan) -> Finding:
     half, limit = plan.settings.mould.ridge_width_mm / 2, plan.settings.mould.min_silicone_mm
     reach, wall = half + limit, plan.cavity.boundary
     beside = plan.cavity.difference(plan.cavity.buffer(-reach, join_style="mitre"))
-    end = INTO_WALL_MM + 2 * reach
+    end = INTO_WALL_MM + plan.settings.mould.exit_mm + 2 * reach
     middles = [ops.substring(line, end, line.length - end) for line in plan.lines]
     near = [part for middle in middles for part in shapely.get_parts(middle.intersection(beside)) if part.length]
     gaps = [part.distance(wall) - half for part in near]
@@ -243,5 +192,45 @@ def _tray_wall(plan: Plan) -> Finding:
     return Finding("tray_wall", graded(least, limit), least, limit, message, as_places(places))
 
 
-def _by(sizes: list[float]) -> str:
-    return " x ".join(f"{math.ceil(size * 100 - 1e-3) / 100:g}" for size in sizes)
+def _cover(plan: Plan) -> Finding:
+    """The silicone that is left beyond the deepest tracks carries the pad."""
+    thickness, wanted = plan.silicone_mm, plan.settings.mould.silicone_mm
+    cover = thickness - plan.heights_mm[-1]
+    message = f"{cover:g} mm of silicone lie beyond the deepest tracks"
+    if thickness > wanted:
+        message += f"; for {len(plan.heights_mm)} depths the pad is {thickness:g} mm thick, not {wanted:g}"
+    thin = cover < COVER_MM - 1e-9
+    return Finding("cover", "warn" if thin or thickness > wanted else "pass", cover, COVER_MM, message)
+
+
+def _fibre_bend(plan: Plan) -> Finding:
+    """A fibre cannot follow a bend tighter than the rules allow for: it lifts out of its track or breaks."""
+    limit = plan.settings.rules.min_bend_radius_mm
+    tight = tight_bends(plan.pad, limit)
+    least = min((bend.measured for bend in tight), default=limit)
+    names = _listed("fibre", [bend.fibres[0] for bend in tight])
+    message = f"{names} bent as tightly as {least:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
+    places = [bend.place_mm for bend in tight if bend.place_mm is not None]
+    return verdict("fibre_bend", not tight, least, limit, message, places)
+
+
+def _numbers(plan: Plan) -> Finding:
+    """A track without its number is easily taken for another."""
+    missing = [fibre for fibre, number in enumerate(plan.numbers) if number is None]
+    names = _listed("number", [fibre + 1 for fibre in missing])
+    message = f"no room beside the fibre's start for {names}" if missing else "every number has room"
+    places = [plan.lines[fibre].coords[0] for fibre in missing]
+    count = len(plan.numbers) - len(missing)
+    return Finding("numbers", "warn" if missing else "pass", count, len(plan.numbers), message, as_places(places))
+
+
+def _listed(noun: str, numbers: Sequence[int]) -> str:
+    """The numbers by name, or how many they are."""
+    plural = noun if len(numbers) == 1 else f"{noun}s"
+    return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= _NAMED else f"{len(numbers)} {plural}"
+
+
+def _middles(plan: Plan, level: int) -> list[tuple[float, ...]]:
+    """The middle of the course of every ridge of a level."""
+    lines = [line for line, own in zip(plan.lines, plan.levels, strict=True) if own == level]
+    return [line.interpolate(0.5, normalized=True).coords[0] for line in lines]

@@ -1,7 +1,8 @@
 """The sections of `pad.toml` that fabricate owns, and everything a mould depends on gathered in one object."""
 
+import math
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -14,18 +15,43 @@ class Mould(Section):
 
     The pad is cast with its tracks down: a taller ridge leaves a track deeper in the silicone. The defaults keep
     0.5 mm between two 0.3 mm fibres that cross, and are whole numbers of 0.1 mm and of 0.2 mm layers.
+
+    Attributes:
+        levels: "as_needed": one ridge height a family, and further ones where fibres of one family cross, each as
+            much taller as the deep family is than the shallow one; "two": a pad with such crossings is refused.
+        exit_mm, exit_width_mm: slots in the wall around every ridge end; they leave a tongue of silicone on the pad
+            that relieves the lead of strain.
+        conductive: a second mould with a well at every ridge end, for casting a conductive material into the tracks
+            in place of laid fibres.
     """
 
     floor_mm: float = Field(default=2.0, ge=0.4, le=50, description="thickness of the tray's floor, mm")
-    wall_mm: float = Field(default=2.0, ge=0.8, le=50, description="thickness of the tray's walls, mm")
+    wall_mm: float = Field(default=2.0, ge=0.8, le=50, description="least thickness of the tray's walls, mm")
+    wall_draft_deg: float = Field(default=2.0, ge=0, le=30, description="lean of the walls, for demoulding, degrees")
     silicone_mm: float = Field(default=6.0, gt=0, le=100, description="thickness of the cast pad, mm")
     border_mm: float = Field(default=0.0, ge=0, le=100, description="silicone beyond the fibre ends, mm")
-    ridge_width_mm: float = Field(default=0.4, ge=0.1, le=20, description="width of a ridge, and so of a track, mm")
+    ridge_width_mm: float = Field(default=0.4, ge=0.1, le=20, description="width of a ridge at its top, mm")
+    ridge_draft_deg: float = Field(default=0.0, ge=0, le=20, description="taper of a ridge on either side, degrees")
     deep_ridge_height_mm: float = Field(default=1.2, gt=0, le=50, description="ridge height of the deep family, mm")
     shallow_ridge_height_mm: float = Field(default=0.4, gt=0, le=50, description="ridge height of the other family, mm")
+    levels: Literal["as_needed", "two"] = Field(
+        default="as_needed", description="more ridge heights where a family crosses itself, or refuse such a pad"
+    )
     min_silicone_mm: float = Field(default=0.4, ge=0, le=10, description="least silicone between tracks, mm")
+    exit_mm: float = Field(default=2.0, ge=0, le=50, description="length of the lead's slot in the wall (0: none), mm")
+    exit_width_mm: float = Field(default=3.0, gt=0, le=50, description="width of the lead's slot in the wall, mm")
+    number_mm: float = Field(default=2.5, ge=0, le=20, description="height of the sensor numbers (0: none), mm")
+    pins: bool = Field(default=False, description="registration pins on the wall, with holes in the lid")
+    lid: bool = Field(default=False, description="a lid that levels the silicone")
+    spout: bool = Field(default=False, description="a pour spout in the lid")
+    conductive: bool = Field(default=False, description="a second mould with wells for conductive material")
     lead_mm: float = Field(default=30.0, ge=0, le=1000, description="fibre left over at each end, mm")
     tolerance_mm: float = Field(default=0.01, ge=1e-3, le=0.1, description="greatest deviation of a ridge, mm")
+
+    @property
+    def level_step_mm(self) -> float:
+        """How much taller the ridges of one level are than those of the level below, mm."""
+        return self.deep_ridge_height_mm - self.shallow_ridge_height_mm
 
 
 class Printer(Section):
@@ -60,10 +86,21 @@ class Settings:
         return cls(spec.section(Mould), spec.section(Printer), spec.section(Pad), spec.section(Rules))
 
     @property
-    def ridge_heights_mm(self) -> tuple[float, float]:
-        """Ridge height of the horizontal and of the vertical family, mm above the tray's floor."""
-        deep, shallow = self.mould.deep_ridge_height_mm, self.mould.shallow_ridge_height_mm
-        return (deep, shallow) if self.pad.deep_family == "horizontal" else (shallow, deep)
+    def flare_mm(self) -> float:
+        """How much wider the cavity is at the top than at the floor, both sides together, at least, mm."""
+        return 2 * self.mould.silicone_mm * math.tan(math.radians(self.mould.wall_draft_deg))
+
+    @property
+    def ridge_slope(self) -> float:
+        """How much a ridge widens on either side per mm of height, downwards."""
+        return math.tan(math.radians(self.mould.ridge_draft_deg))
+
+    @property
+    def terrace_mm(self) -> float:
+        """Height of the terraces that taper a ridge: whole layers whose steps are as wide as the tolerance, or one."""
+        layer = self.printer.layer_mm
+        step = self.ridge_slope * layer
+        return layer * max(1, int(self.mould.tolerance_mm / step)) if step else math.inf
 
     def require_consistent(self, pitch_mm: float) -> None:
         """Refuse settings that contradict each other or the pitch of the pad.
@@ -77,6 +114,13 @@ class Settings:
         shallow, deep = mould.shallow_ridge_height_mm, mould.deep_ridge_height_mm
         _require_less("shallow_ridge_height_mm", shallow, deep, "deep_ridge_height_mm")
         _require_less("deep_ridge_height_mm", deep, mould.silicone_mm, "silicone_mm")
+        if mould.exit_mm:
+            if mould.exit_width_mm <= mould.ridge_width_mm:
+                allowed = f"more than ridge_width_mm, {mould.ridge_width_mm:g} mm"
+                raise InputError(f"[mould] exit_width_mm: got {mould.exit_width_mm:g}, allowed is {allowed}")
+            _require_less("exit_width_mm", mould.exit_width_mm, pitch_mm - self.flare_mm, "the pitch between slots")
+        if mould.spout and not mould.lid:
+            raise InputError("[mould] spout: got true, allowed only with lid = true, which it is a part of")
 
 
 DEFAULTS = Settings()

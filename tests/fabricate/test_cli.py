@@ -4,12 +4,15 @@ import sys
 
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from design.errors import InputError
 from design.morphology import Morphology
 from fabricate.cli import fabricate
 
 from .planted import level_pad
+
+FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md"}
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +37,7 @@ def test_build_is_the_default_command(morphology, tmp_path, words):
     result = invoke(*words, "--formats", "stl,svg", "--out", tmp_path / "out", morphology, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["files"] == ["mould.stl", "tracks.svg"]
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"mould.stl", "tracks.svg", "fabrication.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 
 
 def test_people_get_a_summary_with_what_to_look_at(tmp_path):
@@ -42,7 +45,7 @@ def test_people_get_a_summary_with_what_to_look_at(tmp_path):
     result = invoke(tmp_path / "crossed.json", "--formats", "svg")
     assert result.exit_code == 0
     assert "ml of silicone" in result.output
-    assert "FAIL same_family_crossings: 2 crossings" in result.output
+    assert "warn same_family_crossings: 2 crossings" in result.output
     assert (tmp_path / "tracks.svg").exists()
 
 
@@ -54,7 +57,8 @@ def test_check_of_a_morphology(morphology):
 
 def test_check_exits_1_when_a_check_fails(tmp_path):
     level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
-    result = invoke("check", tmp_path / "crossed.json", "--json")
+    (tmp_path / "pad.toml").write_text('[mould]\nlevels = "two"\n', encoding="utf-8")
+    result = invoke("check", tmp_path / "crossed.json", "--spec", tmp_path / "pad.toml", "--json")
     assert result.exit_code == 1
     document = json.loads(result.stdout)
     assert not document["passed"]
@@ -67,14 +71,14 @@ def test_check_of_a_mesh_with_the_printer_of_a_spec(morphology, tmp_path):
     assert invoke("check", tmp_path / "mould.stl").exit_code == 0
     result = invoke("check", tmp_path / "mould.stl", "--spec", tmp_path / "pad.toml")
     assert result.exit_code == 1
-    assert "FAIL bed: 37.75 x 37.75 x 8 mm to print on a bed of 30 x 30 x 100 mm" in result.stdout
+    assert "FAIL bed: 42.17 x 42.17 x 8 mm to print on a bed of 30 x 30 x 100 mm" in result.stdout
 
 
 def test_the_spec_shapes_the_mould(morphology, tmp_path):
     (tmp_path / "pad.toml").write_text("[mould]\nborder_mm = 1.5\n", encoding="utf-8")
     result = invoke(morphology, "--formats", "svg", "--out", tmp_path, "--spec", tmp_path / "pad.toml", "--json")
     document = json.loads(result.stdout)
-    assert document["size_mm"][0] == 3 * 11.25 + 2 * (1.5 + 2)
+    assert document["sizes"]["pad_mm"] == 3 * 11.25 + 2 * 1.5
     assert set(document["provenance"]["inputs"]) == {"morphology.json", "pad.toml"}
 
 
@@ -117,3 +121,19 @@ def test_a_build_without_step_and_png_loads_neither_cad_nor_plots(morphology, tm
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == []
+
+
+def test_check_draws_where_the_findings_are(morphology, tmp_path):
+    (tmp_path / "pad.toml").write_text("[printer]\nnozzle_mm = 0.6\n", encoding="utf-8")
+    picture = tmp_path / "findings.png"
+    assert invoke("check", morphology, "--picture", picture, "--spec", tmp_path / "pad.toml").exit_code == 1
+    with Image.open(picture) as image:
+        assert image.format == "PNG"
+
+
+def test_a_refused_pad_is_one_line_and_leaves_nothing(tmp_path):
+    level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
+    (tmp_path / "pad.toml").write_text('[mould]\nlevels = "two"\n', encoding="utf-8")
+    result = invoke(tmp_path / "crossed.json", "--out", tmp_path / "out", "--spec", tmp_path / "pad.toml")
+    assert isinstance(result.exception, InputError)
+    assert not (tmp_path / "out").exists()

@@ -1,44 +1,49 @@
 import json
-import re
+import math
 import zipfile
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
-from PIL import Image
-from scipy.interpolate import PchipInterpolator
 
 from design.errors import InputError
 from design.morphology import Morphology
-from design.palette import HORIZONTAL, VERTICAL
-from fabricate import export, printability
-from fabricate.drawings import tracks_svg
-from fabricate.export import FILES, build
-from fabricate.outlines import Plan
+from fabricate import export
+from fabricate.bodies import Body, Prism
+from fabricate.export import FORMATS, build
 
 from .planted import level_pad, with_settings
 
 PAD = Morphology.random(3, 3, seed=7)
 
 
+FILES = {
+    *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive") for suffix in ("stl", "3mf", "step")),
+    *("tracks.svg", "tracks.dxf", "mould.png", "tracks.png", "laying.md", "fabrication.json"),
+}
+SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True})
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("mould")
-    return out, build(PAD, out, list(FILES))
+    return out, build(PAD, out, FORMATS, SETTINGS)
 
 
 def test_all_files_are_there_and_nothing_else(built):
     out, document = built
-    assert {path.name for path in out.iterdir()} == {*FILES.values(), "fabrication.json"}
+    assert {path.name for path in out.iterdir()} == FILES
+    assert {*document["files"]} == FILES - {"fabrication.json", "laying.md"}
     assert json.loads((out / "fabrication.json").read_text()) == document
 
 
 def test_the_same_work_gives_the_same_bytes(built, tmp_path):
     out, _ = built
-    build(PAD, tmp_path / "again", list(FILES))
-    for name in (*FILES.values(), "fabrication.json"):
+    build(PAD, tmp_path / "again", FORMATS, SETTINGS)
+    for name in FILES:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
 
 
@@ -83,59 +88,18 @@ def test_step_reads_back_as_the_same_solid(built):
     assert solid.volume / 1000 == pytest.approx(document["mould_volume_ml"], rel=1e-3)
 
 
-@pytest.mark.parametrize("border_mm", [0.0, 2.0])
-def test_svg_holds_the_exact_curves(border_mm):
-    root = ElementTree.fromstring(tracks_svg(Plan(PAD, with_settings({"border_mm": border_mm}))))
-    side = PAD.size_mm + 2 * border_mm
-    assert root.get("width") == root.get("height") == f"{side:.6g}mm"
-    for family, name in enumerate(("horizontal", "vertical")):
-        (group,) = (group for group in root if group.get("id") == name)
-        assert len(group) == PAD.grid
-        for number, path in enumerate(group):
-            knots = PAD.knots[family * PAD.grid + number]
-            curve = PchipInterpolator(knots[:, family], knots[:, 1 - family])
-            numbers = np.array(re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", path.get("d") or ""), dtype=float)
-            points = PAD.to_grid(numbers.reshape(-1, 2) * (1, -1))
-            ends, points = points[[0, -1]], points[1:-1]
-            assert ends[:, family] == pytest.approx([-border_mm / 11.25, 4 + border_mm / 11.25], abs=1e-5)
-            starts, spans = points[0::3], np.split(points[1:], len(knots) - 1)
-            assert starts == pytest.approx(knots, abs=1e-5)
-            for start, (b, c, d) in zip(starts[:-1], spans, strict=True):
-                middle = (start + 3 * b + 3 * c + d) / 8
-                digits = 1e-5 * (1 + abs(curve(middle[family], 1)))
-                assert middle[1 - family] == pytest.approx(curve(middle[family]), abs=digits)
-
-
-def test_png_shows_the_ridges_in_the_colours_of_their_families(built):
-    out, _ = built
-    with Image.open(out / "mould.png") as image:
-        pixels = np.asarray(image.convert("RGB")).astype(int)
-    for colour in (HORIZONTAL, VERTICAL):
-        assert (np.abs(pixels - [int(colour[i : i + 2], 16) for i in (1, 3, 5)]).max(axis=2) < 8).mean() > 0.003
-
-
 def test_the_document_has_what_a_lab_needs(built):
     _, document = built
     assert document["format"] == "padforge-fabrication/1"
-    assert document["size_mm"] == [49.0, 49.0, 8.0]
+    side = 45 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
+    assert document["size_mm"] == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
+    assert document["sizes"]["tray_mm"] == pytest.approx(side)
     assert {finding["name"] for finding in document["findings"]} >= {"watertight", "bed", "layers", "tray_wall"}
     assert set(document["provenance"]) == {"command", "seed", "versions", "inputs"}
     assert len(document["crossings"]["table"]) == document["crossings"]["total"] >= 9
-    first, second, x, y = document["crossings"]["table"][0]
+    first, second, x, y, *_ = document["crossings"]["table"][0]
     assert {first.split()[0], second.split()[0]} <= {"horizontal", "vertical"}
     assert max(abs(x), abs(y)) < 22.5
-
-
-def test_cut_lengths_and_silicone_of_a_straight_pad(tmp_path):
-    document = build(Morphology.straight(4), tmp_path, [], with_settings({"border_mm": 1.0, "lead_mm": 20.0}))
-    assert document["files"] == []
-    assert [fibre["fibre"] for fibre in document["fibres"]][::7] == ["horizontal 1", "vertical 4"]
-    assert {fibre["in_pad_mm"] for fibre in document["fibres"]} == {58.25}
-    assert {fibre["cut_mm"] for fibre in document["fibres"]} == {98.25}
-    tracks = 4 * 58.25 * 0.4 * (1.2 + 0.4) - 16 * 0.4**3
-    assert document["silicone_volume_ml"] == pytest.approx((58.25**2 * 6 - tracks) / 1000, abs=1e-3)
-    assert document["crossings"]["total"] == 16
-    assert document["crossings"]["same_family"] == 0
 
 
 def test_same_family_crossings_are_counted(tmp_path):
@@ -143,10 +107,8 @@ def test_same_family_crossings_are_counted(tmp_path):
 
 
 def test_nothing_is_written_from_a_mould_in_two_pieces(tmp_path, monkeypatch):
-    from manifold3d import Manifold
-
-    boxes = Manifold.cube((1, 1, 1)) + Manifold.cube((1, 1, 1)).translate((3, 0, 0))
-    monkeypatch.setattr(printability, "plan_mesh", lambda plan: boxes)
+    pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
+    monkeypatch.setattr(export, "mould_body", lambda plan: pieces)
     with pytest.raises(InputError, match=r"the mesh has 2 bodies.*nothing was written"):
         build(PAD, tmp_path / "out", ["stl"])
     assert not (tmp_path / "out").exists()
@@ -155,13 +117,19 @@ def test_nothing_is_written_from_a_mould_in_two_pieces(tmp_path, monkeypatch):
 def test_nothing_is_written_when_mesh_and_solid_disagree(tmp_path, monkeypatch):
     from build123d import Solid
 
-    monkeypatch.setattr(export, "build_mould", lambda pad, settings: Solid.make_box(1, 1, 1))
+    monkeypatch.setattr(export, "valid_solid", lambda mesh: Solid.make_box(1, 1, 1))
     with pytest.raises(InputError, match="nothing was written"):
         build(PAD, tmp_path / "out", ["stl", "step"])
     assert not (tmp_path / "out").exists()
 
 
+def test_a_pad_the_settings_refuse_writes_nothing(tmp_path):
+    with pytest.raises(InputError, match="2 crossings"):
+        build(level_pad(1.8, 1.2), tmp_path / "out", ["svg"], with_settings({"levels": "two"}))
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_unknown_format_is_refused(tmp_path):
-    with pytest.raises(InputError, match="'obj', allowed are stl, 3mf, step, svg, png"):
+    with pytest.raises(InputError, match="'obj', allowed are stl, 3mf, step, svg, dxf, png"):
         build(PAD, tmp_path / "out", ["obj"])
     assert not (tmp_path / "out").exists()

@@ -30,8 +30,8 @@ def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
     exact = exact_lines(pad)
     for line, curve in zip(plan.lines, exact, strict=True):
         assert shapely.distance(shapely.points(curve.coords), line).max() < tolerance_mm / 4
-    for family, ridge in enumerate(plan.ridges):
-        curves = shapely.union_all(exact[family * 4 : family * 4 + 4])
+    for level, ridge in enumerate(plan.ridges):
+        curves = shapely.union_all([curve for curve, own in zip(exact, plan.levels, strict=True) if own == level])
         inside = plan.cavity.buffer(-0.5)  # clear of the ends, which go on straight
         assert ridge.intersection(inside).within(curves.buffer(0.2 + tolerance_mm, quad_segs=16))
         assert curves.buffer(0.2 - tolerance_mm, quad_segs=16).intersection(inside).within(ridge)
@@ -49,7 +49,7 @@ def test_ridges_run_into_the_walls_at_both_ends(border_mm):
     side = plan.pad.size_mm / 2 + border_mm
     assert plan.cavity.bounds == pytest.approx((-side, -side, side, side))
     ends = np.array([line.coords[0] for line in plan.lines[:3]])
-    assert ends[:, 0] == pytest.approx(-side - INTO_WALL_MM)
+    assert ends[:, 0] == pytest.approx(-side - plan.settings.mould.exit_mm - INTO_WALL_MM)
     assert ends[:, 1] == pytest.approx(plan.pad.to_mm([1, 2, 3]))
     for line in plan.lines:
         assert shapely.within(line, plan.tray)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 
 from design.errors import InputError
@@ -29,11 +31,41 @@ def test_a_bad_key_is_one_clear_line(tables, parts):
     assert "\n" not in str(error.value)
 
 
-def test_the_deep_family_has_the_tall_ridges():
-    horizontal = Settings.from_spec(Spec({}))
-    vertical = Settings.from_spec(Spec({"pad": {"deep_family": "vertical"}}))
-    assert horizontal.ridge_heights_mm == (1.2, 0.4)
-    assert vertical.ridge_heights_mm == (0.4, 1.2)
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("ridge_width_mm", 12.0),
+        ("floor_mm", 0.0),
+        ("wall_mm", 0.0),
+        ("silicone_mm", 0.0),
+        ("wall_draft_deg", -1.0),
+        ("ridge_draft_deg", -1.0),
+        ("ridge_draft_deg", math.nan),
+        ("silicone_mm", math.nan),
+        ("silicone_mm", math.inf),
+        ("exit_width_mm", 11.0),
+        ("exit_width_mm", 0.3),
+        ("levels", "three"),
+        ("spout", True),
+    ],
+)
+def test_hostile_values_are_one_clear_line(key, value):
+    with pytest.raises(InputError, match=rf"\[mould\] {key}: (got )?") as refusal:
+        Settings.from_spec(Spec({"mould": {key: value}})).require_consistent(11.25)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("pitch_mm", [0.1, 3.0])
+def test_a_pitch_too_small_for_the_ridges_or_the_exits(pitch_mm):
+    with pytest.raises(InputError, match="allowed is less than the pitch"):
+        DEFAULTS.require_consistent(pitch_mm)
+
+
+def test_terraces_are_whole_layers_with_steps_within_the_tolerance():
+    for draft, layers in ((0.5, 11), (3.0, 1), (20.0, 1)):
+        settings = Settings(mould=Mould(ridge_draft_deg=draft))
+        assert settings.terrace_mm == pytest.approx(layers * 0.1)
+    assert Settings().terrace_mm == math.inf
 
 
 def test_default_ridges_are_whole_layers_of_common_printers():

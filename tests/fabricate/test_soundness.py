@@ -1,0 +1,121 @@
+import numpy as np
+import pytest
+import trimesh
+import trimesh.exchange.stl
+
+from design.errors import InputError
+from fabricate.settings import Printer
+from fabricate.soundness import SOUND, check_mesh, inspect_mesh, sound
+
+from .trays import CROSS, block, faults, inspected, near, tray
+
+
+class TestSound:
+    box = block(10, 20, 5)
+
+    def test_a_missing_triangle(self):
+        found = inspected(trimesh.Trimesh(self.box.vertices, self.box.faces[1:]))
+        assert found["manifold"].status == found["watertight"].status == "fail"
+        assert found["watertight"].measured == len(found["watertight"].places_mm) == 3
+        assert "ridge_width" not in found
+
+    def test_one_triangle_turned_round(self):
+        faces = np.array(self.box.faces)
+        faces[0] = faces[0][::-1]
+        watertight = inspected(trimesh.Trimesh(self.box.vertices, faces))["watertight"]
+        assert (watertight.status, watertight.measured) == ("fail", 3)
+        middle = self.box.triangles_center[0]
+        assert near(watertight, middle[0], middle[1], 8.0)
+
+    def test_two_bodies(self):
+        other = block(2, 2, 2, at=(30, 7, 0))
+        bodies = {f.name: f for f in sound(*_together(self.box, other))}["bodies"]
+        assert (bodies.status, bodies.measured) == ("fail", 2)
+        assert near(bodies, 30, 7, 1.5)
+        assert len(bodies.places_mm) == 1
+
+    def test_a_hollow_is_no_body(self):
+        hollow = block(2, 2, 2)
+        hollow.invert()
+        found = {f.name: f for f in sound(*_together(self.box, hollow))}
+        assert (found["bodies"].status, found["bodies"].measured) == ("warn", 1)
+        assert near(found["bodies"], 0, 0, 1.5)
+
+    def test_a_body_turned_inside_out_beside_another_is_a_body(self):
+        other = block(2, 2, 2, at=(30, 7, 0))
+        other.invert()
+        found = {f.name: f for f in sound(*_together(self.box, other))}
+        assert (found["bodies"].status, found["bodies"].measured) == ("fail", 2)
+
+    def test_a_body_within_a_body(self):
+        found = {f.name: f for f in sound(*_together(self.box, block(2, 2, 2)))}
+        assert faults(found) == {"bodies": "fail"}
+
+    def test_inside_out(self):
+        mesh = self.box.copy()
+        mesh.invert()
+        assert faults(inspected(mesh)) == {"volume": "fail"}
+
+    def test_nothing(self):
+        found = inspect_mesh(np.empty((0, 3)), np.empty((0, 3), dtype=int))
+        assert {f.name for f in found if f.status == "fail"} >= {"bodies", "volume"}
+
+    def test_the_order_and_the_repetition_of_vertices_say_nothing(self):
+        mesh = tray(*CROSS).to_mesh()
+        corners = np.asarray(mesh.vert_properties)[np.asarray(mesh.tri_verts)][::-1].reshape(-1, 3)
+        found = sound(corners, np.arange(len(corners)).reshape(-1, 3), genus=0)
+        assert [f.name for f in found] == list(SOUND)
+        assert {f.status for f in found} == {"pass"}
+
+    @pytest.mark.parametrize(
+        ("bed", "status"),
+        [
+            ([10.0, 20.0, 5.0], "pass"),
+            ([20.0, 10.0, 5.0], "pass"),
+            ([19.0, 19.0, 5.0], "fail"),
+            ([20.0, 20.0, 4.0], "fail"),
+        ],
+    )
+    def test_bed(self, bed, status):
+        assert inspected(self.box, printer=Printer(bed_mm=bed))["bed"].status == status
+
+
+def _together(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)
+    return corners, np.arange(len(corners)).reshape(-1, 3)
+
+
+class TestFiles:
+    @pytest.mark.parametrize("suffix", ["stl", "3mf"])
+    def test_a_box(self, tmp_path, suffix):
+        path = tmp_path / f"box.{suffix}"
+        TestSound.box.export(path)
+        assert {finding.status for finding in check_mesh(path)} == {"pass"}
+
+    def test_two_solids_in_an_ascii_stl(self, tmp_path):
+        far = block(10, 20, 5, at=(30, 0, 0))
+        text = "\n".join(trimesh.exchange.stl.export_stl_ascii(mesh) for mesh in (TestSound.box, far))
+        (tmp_path / "two.stl").write_text(text)
+        found = {finding.name: finding for finding in check_mesh(tmp_path / "two.stl")}
+        assert faults(found) == {"bodies": "fail"}
+        assert found["bodies"].measured == 2
+
+    def test_two_objects_in_a_3mf(self, tmp_path):
+        near_by = block(10, 20, 5, at=(5, 4, 0))
+        trimesh.Scene([TestSound.box, near_by]).export(tmp_path / "two.3mf")
+        found = {finding.name: finding for finding in check_mesh(tmp_path / "two.3mf")}
+        assert {"bodies", "self_intersection"} <= set(faults(found))
+
+    @pytest.mark.parametrize("name", ["torn.stl", "torn.3mf"])
+    @pytest.mark.parametrize("content", [b"", b"solid\n", b"\0" * 84, b"\0" * 90, b"\xff" * 500, b"PK"])
+    def test_a_torn_file_is_refused_on_one_line(self, tmp_path, name, content):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name) as refusal:
+            check_mesh(tmp_path / name)
+        assert "\n" not in str(refusal.value)
+
+    def test_no_file(self, tmp_path):
+        with pytest.raises(InputError, match="no such file"):
+            check_mesh(tmp_path / "absent.stl")
+        with pytest.raises(InputError, match="a folder"):
+            check_mesh(tmp_path)

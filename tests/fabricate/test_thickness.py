@@ -1,0 +1,178 @@
+import math
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from hypothesis import given
+from hypothesis import settings as effort
+from hypothesis import strategies as st
+from manifold3d import Manifold
+
+from fabricate.settings import Printer
+from fabricate.soundness import SOUND
+
+from .trays import CROSS, DEPTH, FLOOR, SIZE, WALL, block, faults, inspected, line, near, prism, ridge, spanning, tray
+
+
+class TestGood:
+    def test_a_tray_with_ridges_passes_every_check(self):
+        found = inspected(tray(*CROSS), genus=0)
+        assert not faults(found)
+        assert set(SOUND) < set(found)
+        assert len(found) == 13
+        assert found["wall_thickness"].measured == pytest.approx(WALL, rel=0.03)
+        assert found["floor_thickness"].measured == pytest.approx(FLOOR)
+
+    @effort(max_examples=60)
+    @given(
+        st.floats(0, 8),
+        st.floats(0.8, 4),
+        st.floats(0.4, 1.0),
+        st.floats(30, 150),
+        st.floats(0.2, 1.0),
+        st.floats(0.0, 1.5),
+        st.integers(1, 4),
+    )
+    def test_no_false_alarm(self, draft_deg, wall, width, angle_deg, height, further, count):
+        pitch = SIZE / (count + 1)
+        lines = [spanning(-SIZE / 2 + pitch * (n + 1), width) for n in range(count)]
+        across = shapely.affinity.rotate(line((-6, 0), (6, 0), width=width), angle_deg, (0, 0))
+        adds = [ridge(outline, height + further) for outline in lines]
+        assert not faults(inspected(tray(*adds, ridge(across, height), draft_deg=draft_deg, wall=wall)))
+
+    @pytest.mark.parametrize("angle_deg", [30, 45, 60, 90, 120])
+    def test_ridges_of_one_height_that_cross(self, angle_deg):
+        crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
+        assert not faults(inspected(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5)))))
+
+    def test_bends_ends_numbers_and_exits(self):
+        turns = [(6 * math.cos(t), 6 * math.sin(t)) for t in np.linspace(0, 4, 200)]
+        eight = [line((-1, -2), (1, -2), (1, 2), (-1, 2), (-1, -2)), line((-1, 0), (1, 0)), line((-1, 1.9), (-1, 2.2))]
+        slot = Manifold.cube((2, 1.5, DEPTH + 1)).translate((-1, SIZE / 2 - 0.5, FLOOR))
+        parts = [ridge(line(*turns), 1.2), ridge(shapely.union_all(eight))]
+        assert not faults(inspected(tray(*parts, wall=3.0) - slot))
+
+    def test_a_lid_with_holes(self):
+        holes = [shapely.Point(x, y).buffer(0.75) for x in (-8, 8) for y in (-8, 8)]
+        lid = prism(shapely.box(-12, -12, 12, 12).difference(shapely.union_all(holes)), 0, 3)
+        found = inspected(lid, genus=4)
+        assert not faults(found)
+        assert found["silicone_wall"].measured == found["wall_thickness"].measured == 24
+        assert faults(inspected(lid, genus=0)) == {"genus": "fail"}
+
+    def test_a_round_body_has_no_levels(self):
+        mesh = trimesh.creation.torus(10, 2)
+        found = inspected(mesh, genus=1)
+        assert set(faults(found)) == {"overhang"}
+
+
+class TestWidth:
+    @pytest.mark.parametrize(("width", "status"), [(0.2, "fail"), (0.3, "fail"), (0.36, "fail"), (0.39, "pass")])
+    def test_a_narrow_ridge(self, width, status):
+        thin = ridge(line((2, -6), (7, -5), width=width), 0.8)
+        found = inspected(tray(*CROSS, thin))
+        assert found["ridge_width"].status == status
+        assert faults(found) == ({"ridge_width": "fail"} if status == "fail" else {})
+        if status == "fail":
+            assert found["ridge_width"].measured == pytest.approx(width, abs=0.015)
+            assert near(found["ridge_width"], 4.5, -5.5, 2.6)
+            assert len(found["ridge_width"].places_mm) == 1
+
+    @pytest.mark.parametrize(
+        ("printer", "status"),
+        [
+            ({"nozzle_mm": 0.6}, "fail"),
+            ({"nozzle_mm": 0.05, "resin": True}, "pass"),
+            ({"nozzle_mm": 0.25, "resin": True}, "fail"),
+        ],
+    )
+    def test_what_a_printer_draws(self, printer, status):
+        assert inspected(tray(*CROSS), printer=Printer.model_validate(printer))["ridge_width"].status == status
+
+    @pytest.mark.parametrize(("gap", "status"), [(0.05, "fail"), (0.3, "warn"), (0.35, "warn"), (0.4, "pass")])
+    def test_narrow_silicone_between_ridges(self, gap, status):
+        found = inspected(
+            tray(*CROSS, ridge(spanning(3.4 + gap), 1.2), ridge(spanning(-7)), ridge(spanning(-6.6 + gap)))
+        )
+        assert faults(found) == ({} if status == "pass" else {"silicone_wall": status})
+        if status != "pass":
+            assert found["silicone_wall"].measured == pytest.approx(gap, abs=0.015)
+            assert {round(y) for _, y in found["silicone_wall"].places_mm} == {3, -7}
+
+    def test_ridges_of_one_height_that_cross_at_a_flat_angle(self):
+        crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), 10, (0, 0.5)))
+        found = inspected(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5))))
+        assert faults(found) == {"silicone_wall": "warn"}
+        assert len(found["silicone_wall"].places_mm) == 2
+
+    def test_narrow_silicone_before_a_wall(self):
+        found = inspected(tray(*CROSS, ridge(spanning(9.5)), draft_deg=0))
+        assert faults(found) == {"silicone_wall": "warn"}
+        assert found["silicone_wall"].measured == pytest.approx(0.3, abs=0.015)
+        assert all(9.6 < y < 10.1 for _, y in found["silicone_wall"].places_mm)
+
+    def test_a_slot_through_the_wall_does_not_hide_the_casting(self):
+        slot = Manifold.cube((10, 1.5, DEPTH + 1)).translate((5, -0.75, FLOOR))
+        assert not faults(inspected(tray(*CROSS) - slot))
+        found = inspected(tray(*CROSS, ridge(spanning(3.7), 1.2)) - slot)
+        assert faults(found) == {"silicone_wall": "warn"}
+
+    def test_tracks_of_two_depths_may_come_close(self):
+        assert not faults(inspected(tray(*CROSS, ridge(spanning(3.7)))))
+
+    def test_less_silicone_may_be_allowed(self):
+        assert not faults(inspected(tray(*CROSS, ridge(spanning(3.6), 1.2)), min_silicone_mm=0.2))
+
+    @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn"), (0.85, "pass")])
+    def test_a_thin_wall(self, wall, status):
+        cut = Manifold.cube((5, 40, 20), True).translate((SIZE / 2 + wall + 2.5, 0, 5))
+        found = inspected(tray(*CROSS, draft_deg=0) - cut)
+        assert found["wall_thickness"].status == status
+        assert found["wall_thickness"].measured == pytest.approx(wall, rel=0.06)
+        assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in found["wall_thickness"].places_mm)
+        assert bool(found["wall_thickness"].places_mm) == (status != "pass")
+
+    @pytest.mark.parametrize(("floor", "status"), [(0.2, "fail"), (0.35, "fail"), (0.5, "pass")])
+    def test_a_thin_floor(self, floor, status):
+        found = inspected(tray(floor=floor))
+        assert found["floor_thickness"].status == status
+        assert found["floor_thickness"].measured == pytest.approx(floor)
+
+    def test_less_than_a_layer(self):
+        assert faults(inspected(block(10, 10, 0.03))) == {"floor_thickness": "fail"}
+
+    def test_a_pit_from_below(self):
+        pit = Manifold.cylinder(FLOOR - 0.3, 1.0).translate((4, -5, 0))
+        floor = inspected(tray(*CROSS) - pit)["floor_thickness"]
+        assert floor.measured == pytest.approx(0.3, abs=1e-5)
+        assert near(floor, 4, -5)
+
+
+class TestLean:
+    def test_a_ridge_with_a_head(self):
+        head = prism(line((2, -6), (7, -6), width=1.5), FLOOR + 0.8, FLOOR + 1.2)
+        found = inspected(tray(*CROSS, ridge(line((2, -6), (7, -6)), 1.2), head))
+        assert faults(found) == {"overhang": "fail", "undercut": "fail"}
+        for name in ("overhang", "undercut"):
+            assert found[name].measured == pytest.approx(90)
+            assert near(found[name], 4.5, -6, 2.6)
+
+    @pytest.mark.parametrize("lean_deg", [0.5, 3, 10])
+    def test_a_wall_that_leans_inwards(self, lean_deg):
+        undercut = inspected(tray(*CROSS, draft_deg=-lean_deg))["undercut"]
+        assert (undercut.status, undercut.limit) == ("fail", 0)
+        assert undercut.measured == pytest.approx(lean_deg, rel=0.01)
+        assert undercut.places_mm
+        assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.places_mm)
+
+    @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45, "pass"), (50, "fail")])
+    def test_a_funnel_on_a_plate_is_no_cavity(self, lean_deg, status):
+        top = 4 + 4 * math.tan(math.radians(lean_deg))
+        cup = Manifold.cylinder(4, 4, top, 64) - Manifold.cylinder(5, 2, 2, 64).translate((0, 0, -0.5))
+        plate = Manifold.cube((24, 24, 3), True).translate((0, 0, -1.4)) - Manifold.cylinder(9, 2, 2, 64).translate(
+            (0, 0, -5)
+        )
+        found = inspected(plate + cup, genus=1)
+        assert faults(found) == ({} if status == "pass" else {"overhang": "fail"})
+        assert found["overhang"].measured == pytest.approx(lean_deg, abs=0.1)

@@ -1,0 +1,68 @@
+"""Trays and blocks as triangle meshes, made without a plan, and what the checks find in them."""
+
+import math
+
+import shapely
+import trimesh
+from manifold3d import CrossSection, Manifold, OpType
+from shapely.geometry.base import BaseGeometry
+
+from fabricate.findings import Finding
+from fabricate.outlines import polygon_rings
+from fabricate.soundness import inspect_mesh
+
+FLOOR, DEPTH, WALL, SIZE = 2.0, 6.0, 2.0, 20.0
+"""Floor, depth and walls of the trays here, and the width of what they hold, mm."""
+
+
+def line(*points: tuple[float, float], width: float = 0.4) -> BaseGeometry:
+    return shapely.LineString(points).buffer(width / 2, cap_style="flat")
+
+
+def prism(area: BaseGeometry, bottom: float, top: float) -> Manifold:
+    rings = [ring for polygon in polygon_rings(area) for ring in polygon]
+    return Manifold.extrude(CrossSection(rings), top - bottom).translate((0, 0, bottom))
+
+
+def ridge(area: BaseGeometry, height: float = 0.4) -> Manifold:
+    return prism(area, FLOOR - 0.2, FLOOR + height)
+
+
+def tray(*adds: Manifold, draft_deg: float = 2.0, wall: float = WALL, floor: float = FLOOR) -> Manifold:
+    """A square tray; its walls lean outwards, or inwards for less than 0, and are as thick as said at the rim."""
+    deep = DEPTH + FLOOR - floor
+    flare = 1 + 2 * deep * math.tan(math.radians(draft_deg)) / SIZE
+    outer = SIZE * max(flare, 1.0) + 2 * wall
+    box = Manifold.cube((outer, outer, FLOOR + DEPTH), True).translate((0, 0, (FLOOR + DEPTH) / 2))
+    cavity = Manifold.extrude(CrossSection.square((SIZE, SIZE), True), deep, scale_top=(flare, flare))
+    above = Manifold.cube((SIZE * flare, SIZE * flare, 1), True).translate((0, 0, FLOOR + DEPTH))
+    hollow = Manifold.batch_boolean([cavity.translate((0, 0, floor)), above], OpType.Add)
+    return Manifold.batch_boolean([box - hollow, *adds], OpType.Add)
+
+
+def spanning(y: float, width: float = 0.4) -> BaseGeometry:
+    return line((-SIZE / 2 - 0.5, y), (SIZE / 2 + 0.5, y), width=width)
+
+
+def block(*sizes: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    return trimesh.creation.box(sizes, trimesh.transformations.translation_matrix(at))
+
+
+def inspected(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[str, Finding]:
+    if isinstance(solid, trimesh.Trimesh):
+        vertices, triangles = solid.vertices, solid.faces
+    else:
+        mesh = solid.to_mesh()
+        vertices, triangles = mesh.vert_properties, mesh.tri_verts
+    return {finding.name: finding for finding in inspect_mesh(vertices, triangles, **arguments)}  # pyright: ignore
+
+
+def faults(found: dict[str, Finding]) -> dict[str, str]:
+    return {name: finding.status for name, finding in found.items() if finding.status != "pass"}
+
+
+def near(found: Finding, x: float, y: float, within: float = 1.0) -> bool:
+    return any(math.hypot(px - x, py - y) <= within for px, py in found.places_mm)
+
+
+CROSS = [ridge(spanning(3.0), 1.2), ridge(spanning(-3.0), 1.2), ridge(shapely.affinity.rotate(spanning(1), 90, (0, 0)))]
