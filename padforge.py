@@ -209,13 +209,22 @@ def _mould(folder: Path, document: dict[str, Any]) -> Pieces:
     from design.page import figures, heading, table
 
     worst = max((f["status"] for f in document["findings"]), key=["pass", "warn", "fail"].index)
-    size = " x ".join(f"{side:g}" for side in document["size_mm"])
+    size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
+    shown = ("number", "fibre", "depth_mm", "in_pad_mm", "cut_mm")
     return [(worst, "mould checks"), (f"{document['silicone_volume_ml']:.1f} ml", "silicone to cast")], [
         heading("Mould"),
-        figures([(folder / "mould.png", f"The mould, {size} mm, shaded by height.")]),
+        figures(
+            [
+                (folder / "mould.png", f"The mould, {size} mm, shaded by height."),
+                (folder / "tracks.png", "The fibres as they lie in the mould; the deeper one interrupts the other."),
+            ]
+        ),
         table(["check", "verdict", "finding"], [[f["name"], f["status"], f["message"]] for f in document["findings"]]),
         heading("Fibres to cut"),
-        table(["fibre", "in the pad (mm)", "cut (mm)"], [list(fibre.values()) for fibre in document["fibres"]]),
+        table(
+            ["number", "fibre", "depth (mm)", "in the pad (mm)", "cut (mm)"],
+            [[fibre[name] for name in shown] for fibre in document["fibres"]],
+        ),
     ]
 
 

@@ -65,7 +65,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
 
 def summary(document: dict[str, Any], out: Path) -> list[str]:
     """What a person wants to know of a mould, in a few lines: where it is, and what to look at."""
-    size = " x ".join(f"{side:g}" for side in document["size_mm"])
+    size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     remarks = [finding for finding in document["findings"] if finding["status"] != "pass"]
     passed = len(document["findings"]) - len(remarks)
     return [

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.palette import ALARM, FAINT, INK, PAPER
 
 from .findings import Finding
-from .layers import COLOURS, FAMILIES, Layer, layers, pale
+from .layers import COLOURS, FAMILIES, Layer, layers
 from .outlines import INTO_WALL_MM, Plan, polygon_rings
 from .relief import RIDGE, lit, mesh_relief, mould_relief
 from .tracks import SCALE_MM
@@ -46,9 +46,6 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 66, 24, 44, 62
 
 _ROW, _COLUMNS = 21, 3
 """Height of a row of the legend in pixels, and entries in one."""
-
-_EXACT, _COLOURS = 32, 64
-"""Colours of a picture that it keeps as they are, the commonest, and what the others are reduced to."""
 
 _FAIL_MARKS, _CARE_MARKS = "osp8H", "D^v<>"
 """A mark of its own for every check, as long as they last."""
@@ -218,15 +215,13 @@ class _Sheet:
         bar.text(1.05, 0.5, high, ha="left", va="center", fontsize=9, color=INK, transform=bar.transAxes)
 
     def save(self, path: Path, handles: list[Any]) -> None:
-        """Write the picture with its legend as PNG, in few colours."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        """Write the picture with its legend as PNG."""
+        from design.plan import save_figure
 
         if handles:
             style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.2, "handlelength": 1.6}
             self.figure.legend(handles=handles, loc="lower center", ncols=_COLUMNS, **style)
-        canvas = FigureCanvasAgg(self.figure)
-        canvas.draw()
-        _few_colours(np.asarray(canvas.buffer_rgba())).save(path, format="PNG", optimize=True)
+        save_figure(self.figure, path, _DPI)
 
 
 def _sheet(extent: tuple[float, float, float, float], title: str, entries: int) -> _Sheet:
@@ -245,26 +240,3 @@ def _sheet(extent: tuple[float, float, float, float], title: str, entries: int) 
     axes.tick_params(colors=_GREY, labelsize=9)
     axes.spines[:].set_color(_EDGE)
     return _Sheet(figure, axes, extent, (wide, tall))
-
-
-def _few_colours(pixels: NDArray[np.uint8]) -> Any:
-    """Pixels (rows, columns, 4), opaque, as a PIL image in few colours; the commonest and the marks' are exact."""
-    from PIL import Image, ImageColor
-
-    picture: Any = Image.fromarray(pixels).convert("RGB")
-    few = picture.quantize(_COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    palette = [tuple(few.getpalette()[i : i + 3]) for i in range(0, 3 * len(few.getcolors()), 3)]
-    # marks have too few pixels for a place in it, whose edges are paler
-    palette += [ImageColor.getrgb(pale(mark, white)) for mark in (ALARM, CARE) for white in (0, 0.25, 0.5, 0.75)]
-    common = sorted(picture.getcolors(picture.width * picture.height), reverse=True)[:_EXACT]
-    exact = [ImageColor.getrgb(ALARM), ImageColor.getrgb(CARE), *(colour for _, colour in common)]
-
-    colours = Image.new("P", (1, 1))
-    colours.putpalette([part for colour in palette for part in colour])
-    index = np.array(picture.quantize(palette=colours, dither=Image.Dither.NONE))
-    packed = pixels.view(np.uint32)[..., 0]
-    for number, colour in enumerate(exact, len(palette)):  # the nearest that quantize finds is only near
-        index[packed == np.frombuffer(bytes((*colour, 255)), np.uint32)] = number
-    out = Image.fromarray(index, "P")
-    out.putpalette([part for colour in (*palette, *exact) for part in colour])
-    return out
