@@ -19,7 +19,7 @@ from design.morphology import Morphology
 from . import drawings, laying, printability, soundness, tracks, writers
 from .bodies import Body
 from .findings import Finding
-from .mould import conductive_body, conductive_plan, lid_body, mould_body, sizes, valid_solid
+from .mould import conductive_body, conductive_plan, lid_body, lid_holes, mould_body, sizes, valid_solid
 from .outlines import Plan
 from .settings import DEFAULTS, Settings
 
@@ -78,7 +78,8 @@ def build(
     findings = printability.inspect(plan, printed[0].vertices, printed[0].triangles)
     _require_sound(printed[0], findings)
     for body in printed[1:]:
-        _require_sound(body, soundness.sound(body.vertices, body.triangles))
+        holes = lid_holes(plan) if body.name == "lid" else 0
+        _require_sound(body, soundness.sound(body.vertices, body.triangles, genus=holes))
     writes = [
         *(write for body in printed for write in _solids(body, formats)),
         *_drawings(plan, findings, formats),
@@ -122,7 +123,7 @@ def _solids(body: Printed, formats: Sequence[str]) -> Iterator[Write]:
     if "3mf" in formats:
         yield f"{body.name}.3mf", partial(writers.write_3mf, vertices=body.vertices, triangles=body.triangles)
     if "step" in formats:
-        solid, volume = valid_solid(body.mesh), body.mesh.volume()
+        solid, volume = valid_solid(body.mesh, body.name), body.mesh.volume()
         if abs(solid.volume - volume) > _VOLUME_RATIO * volume:
             raise InputError(f"{body.name}: solid {solid.volume:.1f} mm³, mesh {volume:.1f}; nothing was written")
         yield f"{body.name}.step", partial(writers.write_step, solid=solid)

@@ -12,6 +12,7 @@ Importing this module loads the CAD kernel, which takes seconds: import it where
 from typing import Any
 
 import numpy as np
+import shapely
 from build123d import Solid
 from manifold3d import Manifold
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from OCP.gp import gp_Dir, gp_Pln, gp_Pnt
 from OCP.TopoDS import TopoDS_Shell, TopoDS_Solid, TopoDS_Wire
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 Ints = NDArray[np.int64]
 Loops = list[list[int]]
@@ -44,11 +46,12 @@ def faceted_solid(solid: Manifold) -> Solid:
     mesh = solid.to_mesh64()
     vertices, triangles = np.asarray(mesh.vert_properties), np.asarray(mesh.tri_verts, dtype=np.int64)
     source = np.repeat(np.asarray(mesh.run_original_id, dtype=np.int64), np.diff(mesh.run_index) // 3)
-    vertex = _contracted(vertices, triangles)
-    shell = _Shell(vertices)
+    kept = _contracted(vertices, triangles)
+    shell = _Shell(vertices, _together(vertices))
     for loops, normal in _faces(vertices, triangles, np.stack([source, np.asarray(mesh.face_id, np.int64)], axis=1)):
-        if kept := [short for loop in loops if len(short := _without_repeats(vertex[loop])) > 2]:
-            shell.add(normal, kept)
+        simple = [part for loop in loops for part in shell.parted(_without_repeats(kept[loop])) if len(part) > 2]
+        for outer, holes in _nested(simple, vertices, normal):
+            shell.add(normal, [outer, *holes])
     return Solid(shell.close())
 
 
@@ -63,13 +66,35 @@ def _contracted(vertices: NDArray[np.float64], triangles: Ints) -> Ints:
     return first[group]
 
 
+def _together(vertices: NDArray[np.float64]) -> Ints:
+    """(n,) number that stands for all vertices at one place: where the solid touches itself there are several."""
+    pairs = cKDTree(vertices).query_pairs(SHORTEST_MM, output_type="ndarray").reshape(-1, 2)
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=2 * (len(vertices),))
+    _, group = connected_components(links, directed=False)
+    _, first = np.unique(group, return_index=True)
+    return first[group]
+
+
+def _nested(loops: Loops, vertices: NDArray[np.float64], normal: NDArray[np.float64]) -> list[tuple[list[int], Loops]]:
+    """Every outer loop of a face with the holes inside it."""
+    areas = [_area(vertices[loop], normal) for loop in loops]
+    outers = [loop for loop, area in zip(loops, areas, strict=True) if area > 0]
+    holes = [loop for loop, area in zip(loops, areas, strict=True) if area < 0]
+    if len(outers) < 2 or not holes:
+        return [(outer, holes) for outer in outers]
+    flat = vertices @ np.linalg.svd(normal[None])[2][1:].T  # in the plane of the face
+    shapes = [shapely.Polygon(flat[outer]) for outer in outers]
+    inside = [[hole for hole in holes if shape.covers(shapely.LinearRing(flat[hole]))] for shape in shapes]
+    return list(zip(outers, inside, strict=True))
+
+
 def _without_repeats(loop: Ints) -> list[int]:
     """A loop without vertices that equal the one before."""
     return loop[loop != np.roll(loop, 1)].tolist()
 
 
 def _faces(vertices: NDArray[np.float64], triangles: Ints, plane: Ints) -> list[tuple[Loops, NDArray[np.float64]]]:
-    """Every plane face as its loops, the outer one first, and its normal.
+    """Every plane face as its loops, outer ones counter-clockwise about its normal, and that normal.
 
     Args:
         vertices: (n, 3). triangles: (m, 3) of a closed mesh.
@@ -86,16 +111,18 @@ def _faces(vertices: NDArray[np.float64], triangles: Ints, plane: Ints) -> list[
     count, face = connected_components(
         coo_array((np.ones(inside.sum()), (mine[inside], other[inside])), shape=2 * (len(triangles),)), directed=False
     )
-    after = following  # the next edge of the face's boundary: round the vertex, across the edges inside the face
-    while (crossing := inside[after]).any():
-        after = np.where(crossing, following[twin[after]], after)
+    left = ~inside
+    after = following.copy()  # the next edge of a face's boundary: round the vertex, across the edges inside the face
+    turning = np.flatnonzero(left & inside[following])
+    while len(turning):
+        after[turning] = following[twin[after[turning]]]
+        turning = turning[inside[after[turning]]]
 
     corners = vertices[triangles]
     normals = np.zeros((count, 3))
     np.add.at(normals, face, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     loops: list[Loops] = [[] for _ in range(count)]
-    left = ~inside
     for first in np.flatnonzero(left).tolist():
         loop, h = [], first
         while left[h]:
@@ -104,8 +131,6 @@ def _faces(vertices: NDArray[np.float64], triangles: Ints, plane: Ints) -> list[
             h = int(after[h])
         if loop:
             loops[face[first // 3]].append(loop)
-    for own, normal in zip(loops, normals, strict=True):
-        own.sort(key=lambda loop: -_area(vertices[loop], normal))
     return list(zip(loops, normals, strict=True))
 
 
@@ -118,13 +143,30 @@ def _area(points: NDArray[np.float64], normal: NDArray[np.float64]) -> float:
 class _Shell:
     """A shell in the making: plane faces that share vertices and edges."""
 
-    def __init__(self, points: NDArray[np.float64]) -> None:
+    def __init__(self, points: NDArray[np.float64], together: Ints) -> None:
         self.points = points.tolist()
+        self.together = together.tolist()
         self.builder = BRep_Builder()
         self.shell = TopoDS_Shell()
         self.builder.MakeShell(self.shell)
         self.vertices: dict[int, Any] = {}
         self.edges: dict[tuple[int, int], Any] = {}
+
+    def parted(self, loop: list[int]) -> Loops:
+        """A loop as loops that pass no place twice; the CAD kernel knows no loop that touches itself."""
+        parts: Loops = []
+        path: list[int] = []
+        at: dict[int, int] = {}
+        for vertex in loop:
+            place = self.together[vertex]
+            if place in at:
+                parts.append(path[at[place] :])
+                for passed in path[at[place] :]:
+                    del at[self.together[passed]]
+                path = path[: len(path) - len(parts[-1])]
+            at[place] = len(path)
+            path.append(vertex)
+        return [*parts, path]
 
     def add(self, normal: NDArray[np.float64], loops: Loops) -> None:
         """Add a plane face, its loops counter-clockwise about `normal`, the outer one first."""
@@ -159,6 +201,7 @@ class _Shell:
         return self.edges[start, end]
 
     def _vertex(self, number: int) -> Any:
+        number = self.together[number]
         if number not in self.vertices:
             vertex = BRepBuilderAPI_MakeVertex(gp_Pnt(*self.points[number])).Vertex()
             self.builder.UpdateVertex(vertex, 2 * SHORTEST_MM)

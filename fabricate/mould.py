@@ -4,6 +4,7 @@ z = 0 is the underside of a body, which lies on the print bed; the tray's floor 
 are mm.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -53,13 +54,13 @@ def build_mould(pad: Morphology, settings: Settings = DEFAULTS) -> "Solid":
     return valid_solid(plan_mesh(plan))
 
 
-def valid_solid(mesh: "Manifold") -> "Solid":
+def valid_solid(mesh: "Manifold", name: str = "mould") -> "Solid":
     """The CAD solid of a mesh; raises InputError where the CAD kernel finds it invalid."""
     from .facets import faceted_solid
 
     solid = faceted_solid(mesh)
     if not solid.is_valid:
-        raise InputError("mould: the CAD kernel finds the solid invalid; try another [mould] tolerance_mm")
+        raise InputError(f"{name}: the CAD kernel finds the solid invalid; try another [mould] tolerance_mm")
     return solid
 
 
@@ -85,8 +86,9 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
     for level, height in enumerate(plan.heights_mm):
 
         def outline(below: float, level: int = level) -> BaseGeometry:
-            ridge = plan.outline(level, below) if below else plan.ridges[level]
-            return ridge | wells[level] if wells else ridge
+            if below:
+                return plan.outline(level, below)
+            return plan.ridges[level] | wells[level] if wells else plan.ridges[level]
 
         ridges = parts.ridge(outline, floor_mm=floor, height_mm=height, terrace_mm=plan.settings.terrace_mm)
         body = body.with_adds(ridges)
@@ -120,9 +122,17 @@ def sizes(plan: Plan) -> dict[str, float]:
 
 
 def lid_body(plan: Plan) -> Body:
-    """The lid that lies on the tray's walls; its holes fit the pins, if there are any."""
-    mould, (_, _, edge, _) = plan.settings.mould, plan.cavity.bounds
+    """The lid that lies on the tray's walls; its holes fit the pins, if there are any.
+
+    Raises:
+        InputError: a pad too small for vents beside the spout.
+    """
+    mould, edge = plan.settings.mould, plan.cavity.bounds[2]
     inset = edge - min(_VENT_INSET_MM, edge / 2)
+    least = (parts.spout_mm() + parts.VENT_MM) / math.sqrt(2)
+    if mould.spout and 2 * inset < least:
+        from_mm = least + 2 * _VENT_INSET_MM
+        raise InputError(f"[mould] spout: got true for a pad {2 * edge:.4g} mm wide, allowed from {from_mm:.4g} mm")
     body = parts.lid(
         plan.tray,
         [(x, y) for x in (-inset, inset) for y in (-inset, inset)],
@@ -131,6 +141,12 @@ def lid_body(plan: Plan) -> Body:
         pin_mm=_pin_mm(plan) if mould.pins else 0.0,
     )
     return parts.spout(body, thickness_mm=LID_MM) if mould.spout else body
+
+
+def lid_holes(plan: Plan) -> int:
+    """How many holes lead through the lid: vents, those for pins, and the spout."""
+    mould = plan.settings.mould
+    return 4 + 3 * mould.pins + mould.spout
 
 
 def conductive_plan(plan: Plan) -> Plan:

@@ -15,6 +15,12 @@ from .bodies import Body, Prism, cylinder
 INTO_FLOOR_MM = 0.2
 """How far parts sink into what they stand on before they are joined to it: no two faces coincide."""
 
+VENT_MM = 1.5
+"""Diameter of a vent of the lid."""
+
+BORE_MM, FUNNEL_MM, FUNNEL_DEG, _FUNNEL_WALL_MM = 6.0, 6.0, 30.0, 2.0
+"""Spout: its bore, the height, lean from upright and wall of its funnel."""
+
 PIN_CLEARANCE_MM = 0.3
 """By how much wider the lid's holes are than the pins."""
 
@@ -78,7 +84,7 @@ def lid(
     vents: Iterable[tuple[float, float]],
     *,
     thickness_mm: float = 3.0,
-    vent_mm: float = 1.5,
+    vent_mm: float = VENT_MM,
     pin_places: Iterable[tuple[float, float]] = (),
     pin_mm: float = 2.0,
 ) -> Body:
@@ -88,14 +94,16 @@ def lid(
     return Body((Prism(outline, 0, thickness_mm),), tuple(Prism(hole, -1, thickness_mm + 1) for hole in holes))
 
 
-def spout(plate: Body, *, thickness_mm: float = 3.0, bore_mm: float = 6.0, funnel_mm: float = 6.0) -> Body:
-    """The plate with a funnel in its middle to pour through, `funnel_mm` high; its walls lean at 30 degrees.
-
-    Printed as it lies: the funnel opens upwards with an overhang of 30 degrees from upright.
-    """
-    flare = funnel_mm * math.tan(math.radians(30))
-    wall = 2.0
-    cup = Prism(cylinder(0, 0, bore_mm + 2 * wall), thickness_mm - INTO_FLOOR_MM, thickness_mm + funnel_mm, flare)
+def spout(plate: Body, *, thickness_mm: float = 3.0, bore_mm: float = BORE_MM, funnel_mm: float = FUNNEL_MM) -> Body:
+    """The plate with a funnel in its middle to pour through, `funnel_mm` high; printed as it lies, without supports."""
+    flare = funnel_mm * math.tan(math.radians(FUNNEL_DEG))
+    foot = cylinder(0, 0, bore_mm + 2 * _FUNNEL_WALL_MM)
+    cup = Prism(foot, thickness_mm - INTO_FLOOR_MM, thickness_mm + funnel_mm, flare)
     bore = Prism(cylinder(0, 0, bore_mm), -1, thickness_mm + INTO_FLOOR_MM)
     mouth = Prism(cylinder(0, 0, bore_mm), thickness_mm, thickness_mm + funnel_mm + 1, flare * (1 + 1 / funnel_mm))
     return Body((*plate.base, cup), (*plate.cuts, bore, mouth))
+
+
+def spout_mm() -> float:
+    """Diameter of the spout at its top, mm, where it is widest."""
+    return BORE_MM + 2 * _FUNNEL_WALL_MM + 2 * FUNNEL_MM * math.tan(math.radians(FUNNEL_DEG))

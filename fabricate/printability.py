@@ -52,7 +52,7 @@ def meshed(plan: Plan) -> tuple[NDArray[np.floating], NDArray[np.integer], list[
 
 def inspect(plan: Plan, vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> list[Finding]:
     """Every check on a plan and its mesh: vertices (n, 3) mm, triangles (m, 3) vertex numbers."""
-    of_mesh = soundness.inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, widths=False)
+    of_mesh = soundness.inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, unplanned=False)
     return [*of_mesh, *check_plan(plan)]
 
 

@@ -57,8 +57,8 @@ class Mould(Section):
 class Printer(Section):
     """`[printer]`: what the mould is printed on."""
 
-    nozzle_mm: float = Field(default=0.4, gt=0, le=5, description="nozzle diameter (resin: pixel size), mm")
-    layer_mm: float = Field(default=0.1, gt=0, le=2, description="layer height, mm")
+    nozzle_mm: float = Field(default=0.4, ge=0.01, le=5, description="nozzle diameter (resin: pixel size), mm")
+    layer_mm: float = Field(default=0.1, ge=0.01, le=2, description="layer height, mm")
     bed_mm: list[Annotated[float, Field(gt=0, le=1e4)]] = Field(
         default=[220.0, 220.0, 250.0],
         min_length=3,
@@ -67,6 +67,9 @@ class Printer(Section):
     )
     resin: bool = Field(default=False, description="true for a resin printer")
 
+
+STEP_MM = 0.03
+"""Width of the terraces of a tapered ridge: no wider than what printers place a line by."""
 
 MODELS: dict[str, type[Section]] = {"mould": Mould, "printer": Printer}
 
@@ -97,10 +100,10 @@ class Settings:
 
     @property
     def terrace_mm(self) -> float:
-        """Height of the terraces that taper a ridge: whole layers whose steps are as wide as the tolerance, or one."""
+        """Height of the terraces that taper a ridge: as many layers as keep their steps within `STEP_MM`, or one."""
         layer = self.printer.layer_mm
         step = self.ridge_slope * layer
-        return layer * max(1, int(self.mould.tolerance_mm / step)) if step else math.inf
+        return layer * max(1, int(STEP_MM / step)) if step else math.inf
 
     def require_consistent(self, pitch_mm: float) -> None:
         """Refuse settings that contradict each other or the pitch of the pad.
@@ -118,7 +121,11 @@ class Settings:
             if mould.exit_width_mm <= mould.ridge_width_mm:
                 allowed = f"more than ridge_width_mm, {mould.ridge_width_mm:g} mm"
                 raise InputError(f"[mould] exit_width_mm: got {mould.exit_width_mm:g}, allowed is {allowed}")
-            _require_less("exit_width_mm", mould.exit_width_mm, pitch_mm - self.flare_mm, "the pitch between slots")
+            room = pitch_mm - self.flare_mm
+            if room <= mould.ridge_width_mm:
+                lean = f"the walls lean outwards by {self.flare_mm:.3g} mm, the pitch is {pitch_mm:g} mm"
+                raise InputError(f"[mould] exit_mm: got {mould.exit_mm:g}, allowed is 0 only: {lean}")
+            _require_less("exit_width_mm", mould.exit_width_mm, room, "the pitch between slots")
         if mould.spout and not mould.lid:
             raise InputError("[mould] spout: got true, allowed only with lid = true, which it is a part of")
 

@@ -3,6 +3,7 @@
 Each check is one finding with its places. Nothing here changes a mesh.
 """
 
+import logging
 import math
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from .settings import DEFAULTS, Printer
 from .slices import slabs
 from .surface import Array, Numbers, Surface, spread
 from .thickness import floor_thickness, ridge_width, silicone_wall, wall_thickness
+from .tightness import tight
 
 SOUND = ("manifold", "watertight", "self_intersection", "bodies", "volume", "genus")
 """The checks a mesh must pass to be a solid at all."""
@@ -34,7 +36,7 @@ def inspect_mesh(
     printer: Printer = DEFAULTS.printer,
     min_silicone_mm: float = 0.4,
     genus: int | None = None,
-    widths: bool = True,
+    unplanned: bool = True,
 ) -> list[Finding]:
     """Every check on a mesh that stands on its underside as it is printed, open side up.
 
@@ -44,11 +46,11 @@ def inspect_mesh(
         printer: nozzle, layer and bed.
         min_silicone_mm: least thickness of the silicone between tracks.
         genus: how many holes must lead through the solid; None where that is not known.
-        widths: False where the plan of the mould is at hand, which tells them exactly and in less time.
+        unplanned: False where the plan of the mould is at hand, which tells widths exactly and in less time.
 
     Returns:
         The findings of `sound`, then bed; and, if that is a solid that can be cut, wall_thickness, floor_thickness,
-        overhang, undercut; and the widths, ridge_width and silicone_wall.
+        overhang, undercut; and what a plan knows, ridge_width, silicone_wall and tight.
     """
     surface = Surface.joined(vertices, triangles)
     findings = [*_sound(surface, genus), _bed(surface, printer)]
@@ -61,8 +63,8 @@ def inspect_mesh(
         overhang(surface, printer),
         undercut(surface, slices),
     ]
-    if widths:
-        findings += [ridge_width(slices, printer), silicone_wall(slices, min_silicone_mm, size)]
+    if unplanned:
+        findings += [ridge_width(slices, printer), silicone_wall(slices, min_silicone_mm, size), tight(slices)]
     return findings
 
 
@@ -91,15 +93,17 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
 
     if not path.is_file():
         raise InputError(f"{path}: {'a folder, expected a mesh file' if path.is_dir() else 'no such file'}")
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it says on top of raising
     try:
         with np.errstate(all="ignore"):
-            scene = trimesh.load_scene(path)
+            scene = trimesh.load_scene(path, process=False)  # which would drop triangles with NaN
             if scene.units:
                 scene = scene.convert_units("millimeters")
             mesh = scene.to_mesh()
         vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # readers of broken files raise whatever comes
-        reason = " ".join(str(error).split()) or type(error).__name__
+        missing = isinstance(error, KeyError)
+        reason = f"{error} is missing in it" if missing else " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(f"{path}: holds no triangles that can be read, or is torn")

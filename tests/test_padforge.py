@@ -1,6 +1,7 @@
 """The front door: what it imports, how it fails, and the whole chain on a small pad."""
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -66,14 +67,15 @@ def test_run_makes_everything(chain):
     names = {path.name for path in out.iterdir()}
     assert names >= {
         *("morphology.json", "design.json", "design.svg", "design.png"),
-        *("mould.stl", "mould.step", "tracks.svg", "mould.png", "fabrication.json"),
+        *("mould.stl", "mould.step", "tracks.svg", "mould.png", "tracks.png", "laying.md", "fabrication.json"),
         *("recording", "localizer.safetensors", "localizer.json", "calibration.json"),
         *("error_map.png", "error_by_loss.png", "report.html"),
     }
     mesh = trimesh.load_mesh(out / "mould.stl")
     assert mesh.is_watertight
     assert mesh.body_count == 1
-    assert mesh.extents[:2] == pytest.approx([3 * 11.25 + 4] * 2, abs=1e-3)
+    walls = 2 * (2 + 2 + 6 * math.tan(math.radians(2)))  # exits, walls and their lean
+    assert mesh.extents[:2] == pytest.approx([3 * 11.25 + walls] * 2, abs=1e-3)
     assert load_file(out / "localizer.safetensors")
     errors = json.loads((out / "calibration.json").read_text())["errors"]
     assert [row["lost"] for row in errors] == [0, 1]
@@ -85,7 +87,7 @@ def test_run_makes_everything(chain):
 
 def test_the_report_is_one_page_with_its_pictures(chain):
     text = (chain[0] / "out" / "pad" / "report.html").read_text()
-    assert text.count('src="data:image/') == 4
+    assert text.count('src="data:image/') == 5
     assert "http://" not in text.replace("http://www.w3.org", "")
     for heading in ("Fibres", "Mould", "Calibration"):
         assert f"<h2>{heading}</h2>" in text

@@ -32,7 +32,7 @@ def pixels(path: Path) -> np.ndarray:
 
 def where(picture: np.ndarray, colour: str) -> np.ndarray:
     """Whether each pixel has this colour, as nearly as a palette of 256 gives it."""
-    return (np.abs(picture.astype(int) - list(bytes.fromhex(colour[1:]))) <= 10).all(axis=2)
+    return np.abs(picture.astype(int) - list(bytes.fromhex(colour[1:]))).max(axis=2) <= 10
 
 
 def mould_picture(tmp_path: Path, *findings: Finding, plan: Plan = PLAN) -> np.ndarray:

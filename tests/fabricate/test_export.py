@@ -117,7 +117,7 @@ def test_nothing_is_written_from_a_mould_in_two_pieces(tmp_path, monkeypatch):
 def test_nothing_is_written_when_mesh_and_solid_disagree(tmp_path, monkeypatch):
     from build123d import Solid
 
-    monkeypatch.setattr(export, "valid_solid", lambda mesh: Solid.make_box(1, 1, 1))
+    monkeypatch.setattr(export, "valid_solid", lambda mesh, name: Solid.make_box(1, 1, 1))
     with pytest.raises(InputError, match="nothing was written"):
         build(PAD, tmp_path / "out", ["stl", "step"])
     assert not (tmp_path / "out").exists()

@@ -6,6 +6,7 @@ import shapely
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from manifold3d import Manifold, Mesh64
 
 from design.errors import InputError
 from design.morphology import Morphology
@@ -172,6 +173,20 @@ def test_lid_has_the_holes_that_fit_the_pins():
     assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
 
 
+@pytest.mark.parametrize("tapered", [5.0, 17.0])
+def test_tapered_moulds_with_wells_are_valid_solids(tapered):
+    plan = Plan(Morphology.random(2, 4, seed=3), with_settings({"ridge_draft_deg": tapered, "pins": True}))
+    for body in (mould_body(plan), conductive_body(conductive_plan(plan))):
+        assert valid_solid(mesh(body)).volume == pytest.approx(mesh(body).volume(), rel=1e-9)
+        assert_one_closed_body(as_read(body))
+
+
+def test_a_spout_needs_room_between_the_vents():
+    with pytest.raises(InputError, match=r"spout: got true for a pad 7 mm wide, allowed from 19"):
+        lid_body(Plan(Morphology.straight(1, 3.5), with_settings({"lid": True, "spout": True})))
+    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))
+
+
 def test_pins_need_room():
     plan = Plan(Morphology.straight(2), with_settings({"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}))
     with pytest.raises(InputError, match=r"pins.*1 mm wide"):
@@ -210,6 +225,23 @@ class TestFacets:
         solid = faceted_solid(mesh(Body((Prism(notched, 0, 1),))))
         assert solid.is_valid
         assert solid.volume == pytest.approx(1, abs=1e-6)
+
+    def test_a_vertex_inside_a_face(self):
+        """Meshes of others may have a face divided from within: none of its edges there bounds anything."""
+        fine = trimesh.creation.box((2, 2, 2)).subdivide().subdivide()
+        solid = faceted_solid(Manifold(Mesh64(fine.vertices, fine.faces.astype(np.uint64))))
+        assert solid.is_valid
+        assert len(solid.faces()) == 6
+        assert solid.volume == pytest.approx(8)
+
+    @pytest.mark.parametrize("low", [1.0, 0.5])
+    def test_parts_that_meet_in_one_upright_line(self, low):
+        """Two blocks on a plate that touch along an edge: the faces around it pass the same places twice."""
+        blocks = (Prism(shapely.box(0, 0, 1, 1), 0, 2), Prism(shapely.box(1, 1, 2, 2), 0, 1 + low))
+        body = Body((Prism(shapely.box(-1, -1, 3, 3), -1, 0.5), *blocks))
+        solid = faceted_solid(mesh(body))
+        assert solid.is_valid
+        assert solid.volume == pytest.approx(16 * 1.5 + 1.5 + 0.5 + low, rel=1e-9)
 
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=15, deadline=None)

@@ -20,7 +20,7 @@ def test_defaults_come_back_from_their_own_file(tmp_path):
         ({"mould": {"wall_mm": 0.1}}, ("[mould] wall_mm", "0.1", "greater than or equal to 0.8")),
         ({"mould": {"floor_mm": "2"}}, ("[mould] floor_mm", "'2'", "number")),
         ({"printer": {"bed_mm": [100.0, 100.0]}}, ("[printer] bed_mm", "at least 3")),
-        ({"printer": {"layer_mm": 0.0}}, ("[printer] layer_mm", "0.0", "greater than 0")),
+        ({"printer": {"layer_mm": 0.0}}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
     ],
 )
 def test_a_bad_key_is_one_clear_line(tables, parts):
@@ -61,8 +61,8 @@ def test_a_pitch_too_small_for_the_ridges_or_the_exits(pitch_mm):
         DEFAULTS.require_consistent(pitch_mm)
 
 
-def test_terraces_are_whole_layers_with_steps_within_the_tolerance():
-    for draft, layers in ((0.5, 11), (3.0, 1), (20.0, 1)):
+def test_terraces_are_whole_layers_with_steps_no_printer_places():
+    for draft, layers in ((0.5, 34), (3.0, 5), (20.0, 1)):
         settings = Settings(mould=Mould(ridge_draft_deg=draft))
         assert settings.terrace_mm == pytest.approx(layers * 0.1)
     assert Settings().terrace_mm == math.inf

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 import trimesh
 import trimesh.exchange.stl
+from manifold3d import Manifold
 
 from design.errors import InputError
 from fabricate.settings import Printer
 from fabricate.soundness import SOUND, check_mesh, inspect_mesh, sound
 
-from .trays import CROSS, block, faults, inspected, near, tray
+from .trays import CROSS, block, faults, inspected, line, near, prism, tray
 
 
 class TestSound:
@@ -119,3 +120,36 @@ class TestFiles:
             check_mesh(tmp_path / "absent.stl")
         with pytest.raises(InputError, match="a folder"):
             check_mesh(tmp_path)
+
+
+def test_a_triangle_with_nan_is_refused_not_dropped(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((10, 20, 5)).export(path)
+    content = bytearray(path.read_bytes())
+    content[80:84] = np.uint32(13).tobytes()
+    path.write_bytes(bytes(content) + np.array([0, 0, 1, np.nan, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + b"\0\0")
+    with pytest.raises(InputError, match="NaN"):
+        check_mesh(path)
+
+
+class TestTight:
+    @pytest.mark.parametrize("width", [1.0, 3.0, 8.0])
+    def test_a_wall_cut_open(self, width):
+        cut = prism(line((9, 2), (14, 2), width=width), 2.0, 9.0)
+        finding = inspected(tray(*CROSS) - cut)["tight"]
+        assert finding.status == "fail"
+        assert near(finding, 11, 2, 2.5)
+
+    def test_a_hole_through_the_floor(self):
+        finding = inspected(tray(*CROSS) - Manifold.cylinder(5, 0.5).translate((-6, 6, -1)))["tight"]
+        assert (finding.status, finding.measured) == ("fail", 1)
+        assert near(finding, -6, 6)
+
+    def test_an_opening_below_the_rim(self):
+        bore = Manifold.cylinder(8, 0.6).rotate((0, 90, 0)).translate((8, 0, 5))
+        assert inspected(tray(*CROSS) - bore)["tight"].status == "fail"
+
+    def test_pockets_that_lead_nowhere(self):
+        slot = prism(line((9, 2), (11, 2), width=3.0), 2.0, 9.0)
+        recess = Manifold.cylinder(1, 2).translate((5, 5, -0.5))
+        assert inspected(tray(*CROSS) - slot - recess)["tight"].status == "pass"
