@@ -9,7 +9,7 @@ import click
 
 from design.cli import INTERRUPTED, design
 from design.console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
-from design.errors import InputError
+from design.errors import Fault, InputError
 from fabricate.cli import fabricate
 from sense.cli import sense
 
@@ -125,8 +125,9 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     from design.cli import summary as design_summary
     from fabricate import Settings, build
     from fabricate.cli import summary as mould_summary
-    from sense.cli import run_calibration, run_recording
+    from sense.cli import run_calibration
     from sense.cli import summary as calibration_summary
+    from sense.rig.cli import run_recording
 
     seeds = {"seed": seed}
     _, found = run_search(spec, out, seeds)
@@ -150,7 +151,7 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
 def _require_replaceable(recorded: Path) -> None:
     """Refuse to run over a recording, unless it is a simulated one, which the same seed gives again."""
     from design.files import read_json
-    from sense.recording import FORMAT, START
+    from sense.recorder import FORMAT, START
 
     if not recorded.exists() or (recorded.is_dir() and not any(recorded.iterdir())):
         return
@@ -265,6 +266,8 @@ def main() -> None:
         code = _fail(error.format_message(), 2)
     except InputError as error:
         code = _fail(str(error), 2)
+    except Fault as fault:
+        code = _fail(str(fault), fault.exit_code)
     except OSError as error:
         code = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""The one exception a user meets."""
+"""The exceptions a user meets: each is one line, without a traceback."""
 
 
 class InputError(ValueError):
@@ -7,3 +7,13 @@ class InputError(ValueError):
     The message is one line that names the thing, the value got and what is
     allowed. The command line prints it without a traceback and exits 2.
     """
+
+
+class Fault(Exception):  # noqa: N818  of things outside the program, not an error of it
+    """Something outside went wrong that the user has to look at, such as a robot that was stopped.
+
+    Attributes:
+        exit_code: what the command line ends with.
+    """
+
+    exit_code = 1

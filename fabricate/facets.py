@@ -22,7 +22,7 @@ from OCP.gp import gp_Dir, gp_Pln, gp_Pnt
 from OCP.TopoDS import TopoDS_Shell, TopoDS_Solid, TopoDS_Wire
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 Ints = NDArray[np.int64]
 Loops = list[list[int]]
@@ -68,7 +68,7 @@ def _contracted(vertices: NDArray[np.float64], triangles: Ints) -> Ints:
 
 def _together(vertices: NDArray[np.float64]) -> Ints:
     """(n,) number that stands for all vertices at one place: where the solid touches itself there are several."""
-    pairs = cKDTree(vertices).query_pairs(SHORTEST_MM, output_type="ndarray").reshape(-1, 2)
+    pairs = KDTree(vertices).query_pairs(SHORTEST_MM, output_type="ndarray").reshape(-1, 2)
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=2 * (len(vertices),))
     _, group = connected_components(links, directed=False)
     _, first = np.unique(group, return_index=True)

@@ -5,7 +5,7 @@ from .exchange import export_csv as export_csv
 from .exchange import import_csv as import_csv
 from .exchange import import_mat as import_mat
 from .localizer import Localizer as Localizer
-from .recording import Recorder as Recorder
+from .recorder import Recorder as Recorder
 from .recording import Recording as Recording
 from .rig.simulated import simulate as simulate
 from .settings import Rig as Rig

@@ -1,6 +1,6 @@
 """`padforge sense`: the edge where recordings come in and places go out."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,8 +8,9 @@ import click
 
 from design.console import json_option, load_spec, progress, seed_option, show_result, spec_option
 
+from .rig.cli import describe, doctor, record
+
 if TYPE_CHECKING:
-    from design.morphology import Morphology
     from design.settings import Spec
 
     from .recording import Recording
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
-recording_argument = click.argument("recording", type=_FOLDER)
+recording_argument = click.argument("recording", type=click.Path(path_type=Path))
 
 
 def recording_out_option(default: str) -> Callable[..., Any]:
@@ -48,73 +49,41 @@ def sense() -> None:
     """Record presses, learn places from them and find new ones."""
 
 
-@sense.command()
-@click.option("--rig", type=click.Choice(["simulated"]), default="simulated", show_default=True)
-@click.option(
-    "--morphology", type=_FILE, help="morphology.json or published .mat (default: the straight grid of [pad])."
-)
-@click.option("--presses", type=int, help="Presses to record.")
-@seed_option
-@spec_option
-@recording_out_option("out/pad/recording")
-def record(
-    rig: str, morphology: Path | None, presses: int | None, seed: int | None, spec: Path | None, out: Path | None
-) -> None:
-    """Record presses at random places on a simulated pad."""
-    from design.morphology import Morphology
-    from design.settings import Pad
-
-    settings = load_spec(spec)
-    of_pad = settings.section(Pad)
-    pad = Morphology.load(morphology) if morphology else Morphology.straight(of_pad.grid, of_pad.pitch_mm)
-    inputs = [path for path in (morphology, spec) if path is not None]
-    folder = out or Path("out/pad/recording")
-    recording = run_recording(settings, pad, folder, {"presses": presses, "seed": seed}, inputs)
-    click.echo(_describe(recording, folder))
-
-
-def run_recording(
-    spec: "Spec", pad: "Morphology", out: Path, overrides: Mapping[str, Any], inputs: Sequence[Path] = ()
-) -> "Recording":
-    """Record presses on the simulated rig with the settings of `spec` into the run directory `out`."""
-    from design.files import provenance
-    from design.settings import Contact
-
-    from .recording import refuse_existing
-    from .rig.simulated import simulate
-    from .settings import Rig
-
-    refuse_existing(out)
-    options = spec.section(Rig, **overrides)
-    recording = simulate(pad, options, spec.section(Contact))
-    recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
-    return recording
+sense.add_command(record)
+sense.add_command(doctor)
 
 
 @sense.command("import")
 @click.argument("file", type=_FILE)
 @recording_out_option("out/NAME/recording for NAME.mat")
 def import_(file: Path, out: Path | None) -> None:
-    """Make a recording of FILE, a published .mat or a .csv.
+    """Make a recording of FILE, a published .mat, a .csv or a .h5 that export wrote.
 
     \b
     The CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two hold
     the place pressed while the probe is down and are empty on all other lines.
     """
-    from design.errors import InputError
     from design.files import provenance
 
-    from .exchange import import_csv, import_mat
-    from .recording import refuse_existing
+    from .exchange import import_file
+    from .recorder import refuse_existing
 
-    readers = {".mat": import_mat, ".csv": import_csv}
-    if file.suffix.lower() not in readers:
-        raise InputError(f"{file}: ends in {file.suffix!r}, allowed are {', '.join(readers)}")
     folder = out or Path("out") / file.stem / "recording"
     refuse_existing(folder)
-    recording = readers[file.suffix.lower()](file)
+    recording = import_file(file)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))
-    click.echo(_describe(recording, folder))
+    click.echo(describe(recording, folder))
+
+
+@sense.command()
+@recording_argument
+@click.argument("file", type=_FILE)
+def export(recording: Path, file: Path) -> None:
+    """Write RECORDING to FILE, as HDF5 (.h5) or CSV (.csv), for other programs."""
+    from .exchange import export_file
+
+    export_file(_open(recording), file)
+    click.echo(f"{recording} -> {file}")
 
 
 @sense.command()
@@ -207,13 +176,6 @@ def _open(path: Path) -> "Recording":
     if recording.torn_presses:
         click.echo(f"{path}: the end is torn off, its last {recording.torn_presses} presses are left out", err=True)
     return recording
-
-
-def _describe(recording: "Recording", out: Path) -> str:
-    return (
-        f"{len(recording.presses_mm)} presses, {len(recording.readings)} readings of {recording.fibres} fibres "
-        f"at {recording.rate_hz:.1f} Hz -> {out}"
-    )
 
 
 def summary(document: Mapping[str, Any]) -> list[str]:

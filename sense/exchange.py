@@ -132,6 +132,34 @@ def export_csv(recording: Recording, path: str | Path) -> None:
             writer.writerow([time, *volts, *place])
 
 
+def import_file(path: Path) -> Recording:
+    """Read a recording from a published .mat, a .csv or a .h5, by the end of its name.
+
+    Raises:
+        InputError: a name with another end, or as the reader of that format.
+    """
+    from .hdf5 import import_hdf5
+
+    readers = {".mat": import_mat, ".csv": import_csv, ".h5": import_hdf5}
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(readers)}")
+    return readers[path.suffix.lower()](path)
+
+
+def export_file(recording: Recording, path: Path) -> None:
+    """Write a recording as .csv or .h5, by the end of the name.
+
+    Raises:
+        InputError: a name with another end, or `path` cannot be written.
+    """
+    from .hdf5 import export_hdf5
+
+    writers = {".csv": export_csv, ".h5": export_hdf5}
+    if path.suffix.lower() not in writers:
+        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(writers)}")
+    writers[path.suffix.lower()](recording, path)
+
+
 def write_places(places_mm: Array, path: str | Path) -> None:
     """Write (Q, 2) places found, mm from the pad's centre, as CSV: press (counted from 0), x_mm, y_mm; atomically.
 

@@ -11,8 +11,10 @@ from design.errors import InputError
 from .limits import MAX_INDEX, MAX_MM
 
 
-def read_journal(path: Path) -> list[tuple[float, float, int, int]]:
-    """Place (x, y in mm) and readings (begun, lifted) of every press that is done, in order of the press.
+def read_journal(path: Path) -> dict[int, tuple[float, float, int, int]]:
+    """Place (x, y in mm) and readings (begun, lifted) of every press that is done, by its number, ascending.
+
+    A press that was aborted and begun again counts as it was begun last.
 
     Raises:
         InputError: the file is missing, or a line other than a torn last one is no entry.
@@ -35,11 +37,22 @@ def read_journal(path: Path) -> list[tuple[float, float, int, int]]:
                 begun[press] = (_place(event, "x_mm"), _place(event, "y_mm"), reading)
             elif event.get("event") == "done" and press in begun:
                 done[press] = reading
+            elif event.get("event") == "aborted" and press in begun:
+                del begun[press]
             else:
                 raise ValueError(f"event {shortened(event.get('event'))} of press {press}")
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: line {number} is no journal entry ({error})") from error
-    return [(*begun[press], done[press]) for press in sorted(done)]
+    return {press: (*begun[press], done[press]) for press in sorted(done)}
+
+
+def cut_torn_line(path: Path) -> None:
+    """Take away what follows the last whole line of a journal."""
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        with path.open("r+b") as file:
+            file.truncate(whole)
 
 
 def _whole(event: Mapping[str, Any], key: str) -> int:

@@ -1,36 +1,29 @@
-"""Recordings: what the fibres gave while a probe pressed known places, and the run directory that keeps it.
-
-A run directory holds `start.json` (what was recorded, with what), `readings.bin` (the stream of readings, see
-`stream`) and `journal.ndjson`: one line as a press begins, with its place and the index of its first reading, and one
-as it is done. Readings are on the disk before the journal says that a press is done, so after a kill every press the
-journal calls done can be used.
-"""
+"""Recordings: what the fibres gave while a probe pressed known places, as read from a run directory (`recorder`)."""
 
 import hashlib
 import json
-import os
 import shutil
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from reprlib import repr as shortened
-from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from design.errors import InputError
-from design.files import read_json, write_json
+from design.files import read_json
 
 from .journal import read_journal
 from .limits import MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_S, MAX_VOLTS, MIN_RATE_HZ, numbers, refuse_beyond
-from .output import refuse_unwritable, writing
-from .stream import BlockWriter, read_blocks
+from .output import writing
+from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
+from .stream import read_blocks
 
-FORMAT = "padforge-recording/1"
-START, JOURNAL, READINGS = "start.json", "journal.ndjson", "readings.bin"
+FILES = (".mat", ".csv", ".h5")
+"""Ends of the names of files that hold a recording: published, of any origin, and exported."""
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -104,21 +97,23 @@ class Recording:
 
     @classmethod
     def open(cls, path: str | Path) -> "Recording":
-        """Read a run directory, finished or not; a torn tail is cut off, with the presses it had.
+        """Read a run directory, finished or not, or a file that `exchange.import_file` knows.
+
+        The torn tail of a run directory is cut off, with the presses it had.
 
         Raises:
             InputError: no run directory, a file damaged elsewhere than at its end, or no press in it.
         """
         path = Path(path)
-        if not (path / START).is_file():
-            raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
+        if path.suffix.lower() in FILES and not path.is_dir():
+            from .exchange import import_file
+
+            return import_file(path)
+        fibres = fibres_of(path)
         start = read_json(path / START, FORMAT)
-        fibres = start.get("fibres")
-        if type(fibres) is not int or not 1 <= fibres <= MAX_FIBRES:
-            raise InputError(f"{path / START}: fibres is {fibres!r}, allowed is 1 to {MAX_FIBRES}")
         rows, _ = read_blocks(path / READINGS, fibres)
         done = read_journal(path / JOURNAL)
-        presses = [press for press in done if press[3] <= len(rows)]
+        presses = [press for press in done.values() if press[3] <= len(rows)]
         table = np.array(presses, dtype=np.float64).reshape(-1, 4)
         try:
             return cls(
@@ -148,78 +143,10 @@ class Recording:
                 recorder.append(self.times_s, self.readings)
                 for place, begun, lifted in zip(self.presses_mm, self.begun, self.lifted, strict=True):
                     recorder.begin(place, int(begun))
-                    recorder.done(int(lifted))
+                    recorder.finish(int(lifted))
             _put(unfinished, path)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
-
-
-class Recorder:
-    """Writes a run directory as it is recorded: append readings, begin a press, end it, `sync`.
-
-    Nothing is promised to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
-
-    Raises:
-        InputError: `path` exists and is not an empty directory, or cannot be written.
-    """
-
-    def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
-        refuse_existing(path)
-        document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
-        with writing(path):
-            path.mkdir(parents=True, exist_ok=True)
-            try:
-                self._stream = (path / READINGS).open("xb")  # of two that start at once, one makes this file
-            except FileExistsError:
-                refuse_existing(path)
-                raise
-            write_json(path / START, document)
-            self._journal = (path / JOURNAL).open("x", encoding="utf-8")
-        self._blocks = BlockWriter(self._stream, fibres)
-        self._lines: list[str] = []
-        self._press = 0
-
-    def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add (n,) times in s and (n, C) volts."""
-        self._blocks.append(np.column_stack([np.asarray(times_s, dtype=np.float64), readings]))
-
-    def begin(self, place_mm: ArrayLike, reading: int) -> None:
-        """Note that the probe is sent down at `place_mm` (2,); `reading` is the index of the reading that follows."""
-        x, y = np.asarray(place_mm, dtype=np.float64).tolist()
-        self._note({"event": "begun", "press": self._press, "reading": reading, "x_mm": x, "y_mm": y})
-
-    def done(self, reading: int) -> None:
-        """Note that the probe is sent up; `reading` is the index of the reading that follows."""
-        self._note({"event": "done", "press": self._press, "reading": reading})
-        self._press += 1
-
-    def _note(self, event: Mapping[str, Any]) -> None:
-        self._lines.append(json.dumps(event, allow_nan=False) + "\n")
-
-    def sync(self) -> None:
-        """Put all so far on the disk: the readings first, then what the journal says of them."""
-        self._blocks.flush()
-        os.fsync(self._stream.fileno())
-        self._journal.writelines(self._lines)
-        self._lines.clear()
-        self._journal.flush()
-        os.fsync(self._journal.fileno())
-
-    def __enter__(self) -> "Recorder":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with self._stream, self._journal:
-            self.sync()
-
-
-def refuse_existing(path: Path) -> None:
-    """Raise InputError if `path` is anything but absent or an empty directory, or cannot be written."""
-    refuse_unwritable(path)
-    if path.exists() and any(path.iterdir()):
-        raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
 
 
 def _put(unfinished: Path, path: Path) -> None:

@@ -1,8 +1,8 @@
 """The sections of `pad.toml` that sense owns: the rig and the localizer."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from design.settings import Section
 
@@ -10,20 +10,75 @@ Features = Literal["windows", "published"]
 Split = Literal["random", "chronological"]
 
 
+def _unknown(value: object) -> object:
+    return None if value == "unknown" else value
+
+
+def _tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Unknown = PlainSerializer(lambda value: "unknown" if value is None else value)
+Millimetres = Annotated[float, Field(ge=-1e4, le=1e4)]
+Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
+Depth = Annotated[float, Field(gt=0, le=50)]
+
+
 class Rig(Section):
-    """`[rig]`: how presses are recorded, and how the simulated pad answers."""
+    """`[rig]`: how presses are recorded, where a real arm may go, and how the simulated pad answers.
+
+    Attributes:
+        depths_mm: depths that presses take in turn; `depth_mm` for all where empty.
+        box_mm: x, y and z from and to, in the arm's base frame, which the tool never leaves; no arm moves without.
+        contact_mm: height of the pad's surface in the base frame; no arm moves while it is unknown.
+        pad_mm, pad_angle_deg: where the pad's centre lies in the base frame, and how far its x axis is turned.
+        tool_rad: rotation vector of the tool while it points down.
+    """
 
     presses: int = Field(default=1500, ge=1, le=1_000_000, description="presses in a recording")
+    plan: Literal["uniform", "grid", "boustrophedon", "adaptive"] = Field(
+        default="uniform", description="where they go; adaptive: where a localizer is least certain (--model)"
+    )
     rate_hz: float = Field(default=13.3, ge=0.1, le=10_000, description="readings per second")
     readings_per_press: int = Field(
         default=40, ge=8, le=100_000, description="readings in the cycle of a press: down at its half, up at its end"
     )
     depth_mm: float = Field(default=5.0, gt=0, le=50, description="depth of a press, mm")
+    depths_mm: Annotated[tuple[Depth, ...], BeforeValidator(_tuple)] = Field(
+        default=(), description="depths that presses take in turn, in place of depth_mm"
+    )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the places and of the simulated pad")
     noise_mv: float = Field(default=1.6, ge=0, le=1000, description="simulated pad: white noise of a reading, mV")
     drift_mv: float = Field(default=40.0, ge=0, le=1000, description="simulated pad: spread of the drifting rest, mV")
     creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's answer that creeps")
     hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
+    host: str = Field(default="192.168.0.100", min_length=1, max_length=253, description="address of the UR controller")
+    port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
+    converter_rate_hz: float = Field(
+        default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz"
+    )
+    channels: int = Field(default=8, ge=1, le=8, description="channels of the board with a fibre, from the first on")
+    box_mm: Annotated[
+        tuple[Millimetres, Millimetres, Millimetres, Millimetres, Millimetres, Millimetres] | None,
+        BeforeValidator(lambda value: _tuple(_unknown(value))),
+        Unknown,
+    ] = Field(default=None, description='workspace [x0, x1, y0, y1, z0, z1] in the base frame, or "unknown"')
+    contact_mm: Annotated[Millimetres | None, BeforeValidator(_unknown), Unknown] = Field(
+        default=None, description='height of the pad\'s surface in the base frame, or "unknown"'
+    )
+    pad_mm: Annotated[tuple[Millimetres, Millimetres], BeforeValidator(_tuple)] = Field(
+        default=(0.0, -400.0), description="the pad's centre in the base frame, mm"
+    )
+    pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="from the base's x axis to the pad's")
+    tool_rad: Annotated[tuple[Angle, Angle, Angle], BeforeValidator(_tuple)] = Field(
+        default=(0.0, 3.141592653589793, 0.0), description="rotation vector of the tool, pointing down, radians"
+    )
+    max_depth_mm: float = Field(default=6.0, gt=0, le=50, description="no press is deeper, mm")
+    clearance_mm: float = Field(default=10.0, ge=1, le=500, description="height above the surface between presses, mm")
+    travel_mm_s: float = Field(default=100.0, gt=0, le=500, description="speed between presses, mm/s")
+    press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
+    acceleration_mm_s2: float = Field(default=500.0, gt=0, le=3000, description="acceleration, mm/s^2")
+    max_force_n: float = Field(default=60.0, gt=0, le=250, description="force at which the arm is stopped, N")
 
 
 class Localizer(Section):

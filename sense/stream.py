@@ -41,13 +41,32 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
 class BlockWriter:
     """Appends rows to an open stream. Rows reach the file a full block at a time, or at `flush`."""
 
-    def __init__(self, file: BinaryIO, fibres: int) -> None:
+    def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:
+        """Append to `file`, which holds so many blocks and rows already."""
         self._file = file
         self._dtype = block_dtype(fibres)
         self._rows = self._dtype["rows"].shape[0]
         self._waiting = np.empty((0, 1 + fibres))
-        self._sequence = 0
-        self._first = 0
+        self._sequence = blocks
+        self._first = rows
+
+    @classmethod
+    def resume(cls, path: Path, fibres: int) -> tuple["BlockWriter", BinaryIO, Array]:
+        """Go on with a stream, its torn tail cut off.
+
+        Returns:
+            The writer, the open file it appends to, and the (R, 1 + C) rows that are there.
+
+        Raises:
+            InputError: as `read_blocks`.
+        """
+        rows, _ = read_blocks(path, fibres)
+        dtype = block_dtype(fibres)
+        file = path.open("r+b")
+        blocks = int(np.argmin(np.append(_sound(_blocks(file.read(), dtype)), False)))
+        file.seek(blocks * dtype.itemsize)
+        file.truncate()
+        return cls(file, fibres, blocks, len(rows)), file, rows
 
     def append(self, rows: Array) -> None:
         """Add (n, 1 + C) rows of time and volts."""
@@ -92,7 +111,7 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    blocks = np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
+    blocks = _blocks(content, dtype)
     sound = _sound(blocks)
     end = len(blocks) if sound.all() else int(np.argmin(sound))
     tail = content[end * dtype.itemsize :]
@@ -104,6 +123,11 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
     blocks = blocks[:end]
     kept = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
     return blocks["rows"][kept], bool(tail)
+
+
+def _blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """Whatever lies where whole blocks should, intact or not."""
+    return np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
 
 
 def _sound(blocks: NDArray[np.void]) -> NDArray[np.bool_]:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from design import Contact, Morphology, signals
+
 from ..settings import Rig
 
 Array = NDArray[np.float64]
@@ -74,36 +76,60 @@ def strain(signals: Array, indented: Array) -> Array:
     return own.reshape(-1, signals.shape[1])
 
 
-def answer(strained: Array, rate_hz: float, creep: float, hysteresis: float) -> Array:
-    """The part of the strain that shows: creeping, and overshooting as it goes down.
+class Answer:
+    """The part of the strain that shows: creeping, and overshooting as it goes down; may be asked bit by bit.
 
     Args:
-        strained: (R, C). creep: share that follows by `CREEP_S`. hysteresis: overshoot as a share of the strain lost.
-
-    Returns:
-        (R, C), settling at `strained` where that stays as it is.
+        rate_hz: readings a second. creep: share that follows by `CREEP_S`. hysteresis: overshoot as a share of the
+            strain lost.
     """
-    shown = (1 - creep) * strained
-    for time_constant in CREEP_S:
-        shown = shown + creep / len(CREEP_S) * follow(strained, rate_hz * time_constant)
-    unloading = np.maximum(-np.diff(strained, axis=0, prepend=strained[:1]), 0)
-    stay = np.exp(-1 / (rate_hz * OVERSHOOT_S))
-    return shown - hysteresis * np.asarray(lfilter([1.0], [1.0, -stay], unloading, axis=0))
+
+    def __init__(self, rate_hz: float, creep: float, hysteresis: float) -> None:
+        self._creep, self._hysteresis = creep, hysteresis
+        self._lags = [Lag(rate_hz * time_constant) for time_constant in CREEP_S]
+        self._stay = np.exp(-1 / (rate_hz * OVERSHOOT_S))
+        self._last: Array | None = None
+        self._overshoot: Array | None = None
+
+    def __call__(self, strained: Array) -> Array:
+        """(R, C) strain, going on from what was asked before, to (R, C), settling at it where it stays as it is."""
+        shown = (1 - self._creep) * strained
+        for lag in self._lags:
+            shown = shown + self._creep / len(self._lags) * lag(strained)
+        last = strained[:1] if self._last is None else self._last
+        unloading = np.maximum(-np.diff(strained, axis=0, prepend=last), 0)
+        before = np.zeros_like(last) if self._overshoot is None else self._overshoot
+        over, self._overshoot = lfilter([1.0], [1.0, -self._stay], unloading, axis=0, zi=before)
+        self._last = strained[-1:].copy()
+        return shown - self._hysteresis * over
 
 
-def follow(values: Array, steps: float) -> Array:
-    """A first-order lag with a time constant of `steps` rows, starting settled at the first of (R, C) `values`."""
-    stay = np.exp(-1 / steps)
-    settled, _ = lfilter([1 - stay], [1.0, -stay], values, axis=0, zi=stay * values[:1])
-    return np.asarray(settled)
+class Lag:
+    """A first-order lag with a time constant of `steps` rows, starting settled at the first of (R, C) values."""
+
+    def __init__(self, steps: float) -> None:
+        self._stay = np.exp(-1 / steps)
+        self._state: Array | None = None
+
+    def __call__(self, values: Array) -> Array:
+        before = self._stay * values[:1] if self._state is None else self._state
+        lagged, self._state = lfilter([1 - self._stay], [1.0, -self._stay], values, axis=0, zi=before)
+        return lagged
 
 
-def wander(readings: int, fibres: int, rate_hz: float, rng: np.random.Generator) -> Array:
-    """(R, C) of unit variance, correlated over `DRIFT_S`: an Ornstein-Uhlenbeck process from its own equilibrium."""
-    stay = np.exp(-1 / (rate_hz * DRIFT_S))
-    kicks = rng.standard_normal((readings, fibres)) * np.sqrt(1 - stay**2)
-    kicks[0] = rng.standard_normal(fibres)
-    return np.asarray(lfilter([1.0], [1.0, -stay], kicks, axis=0))
+class Wander:
+    """Rests of unit variance, correlated over `DRIFT_S`: an Ornstein-Uhlenbeck process from its own equilibrium."""
+
+    def __init__(self, fibres: int, rate_hz: float, rng: np.random.Generator) -> None:
+        self._stay = np.exp(-1 / (rate_hz * DRIFT_S))
+        self._rng = rng
+        self._state = self._stay * rng.standard_normal((1, fibres))
+
+    def __call__(self, readings: int) -> Array:
+        """The next (R, C)."""
+        kicks = self._rng.standard_normal((readings, self._state.shape[1])) * np.sqrt(1 - self._stay**2)
+        wandered, self._state = lfilter([1.0], [1.0, -self._stay], kicks, axis=0, zi=self._state)
+        return wandered
 
 
 def divider(rest_v: Array, change: Array) -> Array:
@@ -119,11 +145,53 @@ def digitised(volts: Array) -> Array:
 
 def read_pad(signals: Array, cycle: Cycle, rig: Rig, rng: np.random.Generator) -> Array:
     """(Q, C) signals of a plan of presses to (Q readings, C) volts as the ADC gives them."""
-    presses, fibres = signals.shape
-    rest_v = rng.uniform(*REST_V, fibres)
-    indented = indentation(cycle, rng.uniform(*DELAY_S, (presses, 2)))
-    shown = answer(strain(signals, indented), cycle.rate_hz, rig.creep, rig.hysteresis)
-    volts = divider(rest_v, GAUGE * rig.depth_mm / FULL_DEPTH_MM * shown)
-    volts += rig.drift_mv * 1e-3 * wander(len(volts), fibres, cycle.rate_hz, rng)
-    volts += rig.noise_mv * 1e-3 * rng.standard_normal(volts.shape)
-    return digitised(volts)
+    model = Divider(signals.shape[1], cycle.rate_hz, rig, rng)
+    indented = indentation(cycle, rng.uniform(*DELAY_S, (len(signals), 2)))
+    return model(rig.depth_mm / FULL_DEPTH_MM * strain(signals, indented))
+
+
+class Divider:
+    """The fibres of a simulated pad in their dividers, read by an ADC; may be asked bit by bit."""
+
+    def __init__(self, fibres: int, rate_hz: float, rig: Rig, rng: np.random.Generator) -> None:
+        self._rest_v = rng.uniform(*REST_V, fibres)
+        self._answer = Answer(rate_hz, rig.creep, rig.hysteresis)
+        self._wander = Wander(fibres, rate_hz, rng)
+        self._rig, self._rng = rig, rng
+
+    def __call__(self, strained: Array) -> Array:
+        """(R, C) strain, 1 for a signal of 1 at full depth, going on from what was asked before, to (R, C) volts."""
+        if not len(strained):
+            return strained
+        volts = divider(self._rest_v, GAUGE * self._answer(strained))
+        volts += self._rig.drift_mv * 1e-3 * self._wander(len(volts))
+        volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
+        return digitised(volts)
+
+
+class LivePad:
+    """A simulated pad that is asked what it gives for where the tip is; one physical model for every simulated rig.
+
+    Args:
+        pad: course of the fibres. contact: what a press deforms. rig: strengths of creep, noise and drift.
+        rate_hz: at which it is asked. rng: of rests, drift and noise.
+    """
+
+    def __init__(self, pad: Morphology, contact: Contact, rig: Rig, rate_hz: float, rng: np.random.Generator) -> None:
+        self._pad, self._contact = pad, contact
+        self._divider = Divider(2 * pad.grid, rate_hz, rig, rng)
+        self._known: dict[tuple[float, float], Array] = {}
+
+    def volts(self, places_mm: Array, depths_mm: Array) -> Array:
+        """(R, C) volts for tips at (R, 2) mm from the pad's centre, (R,) mm below its surface (above: less than 0)."""
+        strained = np.zeros((len(places_mm), 2 * self._pad.grid))
+        for row in np.flatnonzero(depths_mm > 0):
+            strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._signals(places_mm[row])
+        return self._divider(strained)
+
+    def _signals(self, place_mm: Array) -> Array:
+        """(C,) signals of a press at full depth; the tip of an arm at rest stays within hundredths of a millimetre."""
+        x, y = np.round(place_mm, 2).tolist()
+        if (x, y) not in self._known:
+            self._known = {(x, y): signals(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
+        return self._known[x, y]

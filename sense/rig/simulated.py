@@ -41,7 +41,7 @@ def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = 
         lifted=first + cycle.readings,
         source={
             "kind": "simulated",
-            "rig": rig.model_dump(),
+            "rig": rig.model_dump(mode="json"),
             "contact": (contact or Contact()).model_dump(),
             "morphology": {"pitch_mm": pad.pitch_mm, "knots": pad.knots.tolist()},
         },

@@ -88,7 +88,7 @@ def test_what_a_live_recorder_synced_can_be_read_before_it_ends(tmp_path: Path) 
         if i == 9:
             recorder.begin((1.5, -2.5), i + 1)
         if i == 19:
-            recorder.done(i + 1)
+            recorder.finish(i + 1)
             recorder.sync()
         if i == 25:
             recorder.begin((3.0, 4.0), i + 1)
@@ -159,7 +159,7 @@ def test_implausible_readings_in_the_stream_are_refused(tmp_path: Path) -> None:
     with Recorder(tmp_path / "run", 2, {}, {}) as recorder:
         recorder.append(np.arange(9.0), np.full((9, 2), 1e300))
         recorder.begin((0.0, 0.0), 3)
-        recorder.done(6)
+        recorder.finish(6)
     with pytest.raises(
         InputError, match=r"run: readings hold 1e\+300 V \(first in row 0\), allowed is -1000 to 1000 V"
     ):

@@ -150,7 +150,7 @@ def test_numbers_and_places_that_cannot_be_are_one_line(padforge_sense) -> None:
         (("locate", "--model", "model", "rec", "--out", "pad.toml/p.csv"), "pad.toml/p.csv: cannot be written"),
         (("locate", "--model", "model", "rec", "--out", "model"), "directory"),
         (("calibrate", "rec", "--out", "pad.toml/model"), "pad.toml is a file, expected a folder"),
-        (("calibrate", "pad.toml", "--out", "m"), "is a file"),
+        (("calibrate", "pad.toml", "--out", "m"), "pad.toml: no recording, expected a folder"),
         (("calibrate", "absent", "--out", "m"), "absent: no recording, expected a folder with start.json"),
         (("record", "--out", "pad.toml/rec"), "pad.toml is a file, expected a folder"),
         (("import", "rec", "--out", "r"), "is a directory"),

@@ -5,19 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design import Morphology, signals_quantized
+from design import Contact, Morphology, signals, signals_quantized
 from sense import Rig, simulate
 from sense.rig.pad_model import (
     ADC_STEPS,
     SUPPLY_V,
+    Answer,
     Cycle,
-    answer,
+    Lag,
+    LivePad,
+    Wander,
     digitised,
     divider,
-    follow,
     indentation,
     strain,
-    wander,
 )
 
 PAD = Morphology.straight(4)
@@ -61,7 +62,7 @@ def test_untouched_fibres_stay_within_noise() -> None:
 
 def one_press(creep: float, hysteresis: float) -> np.ndarray:
     indented = np.vstack([indentation(CYCLE, np.full((1, 2), 0.1)), np.zeros((9, 80))])
-    return answer(strain(np.vstack([[1.0], np.zeros((9, 1))]), indented), CYCLE.rate_hz, creep, hysteresis)[:, 0]
+    return Answer(CYCLE.rate_hz, creep, hysteresis)(strain(np.vstack([[1.0], np.zeros((9, 1))]), indented))[:, 0]
 
 
 def test_without_creep_and_hysteresis_the_answer_is_the_indentation() -> None:
@@ -98,7 +99,7 @@ def test_strain_of_a_press_reaches_into_the_next_cycle() -> None:
 
 @given(value=st.floats(-5, 5), steps=st.floats(0.5, 1e4))
 def test_a_lag_keeps_what_is_constant(value: float, steps: float) -> None:
-    assert np.allclose(follow(np.full((50, 2), value), steps), value)
+    assert np.allclose(Lag(steps)(np.full((50, 2), value)), value)
 
 
 @given(volts=st.floats(-1, 5))
@@ -116,6 +117,31 @@ def test_the_divider_rests_where_it_should_and_falls_with_resistance(rest: float
 
 
 def test_the_rest_wanders_slowly_about_its_place() -> None:
-    drift = wander(20_000, 200, 13.3, np.random.default_rng(0))
+    drift = Wander(200, 13.3, np.random.default_rng(0))(20_000)
     assert drift.std() == pytest.approx(1, rel=0.05)
     assert np.diff(drift, axis=0).std() == pytest.approx(np.sqrt(2 / (13.3 * 600)), rel=0.02)
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
+def test_asked_bit_by_bit_the_model_gives_the_same(pieces: list[int], seed: int) -> None:
+    strained = np.random.default_rng(seed).uniform(0, 2, (sum(pieces), 3))
+    whole = Answer(13.3, 0.2, 0.3)(strained)
+    model = Answer(13.3, 0.2, 0.3)
+    parts = np.split(strained, np.cumsum(pieces)[:-1])
+    assert np.allclose(np.vstack([model(part) for part in parts]), whole)
+    drift, again = (Wander(2, 13.3, np.random.default_rng(seed)) for _ in range(2))
+    assert np.allclose(np.vstack([drift(n) for n in pieces]), again(sum(pieces)))
+
+
+def test_the_live_pad_answers_where_and_as_deep_as_the_tip_presses() -> None:
+    quiet = Rig(noise_mv=0, drift_mv=0, creep=0, hysteresis=0)
+    pad = Morphology.straight(2)
+    model = LivePad(pad, Contact(), quiet, 1000.0, np.random.default_rng(0))
+    depths = np.repeat([-5.0, 0.0, 2.5, 5.0], 20)
+    volts = model.volts(np.tile([-5.0, 7.0], (80, 1)), depths)
+    rest, above, half, full = (volts[20 * i + 10] for i in range(4))
+    assert np.array_equal(rest, above)
+    touched = signals(pad, pad.to_grid([[-5.0, 7.0]]), Contact())[0] > 0
+    assert touched.any()
+    assert ((full < half) & (half < rest))[touched].all()
+    assert np.array_equal(full[~touched], rest[~touched])

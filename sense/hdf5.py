@@ -1,0 +1,73 @@
+"""Recordings as HDF5: an export made of a finished run directory, for other programs; never written to while recording.
+
+Datasets: `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `begun` and `lifted` (Q,), and of a recording with
+an arm `states` (S, 10) with its column names as an attribute; `source` is JSON text.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from design.errors import InputError
+from design.files import atomic
+
+from .output import writing
+from .recording import Recording
+
+FORMAT = "padforge-hdf5/1"
+
+_ARRAYS = {
+    "times_s": "times_s",
+    "readings_v": "readings",
+    "presses_mm": "presses_mm",
+    "begun": "begun",
+    "lifted": "lifted",
+}
+"""Names of the datasets and of what they hold of a `Recording`."""
+
+
+def export_hdf5(recording: Recording, path: str | Path) -> None:
+    """Write a recording as HDF5, atomically; importing it gives the same numbers.
+
+    Raises:
+        InputError: `path` cannot be written.
+    """
+    import h5py
+
+    path = Path(path)
+    with writing(path), atomic(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["source"] = json.dumps(dict(recording.source))
+        for name, attribute in _ARRAYS.items():
+            values = getattr(recording, attribute)
+            file.create_dataset(name, data=values, compression="gzip", shuffle=True, track_times=False)
+
+
+def import_hdf5(path: str | Path) -> Recording:
+    """Read a recording that `export_hdf5` wrote.
+
+    Raises:
+        InputError: the file is missing, torn, of another kind, or its datasets do not fit together.
+    """
+    import h5py
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}, expected an HDF5 file")
+    try:
+        with h5py.File(path, "r") as file:
+            kind = file.attrs.get("format")
+            if kind != FORMAT:
+                raise InputError(f"{path}: format is {kind!r}, expected {FORMAT!r}")
+            arrays: dict[str, Any] = {attribute: np.asarray(file[name]) for name, attribute in _ARRAYS.items()}
+            source = json.loads(str(file.attrs["source"]))
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a recording that can be read ({' '.join(str(error).split())})") from error
+    try:
+        return Recording(**arrays, source=source)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error

@@ -1,0 +1,185 @@
+"""The run directory that keeps a recording, written so that nothing finished is ever lost.
+
+It holds `start.json` (what was recorded, with what), `readings.bin` and, of a real or emulated arm, `states.bin`
+(streams, see `stream`), and `journal.ndjson`: one line as a press begins, with its place and the index of its first
+reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done, so
+after a kill every press the journal calls done can be used, and the others are repeated.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from design.errors import InputError
+from design.files import read_json, write_json
+
+from .journal import cut_torn_line, read_journal
+from .limits import MAX_FIBRES
+from .output import refuse_unwritable, writing
+from .rig.devices import STATE_COLUMNS
+from .stream import BlockWriter
+
+FORMAT = "padforge-recording/1"
+START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+
+
+class Recorder:
+    """Writes a run directory as it is recorded: append readings, begin a press, end it, `sync`.
+
+    Nothing is promised to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
+
+    Attributes:
+        done: numbers of the presses that are done.
+        readings: how many readings there are.
+        last_s: time of the last reading or state, s; -inf where there is none.
+
+    Raises:
+        InputError: `path` exists and is not an empty directory, or cannot be written.
+    """
+
+    def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
+        refuse_existing(path)
+        document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
+        with writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+            try:
+                self._stream: BinaryIO = (path / READINGS).open("xb")  # of two that start at once, one makes this file
+            except FileExistsError:
+                refuse_existing(path)
+                raise
+            write_json(path / START, document)
+            self._journal: TextIO = (path / JOURNAL).open("x", encoding="utf-8")
+        self._begin_with(path, BlockWriter(self._stream, fibres))
+
+    def _begin_with(self, path: Path, blocks: BlockWriter) -> None:
+        self._path = path
+        self._blocks = blocks
+        self._states: tuple[BlockWriter, BinaryIO] | None = None
+        self._lines: list[str] = []
+        self._press = 0
+        self._down = False
+        self.done: set[int] = set()
+        self.readings = 0
+        self.last_s = -np.inf
+
+    @classmethod
+    def resume(cls, path: Path) -> "Recorder":
+        """Go on with a run directory that was left unfinished; torn tails are cut off.
+
+        Raises:
+            InputError: no run directory, or damage elsewhere than at its end.
+        """
+        fibres = fibres_of(path)
+        done = read_journal(path / JOURNAL)
+        self = cls.__new__(cls)
+        with writing(path):
+            blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
+            cut_torn_line(path / JOURNAL)
+            self._journal = (path / JOURNAL).open("a", encoding="utf-8")
+            self._begin_with(path, blocks)
+            self._note_time(rows)
+            if (path / STATES).exists():
+                states, file, state_rows = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
+                self._states = (states, file)
+                self._note_time(state_rows)
+        self.done = {press for press, entry in done.items() if entry[3] <= len(rows)}
+        self._press = max(self.done, default=-1) + 1
+        self.readings = len(rows)
+        return self
+
+    def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
+        """Add (n,) times in s and (n, C) volts."""
+        rows = np.column_stack([np.asarray(times_s, dtype=np.float64), readings])
+        self._blocks.append(rows)
+        self._note_time(rows)
+        self.readings += len(rows)
+
+    def append_states(self, rows: NDArray[np.float64]) -> None:
+        """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
+        if self._states is None:
+            file = (self._path / STATES).open("xb")
+            self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
+        self._states[0].append(rows)
+        self._note_time(rows)
+
+    def _note_time(self, rows: NDArray[np.float64]) -> None:
+        if len(rows):
+            self.last_s = max(self.last_s, float(rows[-1, 0]))
+
+    def begin(self, place_mm: ArrayLike, reading: int, press: int | None = None, **more: Any) -> None:
+        """Note that the probe is sent down at `place_mm` (2,); `reading` is the index of the reading that follows.
+
+        Args:
+            press: its number, by default one more than that of the last.
+            more: what else is known of it, as JSON.
+        """
+        self._press, self._down = self._press if press is None else press, True
+        x, y = np.asarray(place_mm, dtype=np.float64).tolist()
+        self._note({"event": "begun", "press": self._press, "reading": reading, "x_mm": x, "y_mm": y, **more})
+
+    def finish(self, reading: int, **more: Any) -> None:
+        """Note that the probe is sent up; `reading` is the index of the reading that follows."""
+        self._note({"event": "done", "press": self._press, "reading": reading, **more})
+        self.done.add(self._press)
+        self._press, self._down = self._press + 1, False
+
+    def abort(self, reason: str) -> None:
+        """Note that the press that was begun, if any is, did not come to its end."""
+        if not self._down:
+            return
+        self._down = False
+        self._note({"event": "aborted", "press": self._press, "reading": self.readings, "reason": reason})
+
+    def _note(self, event: Mapping[str, Any]) -> None:
+        self._lines.append(json.dumps(event, allow_nan=False) + "\n")
+
+    def sync(self) -> None:
+        """Put all so far on the disk: the readings and states first, then what the journal says of them."""
+        self._blocks.flush()
+        os.fsync(self._stream.fileno())
+        if self._states is not None:
+            self._states[0].flush()
+            os.fsync(self._states[1].fileno())
+        self._journal.writelines(self._lines)
+        self._lines.clear()
+        self._journal.flush()
+        os.fsync(self._journal.fileno())
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.ExitStack() as files:
+            for file in (self._journal, self._stream, *(self._states or ())[1:]):
+                files.enter_context(file)
+            self.sync()
+
+
+def fibres_of(path: Path) -> int:
+    """The number of fibres a run directory was recorded of.
+
+    Raises:
+        InputError: no run directory, or one that does not say.
+    """
+    if not (path / START).is_file():
+        raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
+    fibres = read_json(path / START, FORMAT).get("fibres")
+    if type(fibres) is not int or not 1 <= fibres <= MAX_FIBRES:
+        raise InputError(f"{path / START}: fibres is {fibres!r}, allowed is 1 to {MAX_FIBRES}")
+    return fibres
+
+
+def refuse_existing(path: Path) -> None:
+    """Raise InputError if `path` is anything but absent or an empty directory, or cannot be written."""
+    refuse_unwritable(path)
+    if path.exists() and any(path.iterdir()):
+        raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")

@@ -1,0 +1,188 @@
+"""The press loop: an arm presses as planned while a converter reads, and a run directory keeps all of it.
+
+Nothing moves before the whole plan is found safe. Every wait reads, records and watches. On a fault the arm is
+stopped first, then what came so far is brought to the disk, then the fault is told.
+"""
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..recorder import Recorder
+from ..settings import Rig
+from .averaging import Averager
+from .devices import Arm, Converter, Pose, RigFault
+from .frame import Frame
+from .plan import PressPlan
+from .safety import POLL_S, Limits, require_safe, wait_until_still, watch
+
+Array = NDArray[np.float64]
+
+_SPARE_S = 3.0
+"""A move or a wait may take this much longer than it should."""
+_KEPT = 4096
+"""Readings whose times are remembered, to tell which came after a command."""
+
+Report = Callable[[int, int], None]
+"""Told after every press: how many are done, and how many there are."""
+
+
+class Session:
+    """One stretch of recording with one arm and one converter, both connected.
+
+    Args:
+        recorder: new or resumed; presses it has are not made again.
+        dry: press nothing: the arm stays above the pad all the time.
+        clock, sleep: for rigs whose time is not that of the wall.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        converter: Converter,
+        recorder: Recorder,
+        rig: Rig,
+        *,
+        dry: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._arm, self._converter, self._recorder, self._rig = arm, converter, recorder, rig
+        self._clock, self._sleep, self._dry = clock, sleep, dry
+        self._frame, self._limits = Frame.of(rig), Limits.of(rig)
+        ratio = max(1, round(rig.converter_rate_hz / rig.rate_hz))
+        self._half_s = rig.readings_per_press / 2 * ratio / rig.converter_rate_hz
+        self._averager = Averager(ratio, rig.channels)
+        self._recent: deque[float] = deque(maxlen=_KEPT)
+        # Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
+        self._zero_s = clock() - (recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0)
+
+    def require_safe(self, plan: PressPlan) -> None:
+        """Refuse a plan of which any pose or move is beyond the limits; raises RigFault("refused")."""
+        rig = self._rig
+        for place, depth in zip(plan.places_mm, plan.depths_mm.tolist(), strict=True):
+            require_safe(self._above(place), rig.travel_mm_s, rig.acceleration_mm_s2, self._limits)
+            require_safe(self._frame.pose(place, depth), rig.press_mm_s, rig.acceleration_mm_s2, self._limits)
+
+    def run(
+        self,
+        plan: PressPlan,
+        report: Report = lambda done, of: None,
+        steer: Callable[[PressPlan, int], PressPlan] = lambda plan, press: plan,
+    ) -> None:
+        """Make every press of the plan that the recorder does not have.
+
+        Args:
+            report: told of progress. steer: may move the presses from the next one on.
+
+        Raises:
+            RigFault: the plan is not safe, or the rig failed; the arm stands still and what is done is on the disk.
+        """
+        self.require_safe(plan)
+        with self._safely():
+            for press in range(len(plan)):
+                if press not in self._recorder.done:
+                    if (steered := steer(plan, press)) is not plan:
+                        self.require_safe(steered)
+                        plan = steered
+                    self._press(press, plan.places_mm[press], float(plan.depths_mm[press]))
+                    report(len(self._recorder.done), len(plan))
+            self._until(lambda: False, self._half_s, patient=True)  # the release after the last press
+            self._recorder.sync()
+
+    def _press(self, press: int, place_mm: Array, depth_mm: float) -> None:
+        above = self._above(place_mm)
+        began = self._clock()
+        self._arm.move(above, self._rig.travel_mm_s, self._rig.acceleration_mm_s2)
+        self._still()
+        self._until(lambda: False, began + self._half_s - self._clock(), patient=True)
+        down_s = self._clock()
+        target = self._frame.pose(place_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
+        self._arm.move(target, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
+        self._until(lambda: self._after(down_s) is not None, _SPARE_S)
+        self._recorder.begin(place_mm, self._reading(down_s), press, depth_mm=depth_mm)
+        self._recorder.sync()
+        self._still()
+        self._until(lambda: False, down_s + self._half_s - self._clock(), patient=True)
+        tip, depths = self._frame.tip(np.array([self._arm.state().pose]))
+        up_s = self._clock()
+        self._arm.move(above, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
+        self._until(lambda: self._after(up_s) is not None, _SPARE_S)
+        reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.lost}
+        self._recorder.finish(self._reading(up_s), **reached)
+        self._recorder.sync()
+        self._still()
+
+    def _above(self, place_mm: Array) -> Pose:
+        return self._frame.pose(place_mm, -self._rig.clearance_mm)
+
+    def _still(self) -> None:
+        wait_until_still(self._arm, self._limits, self._clock, self._sleep, self._pump)
+
+    def _until(self, done: Callable[[], bool], within_s: float, patient: bool = False) -> None:
+        """Read, record and watch until `done`; a `patient` wait ends with its time, any other fails then."""
+        deadline = self._clock() + within_s
+        while True:
+            self._pump()
+            if done():
+                return
+            if self._clock() >= deadline:
+                if patient:
+                    return
+                raise RigFault("deadline", f"the rig did not finish a step within {within_s:.1f} s", "look at the arm")
+            self._sleep(POLL_S)
+
+    def _pump(self) -> None:
+        """Take what the devices have, keep it, and see that all is well."""
+        times_s, volts = self._averager.feed(self._converter.read())
+        if len(times_s):
+            self._recorder.append(times_s - self._zero_s, volts)
+            self._recent.extend(times_s.tolist())
+        states = self._arm.drain()
+        if len(states):
+            self._recorder.append_states(states - np.eye(1, states.shape[1]) * self._zero_s)
+        watch(self._arm.state(), self._limits, self._clock())
+
+    def _after(self, moment_s: float) -> int | None:
+        """How many of the recent readings came after a moment; None before the first."""
+        count = 0
+        for reading_s in reversed(self._recent):
+            if reading_s <= moment_s:
+                break
+            count += 1
+        return count or None
+
+    def _reading(self, moment_s: float) -> int:
+        """Index of the first reading after a moment."""
+        return self._recorder.readings - (self._after(moment_s) or 0)
+
+    @contextlib.contextmanager
+    def _safely(self) -> Iterator[None]:
+        """On any failure: stop the arm, retract it where that is safe, keep the data, then tell."""
+        try:
+            yield
+        except BaseException as error:
+            with contextlib.suppress(Exception):
+                self._arm.stop()
+            with contextlib.suppress(Exception):
+                self._recorder.abort(str(error) or type(error).__name__)
+                self._recorder.sync()
+            with contextlib.suppress(Exception):
+                self._retract()
+            if isinstance(error, OSError):
+                raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
+            raise
+
+    def _retract(self) -> None:
+        """Lift the tool straight up to its travelling height, unless the controller or a person stopped the arm."""
+        state = self._arm.state()
+        raised = self._limits.contact_mm + self._rig.clearance_mm if self._limits.contact_mm is not None else None
+        if state.protective_stop or state.emergency_stop or raised is None or state.pose[2] >= raised:
+            return
+        up: Pose = (*state.pose[:2], raised, *state.pose[3:])
+        require_safe(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2, self._limits)
+        self._arm.move(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2)

@@ -1,0 +1,107 @@
+"""Whatever is left of a run directory, it goes on from there: no finished press lost, nothing else taken for one."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from design.errors import InputError
+from sense.journal import read_journal
+from sense.recorder import JOURNAL, READINGS, STATES, Recorder
+from sense.recording import Recording
+from sense.stream import block_dtype
+
+FIBRES = 3
+
+
+def record(recorder: Recorder, presses: range, time_s: float) -> float:
+    """Twenty readings a press at 10 Hz, and as many states."""
+    for press in presses:
+        times = time_s + np.arange(20) / 10
+        recorder.append(times[:10], np.full((10, FIBRES), press + 0.25))
+        recorder.append_states(np.column_stack([times[:10], np.full((10, 9), float(press))]))
+        recorder.begin((press, -press), recorder.readings, press)
+        recorder.append(times[10:], np.full((10, FIBRES), press + 0.5))
+        recorder.finish(recorder.readings)
+        recorder.sync()
+        time_s += 2
+    return time_s
+
+
+def made(folder, presses=5):
+    with Recorder(folder / "run", FIBRES, {"kind": "made"}, {}) as recorder:
+        record(recorder, range(presses), 0.0)
+    return folder / "run"
+
+
+def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
+    path = made(tmp_path)
+    before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
+    with Recorder.resume(path) as recorder:
+        assert recorder.done == set(range(5))
+        assert recorder.readings == 100
+        assert recorder.last_s == pytest.approx(9.9)
+    assert {name: (path / name).read_bytes() for name in before} == before
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_kill_at_any_byte_loses_no_finished_press(tmp_path_factory, data):
+    """Files grow in the order readings, states, journal; a kill leaves any prefix of what came after the last sync."""
+    path = made(tmp_path_factory.mktemp("killed"))
+    whole = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
+    lines = whole[JOURNAL].splitlines(keepends=True)
+    finished = data.draw(st.integers(0, 4))
+    synced = {JOURNAL: sum(map(len, lines[: 2 * finished]))}
+    for name, columns, rows in ((READINGS, FIBRES, 20), (STATES, 9, 10)):
+        dtype = block_dtype(columns)
+        blocks = np.frombuffer(whole[name], dtype)
+        kept = int(np.searchsorted(np.cumsum(blocks["count"]), rows * finished, side="right")) if finished else 0
+        synced[name] = kept * dtype.itemsize
+    for name, content in whole.items():
+        cut = data.draw(st.integers(synced[name], len(content)))
+        (path / name).write_bytes(content[: cut if name != JOURNAL else min(cut, synced[name] + 40)])
+    with Recorder.resume(path) as recorder:
+        assert recorder.done >= set(range(finished))
+        assert len(recorder.done) <= finished + 1
+        left = [press for press in range(5) if press not in recorder.done]
+        for press in left:
+            record(recorder, range(press, press + 1), max(recorder.last_s, 0.0) + 1)
+    recording = Recording.open(path)
+    assert recording.presses_mm.tolist() == [[press, -press] for press in range(5)]
+    for press, (begun, lifted) in enumerate(zip(recording.begun, recording.lifted, strict=True)):
+        assert (recording.readings[begun:lifted] == press + 0.5).all()
+    assert (np.diff(recording.times_s) > 0).all()
+
+
+def test_an_aborted_press_is_made_again(tmp_path):
+    with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+        time_s = record(recorder, range(2), 0.0)
+        recorder.append([time_s], np.zeros((1, FIBRES)))
+        recorder.begin((2, -2), recorder.readings, 2)
+        recorder.abort("the arm was stopped")
+        recorder.abort("told twice")
+    events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
+    assert events[-2:] == ["begun", "aborted"]
+    assert set(read_journal(tmp_path / "run" / JOURNAL)) == {0, 1}
+    with Recorder.resume(tmp_path / "run") as recorder:
+        record(recorder, range(2, 4), time_s + 1)
+    assert len(Recording.open(tmp_path / "run").presses_mm) == 4
+
+
+@pytest.mark.parametrize("name", [READINGS, JOURNAL])
+def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
+    path = made(tmp_path)
+    content = bytearray((path / name).read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    (path / name).write_bytes(bytes(content))
+    with pytest.raises(InputError, match=name):
+        Recorder.resume(path)
+    assert (path / name).read_bytes() == bytes(content)
+
+
+def test_no_recording_to_resume(tmp_path):
+    with pytest.raises(InputError, match="no recording"):
+        Recorder.resume(tmp_path)
