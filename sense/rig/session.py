@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 _SPARE_S = 3.0
 """A move or a wait may take this much longer than it should."""
+_SETTLE_S = 0.1
 _KEPT = 4096
 """Readings whose times are remembered, to tell which came after a command."""
 
@@ -84,6 +85,7 @@ class Session:
         """
         self.require_safe(plan)
         with self._safely():
+            self._lift()  # the tool may stand anywhere in the box, even on the pad
             for press in range(len(plan)):
                 if press not in self._recorder.done:
                     if (steered := steer(plan, press)) is not plan:
@@ -97,12 +99,12 @@ class Session:
     def _press(self, press: int, place_mm: Array, depth_mm: float) -> None:
         above = self._above(place_mm)
         began = self._clock()
-        self._arm.move(above, self._rig.travel_mm_s, self._rig.acceleration_mm_s2)
+        self._move(above, self._rig.travel_mm_s)
         self._still()
         self._until(lambda: False, began + self._half_s - self._clock(), patient=True)
         down_s = self._clock()
         target = self._frame.pose(place_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
-        self._arm.move(target, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
+        self._move(target, self._rig.press_mm_s)
         self._until(lambda: self._after(down_s) is not None, _SPARE_S)
         self._recorder.begin(place_mm, self._reading(down_s), press, depth_mm=depth_mm)
         self._recorder.sync()
@@ -110,7 +112,7 @@ class Session:
         self._until(lambda: False, down_s + self._half_s - self._clock(), patient=True)
         tip, depths = self._frame.tip(np.array([self._arm.state().pose]))
         up_s = self._clock()
-        self._arm.move(above, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
+        self._move(above, self._rig.press_mm_s)
         self._until(lambda: self._after(up_s) is not None, _SPARE_S)
         reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.lost}
         self._recorder.finish(self._reading(up_s), **reached)
@@ -119,6 +121,15 @@ class Session:
 
     def _above(self, place_mm: Array) -> Pose:
         return self._frame.pose(place_mm, -self._rig.clearance_mm)
+
+    def _move(self, pose: Pose, speed_mm_s: float) -> None:
+        watch(self._arm.state(), self._limits, self._clock())
+        try:
+            self._arm.move(pose, speed_mm_s, self._rig.acceleration_mm_s2)
+        except RigFault:
+            self._sleep(_SETTLE_S)  # the next state tells why, where the arm was stopped a moment ago
+            watch(self._arm.state(), self._limits, self._clock())
+            raise
 
     def _still(self) -> None:
         wait_until_still(self._arm, self._limits, self._clock, self._sleep, self._pump)
@@ -172,17 +183,25 @@ class Session:
                 self._recorder.abort(str(error) or type(error).__name__)
                 self._recorder.sync()
             with contextlib.suppress(Exception):
-                self._retract()
+                self._lift()
             if isinstance(error, OSError):
                 raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
             raise
 
-    def _retract(self) -> None:
-        """Lift the tool straight up to its travelling height, unless the controller or a person stopped the arm."""
+    def _lift(self) -> None:
+        """Lift the tool straight up to its travelling height, unless the controller or a person stopped the arm.
+
+        Raises:
+            RigFault: the tool is outside the box, or something else is amiss.
+        """
         state = self._arm.state()
-        raised = self._limits.contact_mm + self._rig.clearance_mm if self._limits.contact_mm is not None else None
-        if state.protective_stop or state.emergency_stop or raised is None or state.pose[2] >= raised:
-            return
-        up: Pose = (*state.pose[:2], raised, *state.pose[3:])
+        watch(state, self._limits, self._clock())
+        raised = self._frame.contact_mm + self._rig.clearance_mm
+        if any(not low <= x <= high for x, (low, high) in zip(state.pose, self._limits.box_mm, strict=False)):
+            at = ", ".join(f"{x:.1f}" for x in state.pose[:3])
+            raise RigFault("refused", f"the tool stands at {at} mm, outside the box", "move it there by hand")
+        up: Pose = (*state.pose[:2], max(raised, state.pose[2]), *state.pose[3:])
         require_safe(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2, self._limits)
-        self._arm.move(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
+        if up != state.pose:
+            self._arm.move(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
+            wait_until_still(self._arm, self._limits, self._clock, self._sleep)

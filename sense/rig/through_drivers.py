@@ -29,7 +29,8 @@ def emulated(pad: Morphology, contact: Contact, rig: Rig) -> Iterator[tuple[UR5,
     """
     frame = Frame.of(rig)
     model = LivePad(pad, contact, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
-    with UrEmulator(surface_mm=rig.contact_mm) as robot:
+    start = frame.pose(np.zeros(2), -2 * rig.clearance_mm)
+    with UrEmulator(pose=start, surface_mm=rig.contact_mm) as robot:
 
         def volts(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
             return model.volts(*frame.tip(robot.pose_at(times_s)))

@@ -76,6 +76,21 @@ def test_nothing_moves_before_all_of_the_plan_is_safe(tmp_path, change, cause):
     assert arm.moves == []
 
 
+def test_an_arm_outside_its_box_is_not_moved(tmp_path):
+    arm, converter, options = rig(tmp_path)
+    arm.pose = (150.0, -400.0, 100.0, *arm.pose[3:])
+    with pytest.raises(RigFault, match=r"stands at 150\.0, -400\.0, 100\.0 mm, outside the box"):
+        run(tmp_path, arm, converter, options)
+    assert arm.moves == []
+
+
+def test_a_tool_left_on_the_pad_is_lifted_first(tmp_path):
+    arm, converter, options = rig(tmp_path)
+    arm.pose = (5.0, -395.0, 46.0, *arm.pose[3:])
+    run(tmp_path, arm, converter, options)
+    assert arm.moves[0][:3] == (5.0, -395.0, 60.0)
+
+
 def broken_at(moment_s, what):
     def hook(arm):
         if arm.time() > 100 + moment_s:
