@@ -1,7 +1,7 @@
 """Recordings as HDF5: an export made of a finished run directory, for other programs; never written to while recording.
 
-Datasets: `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `begun` and `lifted` (Q,), and of a recording with
-an arm `states` (S, 10) with its column names as an attribute; `source` is JSON text.
+Datasets: `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `begun` and `lifted` (Q,); the attribute `source` is
+JSON text. The states of an arm stay in the run directory.
 """
 
 import json

@@ -35,10 +35,12 @@ def read_journal(path: Path) -> dict[int, tuple[float, float, int, int]]:
             press, reading = _whole(event, "press"), _whole(event, "reading")
             if event.get("event") == "begun":
                 begun[press] = (_place(event, "x_mm"), _place(event, "y_mm"), reading)
+                done.pop(press, None)
             elif event.get("event") == "done" and press in begun:
                 done[press] = reading
             elif event.get("event") == "aborted" and press in begun:
                 del begun[press]
+                done.pop(press, None)
             else:
                 raise ValueError(f"event {shortened(event.get('event'))} of press {press}")
         except (ValueError, RecursionError) as error:

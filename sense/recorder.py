@@ -26,6 +26,11 @@ from .output import refuse_unwritable, writing
 from .rig.devices import STATE_COLUMNS
 from .stream import BlockWriter
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 FORMAT = "padforge-recording/1"
 START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
 
@@ -56,6 +61,7 @@ class Recorder:
                 raise
             write_json(path / START, document)
             self._journal: TextIO = (path / JOURNAL).open("x", encoding="utf-8")
+            _lock(self._journal, path)
         self._begin_with(path, BlockWriter(self._stream, fibres))
 
     def _begin_with(self, path: Path, blocks: BlockWriter) -> None:
@@ -80,9 +86,14 @@ class Recorder:
         done = read_journal(path / JOURNAL)
         self = cls.__new__(cls)
         with writing(path):
-            blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
-            cut_torn_line(path / JOURNAL)
             self._journal = (path / JOURNAL).open("a", encoding="utf-8")
+            try:
+                _lock(self._journal, path)
+                blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
+            except InputError:
+                self._journal.close()
+                raise
+            cut_torn_line(path / JOURNAL)
             self._begin_with(path, blocks)
             self._note_time(rows)
             if (path / STATES).exists():
@@ -90,8 +101,13 @@ class Recorder:
                 self._states = (states, file)
                 self._note_time(state_rows)
         self.done = {press for press, entry in done.items() if entry[3] <= len(rows)}
-        self._press = max(self.done, default=-1) + 1
         self.readings = len(rows)
+        for press in sorted(set(done) - self.done):  # or they would count again as soon as enough rows follow
+            self._note(
+                {"event": "aborted", "press": press, "reading": len(rows), "reason": "its readings were torn off"}
+            )
+        self.sync()
+        self._press = max(self.done, default=-1) + 1
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
@@ -161,7 +177,18 @@ class Recorder:
         with contextlib.ExitStack() as files:
             for file in (self._journal, self._stream, *(self._states or ())[1:]):
                 files.enter_context(file)
-            self.sync()
+            with contextlib.suppress(*([OSError] if kind else [])):  # the error under way tells more
+                self.sync()
+
+
+def _lock(file: TextIO, path: Path) -> None:
+    """Keep other recorders off a run directory until the file is closed, where the system has such locks."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise InputError(f"{path}: another program is recording into it") from error
 
 
 def fibres_of(path: Path) -> int:

@@ -1,14 +1,16 @@
 """`padforge sense record` and `doctor`: the edge where rigs come in."""
 
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from design.console import json_option, load_spec, progress, seed_option, show_result, spec_option
+
+from .orders import Order, plan_of, recorder_of
 
 if TYPE_CHECKING:
     from design.morphology import Morphology
@@ -26,18 +28,6 @@ rig_option = click.option("--rig", type=click.Choice(["simulated", "ur5"]), defa
 drivers_option = click.option(
     "--through-drivers", is_flag=True, help="The simulated rig in real time, through the drivers of the real one."
 )
-
-
-@dataclass(frozen=True)
-class Order:
-    """What is to be recorded: the pad, settings and plan, and where they came from."""
-
-    pad: "Morphology"
-    rig: "Rig"
-    spec: "Spec"
-    out: Path
-    command: str
-    inputs: Sequence[Path]
 
 
 @click.command()
@@ -93,7 +83,10 @@ def record(
         click.echo(describe(run_recording(settings, pad, out, overrides, inputs), out))
         return
     options = settings.section(Rig, **overrides)
-    order = Order(pad, options, settings, out, f"padforge sense record --rig {rig}", inputs)
+    command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
+    order = Order(pad, options, settings, out, command, inputs)
+    for ending in (signal.SIGTERM, signal.SIGHUP):  # an end that stops the arm and keeps the data, as Ctrl-C is
+        signal.signal(ending, signal.default_int_handler)
     with _devices(rig, order) as (arm, converter, chosen):
         recording = _run(order, chosen, arm, converter, plan, model, dry=dry_run, resume=resume)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else describe(recording, out))
@@ -172,77 +165,27 @@ def _run(
     """Record, or go through the plan without touching the pad."""
     import tempfile
 
+    from ..recorder import refuse_existing
     from ..recording import Recording
+    from .session import Session, require_safe_plan
 
+    plan = plan_of(order, rig, plan_file, resume)
+    steer = _steering(order, rig, model)
+    require_safe_plan(plan, rig)
+    if not (resume or dry):
+        refuse_existing(order.out)
+    converter.connect()  # a board in use is refused before the arm's program is ended
+    arm.connect()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "dry" if dry else order.out
-        plan = _plan(order, rig, plan_file, resume)
-        with _recorder(order, rig, plan, folder, resume) as recorder:
-            _session(order, rig, arm, converter, recorder, plan, model, folder, dry=dry)
+        with recorder_of(order, rig, plan, folder, resume) as recorder, progress() as bar:
+            task = bar.add_task("presses", total=len(plan), completed=len(recorder.done), note="")
+            session = Session(arm, converter, recorder, rig, dry=dry)
+            session.run(plan, lambda done, of: bar.update(task, completed=done), steer)
         return None if dry else Recording.open(folder)
 
 
-def _plan(order: Order, rig: "Rig", plan_file: Path | None, resume: bool) -> "PressPlan":
-    """The plan of a resumed recording, of a file, or of the settings."""
-    import numpy as np
-
-    from design.errors import InputError
-    from design.files import read_json
-
-    from ..recorder import FORMAT, START
-    from .plan import PressPlan, planned, read_plan
-
-    if resume and (order.out / START).exists():
-        kept = read_json(order.out / START, FORMAT).get("source", {}).get("plan", {}).get("presses")
-        if kept is None:
-            raise InputError(f"{order.out}: has no plan, so that it cannot be resumed")
-        return PressPlan.of(kept)
-    if plan_file is not None:
-        return read_plan(plan_file, rig.depth_mm)
-    return planned(order.pad, rig, np.random.default_rng(rig.seed))
-
-
-def _recorder(order: Order, rig: "Rig", plan: "PressPlan", folder: Path, resume: bool) -> Any:
-    from design.files import provenance
-
-    from ..recorder import START, Recorder
-    from .plan import describe as describe_plan
-
-    if resume and (folder / START).exists():
-        return Recorder.resume(folder)
-    source = {
-        "kind": "rig",
-        "rig": rig.model_dump(mode="json"),
-        "morphology": {"pitch_mm": order.pad.pitch_mm, "knots": order.pad.knots.tolist()},
-        "plan": describe_plan(plan),
-    }
-    return Recorder(folder, rig.channels, source, provenance(order.command, rig.seed, order.inputs))
-
-
-def _session(
-    order: Order,
-    rig: "Rig",
-    arm: "Arm",
-    converter: "Converter",
-    recorder: Any,
-    plan: "PressPlan",
-    model: Path | None,
-    folder: Path,
-    *,
-    dry: bool,
-) -> None:
-    from .session import Session
-
-    session = Session(arm, converter, recorder, rig, dry=dry)
-    session.require_safe(plan)  # before anything is connected
-    arm.connect()
-    converter.connect()
-    with progress() as bar:
-        task = bar.add_task("presses", total=len(plan), completed=len(recorder.done), note="")
-        session.run(plan, lambda done, of: bar.update(task, completed=done), _steering(rig, model, folder))
-
-
-def _steering(rig: "Rig", model: Path | None, folder: Path) -> Callable[["PressPlan", int], "PressPlan"]:
+def _steering(order: Order, rig: "Rig", model: Path | None) -> Callable[["PressPlan", int], "PressPlan"]:
     if rig.plan != "adaptive":
         return lambda plan, press: plan
     import numpy as np
@@ -254,7 +197,7 @@ def _steering(rig: "Rig", model: Path | None, folder: Path) -> Callable[["PressP
 
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
-    return Steering(Localizer.load(model), folder, np.random.default_rng(rig.seed))
+    return Steering(Localizer.load(model), order.out, np.random.default_rng(rig.seed))
 
 
 @click.command()

@@ -107,6 +107,8 @@ def read_plan(path: Path, depth_mm: float) -> PressPlan:
         raise InputError(f"{path}: header is {','.join(names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=2):
+        if not line:
+            continue
         try:
             values = [float(cell) for cell in line]
         except ValueError as error:

@@ -62,13 +62,6 @@ class Session:
         # Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
         self._zero_s = clock() - (recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0)
 
-    def require_safe(self, plan: PressPlan) -> None:
-        """Refuse a plan of which any pose or move is beyond the limits; raises RigFault("refused")."""
-        rig = self._rig
-        for place, depth in zip(plan.places_mm, plan.depths_mm.tolist(), strict=True):
-            require_safe(self._above(place), rig.travel_mm_s, rig.acceleration_mm_s2, self._limits)
-            require_safe(self._frame.pose(place, depth), rig.press_mm_s, rig.acceleration_mm_s2, self._limits)
-
     def run(
         self,
         plan: PressPlan,
@@ -83,13 +76,13 @@ class Session:
         Raises:
             RigFault: the plan is not safe, or the rig failed; the arm stands still and what is done is on the disk.
         """
-        self.require_safe(plan)
+        require_safe_plan(plan, self._rig)
         with self._safely():
             self._lift()  # the tool may stand anywhere in the box, even on the pad
             for press in range(len(plan)):
                 if press not in self._recorder.done:
                     if (steered := steer(plan, press)) is not plan:
-                        self.require_safe(steered)
+                        require_safe_plan(steered, self._rig)
                         plan = steered
                     self._press(press, plan.places_mm[press], float(plan.depths_mm[press]))
                     report(len(self._recorder.done), len(plan))
@@ -205,3 +198,11 @@ class Session:
         if up != state.pose:
             self._arm.move(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
             wait_until_still(self._arm, self._limits, self._clock, self._sleep)
+
+
+def require_safe_plan(plan: PressPlan, rig: Rig) -> None:
+    """Refuse a plan of which any pose or move is beyond the limits of `[rig]`; raises RigFault("refused")."""
+    frame, limits = Frame.of(rig), Limits.of(rig)
+    for place, depth in zip(plan.places_mm, plan.depths_mm.tolist(), strict=True):
+        require_safe(frame.pose(place, -rig.clearance_mm), rig.travel_mm_s, rig.acceleration_mm_s2, limits)
+        require_safe(frame.pose(place, depth), rig.press_mm_s, rig.acceleration_mm_s2, limits)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from design import Contact, Morphology
+from design import Contact, Morphology, signals
 
 from ..settings import Rig
 from .arduino import Arduino
@@ -29,6 +29,7 @@ def emulated(pad: Morphology, contact: Contact, rig: Rig) -> Iterator[tuple[UR5,
     """
     frame = Frame.of(rig)
     model = LivePad(pad, contact, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
+    signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     start = frame.pose(np.zeros(2), -2 * rig.clearance_mm)
     with UrEmulator(pose=start, surface_mm=rig.contact_mm) as robot:
 

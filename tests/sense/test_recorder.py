@@ -105,3 +105,43 @@ def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
 def test_no_recording_to_resume(tmp_path):
     with pytest.raises(InputError, match="no recording"):
         Recorder.resume(tmp_path)
+
+
+def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
+    """The journal says they are done; once other readings fill the gap, it must not say so any more."""
+    path = made(tmp_path)
+    content = (path / READINGS).read_bytes()
+    (path / READINGS).write_bytes(content[: len(content) // 2])
+    with Recorder.resume(path) as recorder:
+        kept = set(recorder.done)
+        assert kept < set(range(5))
+        times = recorder.last_s + 1 + np.arange(100) / 10
+        recorder.append(times, np.zeros((100, FIBRES)))
+    with Recorder.resume(path) as recorder:
+        assert recorder.done == kept
+        recorder.begin((9, 9), recorder.readings, max(kept) + 1)
+        recorder.abort("broken off")
+    assert set(read_journal(path / JOURNAL)) == kept
+    assert len(Recording.open(path).presses_mm) == len(kept)
+
+
+def test_two_programs_cannot_record_into_one_folder(tmp_path):
+    path = made(tmp_path)
+    with Recorder.resume(path):
+        before = (path / READINGS).read_bytes()
+        with pytest.raises(InputError, match="another program is recording"):
+            Recorder.resume(path)
+        assert (path / READINGS).read_bytes() == before
+
+
+def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    def broken():
+        with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+            recorder.sync = full
+            raise RuntimeError("the first thing")
+
+    with pytest.raises(RuntimeError, match="the first thing"):
+        broken()
