@@ -70,6 +70,7 @@ def record(
     from design.errors import InputError
     from design.settings import Pad
 
+    from ..recorder import START
     from ..settings import Rig
 
     settings = load_spec(spec)
@@ -85,8 +86,12 @@ def record(
     options = settings.section(Rig, **overrides)
     command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
     order = Order(pad, options, settings, out, command, inputs)
-    for ending in (signal.SIGTERM, signal.SIGHUP):  # an end that stops the arm and keeps the data, as Ctrl-C is
-        signal.signal(ending, signal.default_int_handler)
+    for ending in {"SIGTERM", "SIGHUP"} & set(
+        dir(signal)
+    ):  # an end that stops the arm and keeps the data, as Ctrl-C is
+        signal.signal(getattr(signal, ending), signal.default_int_handler)
+    if resume and not (out / START).exists():
+        click.echo(f"{out}: nothing to resume, a new recording begins", err=True)
     with _devices(rig, order) as (arm, converter, chosen):
         recording = _run(order, chosen, arm, converter, plan, model, dry=dry_run, resume=resume)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else describe(recording, out))

@@ -1,6 +1,14 @@
 import numpy as np
 
-from sense.rig.adaptive import uncertainty
+from sense.calibration import calibrate
+from sense.recorder import Recorder
+from sense.recording import Recording
+from sense.rig.adaptive import EVERY, Steering, uncertainty
+from sense.rig.plan import PressPlan, planned
+from sense.rig.session import Session
+from sense.settings import Localizer as LocalizerSettings
+
+from .fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 
 def test_presses_go_where_errors_are_large_and_nothing_was_pressed():
@@ -19,3 +27,26 @@ def test_a_place_just_chosen_is_not_chosen_again():
     again = uncertainty(candidates, known, errors, np.vstack([known, candidates[:1]]))
     assert first[0] == first[1]
     assert again[0] == 0 < again[1]
+
+
+def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
+    """Two presses in three of those chosen lie in the half of the pad the localizer never saw."""
+    time = Time()
+    arm = FakeArm(time)
+    options = RIG.model_copy(update={"presses": 60, "plan": "adaptive"})
+    plan = planned(PAD, options, np.random.default_rng(3))
+    learnt = planned(PAD, options, np.random.default_rng(4))
+    known = PressPlan(np.column_stack([-np.abs(learnt.places_mm[:, 0]), learnt.places_mm[:, 1]]), learnt.depths_mm)
+    converter = FakeConverter(arm)
+    with Recorder(tmp_path / "known", RIG.channels, {}, {}) as recorder:
+        Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(known)
+    small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=60, lost=0)
+    localizer, _ = calibrate(Recording.open(tmp_path / "known"), small)
+    with Recorder(tmp_path / "run", RIG.channels, {}, {}) as recorder:
+        steering = Steering(localizer, tmp_path / "run", np.random.default_rng(5))
+        Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(plan, steer=steering)
+    made = Recording.open(tmp_path / "run").presses_mm
+    assert np.array_equal(made[:EVERY], plan.places_mm[:EVERY])
+    assert not np.array_equal(made[EVERY:], plan.places_mm[EVERY:])
+    assert np.abs(made).max() <= np.abs(plan.places_mm).max()
+    assert (made[EVERY:, 0] > 0).mean() > 2 / 3
