@@ -18,6 +18,7 @@ from design.published import load_mat
 from .limits import MAX_FIBRES
 from .output import writing
 from .recording import Recording
+from .tables import read_csv
 
 READINGS_PER_PRESS = 40
 """Length of the published cycle of a press, readings."""
@@ -87,14 +88,7 @@ def import_csv(path: str | Path) -> Recording:
 
 def _read_table(path: Path) -> Array:
     """The numbers of a CSV with the expected header; an empty cell is NaN."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *lines = list(csv.reader(file)) or [[]]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not a CSV file ({error})") from error
-    names = [name.strip() for name in header]
+    names, lines = read_csv(path)
     if names[:1] != ["time_s"] or names[-2:] != ["x_mm", "y_mm"] or not 4 <= len(names) <= 3 + MAX_FIBRES:
         found = ",".join(names)[:60] or "nothing"
         hint = "; values are separated by commas, not by semicolons" if ";" in found else ""

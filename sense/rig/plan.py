@@ -1,7 +1,6 @@
 """Press plans as data: where, how deep and how long the probe presses, in the order it does."""
 
-import csv
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from design.morphology import Morphology
 
 from ..limits import MAX_MM, numbers, refuse_beyond
 from ..settings import Rig
+from ..tables import read_csv
 
 Array = NDArray[np.float64]
 
@@ -64,10 +64,6 @@ class PressPlan:
             raise InputError(f"plan has shape {table.shape}, expected (Q, 3): {', '.join(COLUMNS)}")
         return cls(table[:, :2], table[:, 2])
 
-    def with_depth(self, depth_mm: float) -> "PressPlan":
-        """The same places, all pressed to one depth."""
-        return replace(self, depths_mm=np.full(len(self), depth_mm))
-
 
 def planned(pad: Morphology, rig: Rig, rng: np.random.Generator) -> PressPlan:
     """The plan that `[rig]` asks for: `presses` places in the square half a pitch beyond the outer fibres.
@@ -95,15 +91,8 @@ def read_plan(path: Path, depth_mm: float) -> PressPlan:
     Raises:
         InputError: the file is no such CSV; the message names the line.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *lines = list(csv.reader(file)) or [[]]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not a CSV file ({error})") from error
-    names = tuple(name.strip() for name in header)
-    if names not in (COLUMNS, COLUMNS[:2]):
+    names, lines = read_csv(path)
+    if tuple(names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=2):

@@ -23,7 +23,7 @@ from .safety import POLL_S, Limits, require_safe, wait_until_still, watch
 Array = NDArray[np.float64]
 
 _SPARE_S = 3.0
-"""A move or a wait may take this much longer than it should."""
+"""A reading that is waited for may take this long."""
 _SETTLE_S = 0.1
 _KEPT = 4096
 """Readings whose times are remembered, to tell which came after a command."""
@@ -86,7 +86,7 @@ class Session:
                         plan = steered
                     self._press(press, plan.places_mm[press], float(plan.depths_mm[press]))
                     report(len(self._recorder.done), len(plan))
-            self._until(lambda: False, self._half_s, patient=True)  # the release after the last press
+            self._go_on_until(self._clock() + self._half_s)  # the release after the last press
             self._recorder.sync()
 
     def _press(self, press: int, place_mm: Array, depth_mm: float) -> None:
@@ -94,19 +94,19 @@ class Session:
         began = self._clock()
         self._move(above, self._rig.travel_mm_s)
         self._still()
-        self._until(lambda: False, began + self._half_s - self._clock(), patient=True)
+        self._go_on_until(began + self._half_s)
         down_s = self._clock()
         target = self._frame.pose(place_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
         self._move(target, self._rig.press_mm_s)
-        self._until(lambda: self._after(down_s) is not None, _SPARE_S)
+        self._await_reading(down_s)
         self._recorder.begin(place_mm, self._reading(down_s), press, depth_mm=depth_mm)
         self._recorder.sync()
         self._still()
-        self._until(lambda: False, down_s + self._half_s - self._clock(), patient=True)
+        self._go_on_until(down_s + self._half_s)
         tip, depths = self._frame.tip(np.array([self._arm.state().pose]))
         up_s = self._clock()
         self._move(above, self._rig.press_mm_s)
-        self._until(lambda: self._after(up_s) is not None, _SPARE_S)
+        self._await_reading(up_s)
         reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.lost}
         self._recorder.finish(self._reading(up_s), **reached)
         self._recorder.sync()
@@ -127,18 +127,22 @@ class Session:
     def _still(self) -> None:
         wait_until_still(self._arm, self._limits, self._clock, self._sleep, self._pump)
 
-    def _until(self, done: Callable[[], bool], within_s: float, patient: bool = False) -> None:
-        """Read, record and watch until `done`; a `patient` wait ends with its time, any other fails then."""
-        deadline = self._clock() + within_s
-        while True:
-            self._pump()
-            if done():
-                return
-            if self._clock() >= deadline:
-                if patient:
-                    return
-                raise RigFault("deadline", f"the rig did not finish a step within {within_s:.1f} s", "look at the arm")
+    def _go_on_until(self, moment_s: float) -> None:
+        """Read, record and watch until a moment, at least once."""
+        self._pump()
+        while self._clock() < moment_s:
             self._sleep(POLL_S)
+            self._pump()
+
+    def _await_reading(self, moment_s: float) -> None:
+        """Read, record and watch until a reading has come that was taken after a moment."""
+        deadline = self._clock() + _SPARE_S
+        self._pump()
+        while self._after(moment_s) is None:
+            if self._clock() >= deadline:
+                raise RigFault("deadline", f"no reading came within {_SPARE_S:.1f} s", "look at the board")
+            self._sleep(POLL_S)
+            self._pump()
 
     def _pump(self) -> None:
         """Take what the devices have, keep it, and see that all is well."""
