@@ -74,7 +74,7 @@ def report(folder: Path) -> None:
 
 
 @cli.command()
-@click.argument("name", type=click.Choice(["contact", "objective", "search", "mould"]))
+@click.argument("name", type=click.Choice(["contact", "objective", "search", "filter", "mould"]))
 @out_option("out/bench")
 @json_option
 def bench(name: str, out: Path, as_json: bool) -> None:
@@ -86,8 +86,15 @@ def bench(name: str, out: Path, as_json: bool) -> None:
     from design.bench_search import bench_search
     from design.bench_table import lines
     from fabricate.bench import bench_mould
+    from sense.bench_filter import bench_filter
 
-    benches = {"contact": bench_contact, "objective": bench_objective, "search": bench_search, "mould": bench_mould}
+    benches = {
+        "contact": bench_contact,
+        "objective": bench_objective,
+        "search": bench_search,
+        "filter": bench_filter,
+        "mould": bench_mould,
+    }
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
         document = benches[name](out, lambda step: bar.update(task, note=step))
@@ -233,7 +240,7 @@ def _calibration(folder: Path, document: dict[str, Any]) -> Pieces:
     from design.page import figures, heading, paragraph, table
 
     names = ("lost", "subsets", "mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
-    errors = [[row[name] for name in names] for row in document["errors"]]
+    errors = [[row[name] for name in names] + [f"{row['within_r90']:.1%}"] for row in document["errors"]]
     return [
         (f"{errors[0][2]:.2f} mm", "mean error, all fibres"),
         (f"{errors[-1][2]:.2f} mm", f"{errors[-1][0]} lost"),
@@ -249,7 +256,9 @@ def _calibration(folder: Path, document: dict[str, Any]) -> Pieces:
                 (folder / "error_by_loss.png", "Error by number of lost fibres."),
             ]
         ),
-        table(["lost", "subsets", "mean (mm)", "std (mm)", "worst subset (mm)", "median (mm)", "95 % (mm)"], errors),
+        table(
+            ["lost", "subsets", "mean (mm)", "std (mm)", "worst (mm)", "median (mm)", "95 % (mm)", "within r90"], errors
+        ),
     ]
 
 

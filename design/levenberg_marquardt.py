@@ -76,13 +76,21 @@ class Network:
         return self.targets.back(neurons @ self.output[:, :-1].T + self.output[:, -1])
 
 
-def fit(inputs: Array, targets: Array, rng: np.random.Generator, hidden: int = 50, epochs: int = EPOCHS) -> Network:
+def fit(
+    inputs: Array,
+    targets: Array,
+    rng: np.random.Generator,
+    hidden: int = 50,
+    epochs: int = EPOCHS,
+    check: tuple[Array, Array] | None = None,
+) -> Network:
     """Train a network on samples: 70 % to learn from, 15 % for validation, 15 % left aside, drawn at random.
 
     Args:
         inputs: (Q, D), targets: (Q, O), finite.
         rng: source of the split and of the first weights.
         hidden: neurons of the hidden layer. epochs: at most so many steps.
+        check: inputs and targets of validation; where given, all samples are learnt from.
 
     Returns:
         The network of the epoch that did best on validation; the same for the same `rng` and number of threads.
@@ -93,13 +101,18 @@ def fit(inputs: Array, targets: Array, rng: np.random.Generator, hidden: int = 5
     if len(inputs) != len(targets) or len(inputs) < 3:
         raise InputError(f"{len(inputs)} inputs and {len(targets)} targets, allowed is as many of both, at least 3")
     into, onto = Scale.of(inputs), Scale.of(targets)
-    x = torch.from_numpy(np.column_stack([into.there(inputs), np.ones(len(inputs))]))
-    y = torch.from_numpy(onto.there(targets))
-    order = torch.from_numpy(rng.permutation(len(x)))
-    learned = round(LEARN * len(x))
-    learn, check = order[:learned], order[learned : learned + max(1, round(VALIDATE * len(x)))]
+
+    def scaled(x: Array, y: Array) -> Samples:
+        return torch.from_numpy(np.column_stack([into.there(x), np.ones(len(x))])), torch.from_numpy(onto.there(y))
+
+    order = rng.permutation(len(inputs))
+    learned = round(LEARN * len(inputs)) if check is None else len(inputs)
+    learn = order[:learned]
+    if check is None:
+        held = order[learned : learned + max(1, round(VALIDATE * len(inputs)))]
+        check = inputs[held], targets[held]
     start = first_weights(into.half > 0, hidden, targets.shape[1], rng)
-    (neurons, output), done = _train(start, (x[learn], y[learn]), (x[check], y[check]), epochs)
+    (neurons, output), done = _train(start, scaled(inputs[learn], targets[learn]), scaled(*check), epochs)
     return Network(neurons.numpy(), output.numpy(), into, onto, done)
 
 

@@ -1,8 +1,9 @@
 """Spreading compiled work over the cores: the kernels let go of the interpreter while they run."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import TypeVar
 
@@ -23,3 +24,17 @@ def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> lis
     edges = np.linspace(0, count, chunks + 1).astype(int).tolist()
     with ThreadPoolExecutor(chunks) as pool:
         return list(pool.map(lambda ends: work(*ends), pairwise(edges)))
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch to one thread: small matrices gain little from more, and where another program has a core, threads
+    that wait for each other take many times as long."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

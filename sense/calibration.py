@@ -1,6 +1,6 @@
 """Calibration: learn places from a recording, and say how far off they are on presses never learnt from."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,14 +13,21 @@ from design.losses import lost_subsets
 from design.settings import validated
 
 from . import settings
-from .localizer import Localizer, Scaling
+from .evaluation import distances, evaluate
+from .health import HealthModel
+from .localizer import Found, Localizer
+from .monitor import Finding
 from .network import refuse_unsound
-from .presses import INPUTS
+from .presses import press_inputs
 from .recording import Recording
+from .scaling import Scaled, Scaling
 
-FORMAT = "padforge-calibration/1"
-LEAST_TRAINING = 2
-"""Presses needed to learn from: of fewer, the span is none."""
+LEAST_TRAINING = 3
+"""Presses needed to learn from and to check on: of fewer, the span is none."""
+CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
+"""Share of the presses of training that end it and find the radii; of the published method, 15 % of all."""
+SUBSETS = 32
+"""Sets of lost fibres of a size that the radii are found on, at most."""
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -36,12 +43,13 @@ def calibrate(
 ) -> tuple[Localizer, dict[str, Any]]:
     """Train a localizer on a part of the presses and test it on the rest.
 
-    Test presses enter nothing but the test: not the scaling, not the training, not its length.
+    Test presses enter nothing but the test, which looks at them once: not the scaling, not the training, not its
+    length, not the radii. Presses whose place is not known are left out.
 
     Args:
         recording: readings and presses with known places.
         options: how to learn; the defaults if None. split, seed: win over those of `options`.
-        progress: called with (epochs done, epochs in all).
+        progress: called with (steps done, steps in all).
 
     Returns:
         The localizer, and the document of `calibration.json`.
@@ -51,121 +59,132 @@ def calibrate(
     """
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
     options = validated(settings.Localizer, {**(options or settings.Localizer()).model_dump(), **given}, "[localizer]")
+    if options.method == "published":
+        options = options.model_copy(update={"features": "published"})
     rng = np.random.default_rng(options.seed)
-    training, test = split_presses(len(recording.presses_mm), options.split, options.test_share, rng)
+    known = np.flatnonzero(recording.known)
+    training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by["inputs"] = {"recording": recording.digest}
+    localizer = replace(
+        learn(recording, training, options, rng, progress), split=options.split, test=tuple(test.tolist())
+    )
+    localizer = replace(localizer, provenance=made_by)
+    levels = range(min(options.lost, recording.fibres - 1) + 1) if options.method == "masked" else (0,)
+    document = evaluate(localizer, recording, levels)
+    document |= {"training_presses": len(training), "settings": options.model_dump()}
+    return replace(localizer, errors=document["errors"]), document
 
-    raw = INPUTS[options.features](recording.readings, recording.begun, recording.lifted)[training]
+
+def learn(
+    recording: Recording,
+    training: Indices,
+    options: settings.Localizer,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Localizer:
+    """Train a localizer on the presses `training` of a recording, by index.
+
+    Of them, a share is not trained on but ends the training and finds the radii: drawn at random, or the last ones, as
+    the split is.
+
+    Raises:
+        InputError: the training diverged.
+    """
+    raw = press_inputs(recording.readings, recording.begun, recording.lifted, options.features)[training]
     places_mm = recording.presses_mm[training]
-    scaling = Scaling.fit(raw, places_mm)
-    from .training import train  # torch, seconds to import, is needed here only
+    taught, checked = split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
+    scaling, table = Scaling.fit(raw[taught], places_mm[taught])
+    presses, targets = scaling.inputs(raw), scaling.targets(places_mm)
+    from .training import Samples, train  # torch, seconds to import, is needed here only
 
-    weights = train(scaling.inputs(raw), scaling.targets(places_mm), options, rng, progress)
+    shown, held = (Samples(presses.inputs[part], presses.alive[part], targets[part]) for part in (taught, checked))
+    if options.method == "masked":
+        weights = train(shown, held, table, options, rng, progress)
+    else:
+        from .classic import train_published
+
+        weights = train_published(shown, held, rng)
     try:
-        refuse_unsound(weights, scaling.entries)
+        refuse_unsound(weights, scaling.entries(options.method), options.method)
     except InputError as error:
         raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
     localizer = Localizer(
         weights=weights,
         scaling=scaling,
+        table=table,
+        method=options.method,
         features=options.features,
+        factors=np.ones((1, 3)),
         rate_hz=recording.rate_hz,
         learnt_from=recording.digest,
-        split=options.split,
-        test=tuple(test.tolist()),
-        provenance=made_by,
     )
-    document = evaluate(localizer, recording, range(min(options.lost, recording.fibres - 1) + 1))
-    document |= {"training_presses": len(training), "settings": options.model_dump()}
-    return replace(localizer, errors=document["errors"]), document
+    levels = min(options.lost, recording.fibres - 1) + 1 if options.method == "masked" else 1
+    return replace(localizer, factors=radii(localizer, presses[checked], places_mm[checked], levels))
 
 
-def split_presses(presses: int, split: str, share: float, rng: np.random.Generator) -> tuple[Indices, Indices]:
+def radii(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Array:
+    """(levels, 3) what makes of expected errors, by number of lost fibres, standard deviations and radii.
+
+    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
+    distance over expected error on presses never trained on, a rank higher than their share, as if the next were one.
+    """
+    plain = replace(localizer, factors=np.ones((1, 3)))
+    out = np.empty((levels, 3))
+    for level in range(levels):
+        found = [(plain.locate(presses, subset)) for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
+        off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
+        ratios = [distances(each.places_mm, places_mm) / each.r50_mm for each in found]
+        share = 1 + 1 / len(presses)
+        out[level, 0] = np.sqrt(np.square(off).mean())
+        out[level, 1:] = np.quantile(ratios, [min(1.0, 0.5 * share), min(1.0, 0.9 * share)])
+    return np.clip(out, 1e-6, 1e6)
+
+
+def split_presses(
+    presses: int, split: str, share: float, rng: np.random.Generator, least: int = LEAST_TRAINING
+) -> tuple[Indices, Indices]:
     """Indices (ascending) of the presses to learn from and of those held back: drawn at random, or the last.
 
     Raises:
-        InputError: a share of so few presses leaves none on one side.
+        InputError: a share of so few presses leaves none on one side, or fewer than `least` to learn from.
     """
-    test = round(share * presses)
-    if not 1 <= test <= presses - LEAST_TRAINING:
+    held = max(round(share * presses), 1 if least < LEAST_TRAINING else 0)
+    if not 1 <= held <= presses - least:
         raise InputError(
-            f"recording has {presses} presses: a test share of {share:g} holds {test} back, expected at least 1, "
-            f"and {LEAST_TRAINING} to learn from"
+            f"recording has {presses} presses of known place: a share of {share:g} holds {held} back, "
+            f"expected at least 1, and {least} to learn from"
         )
     order = rng.permutation(presses) if split == "random" else np.arange(presses)
-    return np.sort(order[:-test]), np.sort(order[-test:])
+    return np.sort(order[:-held]), np.sort(order[-held:])
 
 
-def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
-    """Errors of a localizer for every set of lost fibres of the sizes `levels`.
-
-    On the recording it was trained on, only the presses held back then count; of any other, all do.
-
-    Returns:
-        A document with "errors", one row per level: how many sets of lost fibres were tried; mean, standard deviation
-        and greatest of their mean errors; median and 95th percentile over all their presses, mm. Besides "split"
-        ("none" for another recording), "test_presses", "by_subset" (mean error of each set) and "test" (places
-        pressed, and found with all fibres).
+def learn_health(recording: Recording, localizer: Localizer) -> HealthModel:
+    """Learn what the healthy pad gives from the presses of the recording that `localizer` did not hold back.
 
     Raises:
-        InputError: no level, one that leaves no fibre, or a recording that does not suit the localizer.
+        InputError: too few presses, or no living fibre.
     """
-    levels, presses = tuple(levels), len(recording.presses_mm)
-    if not levels:
-        raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
-    own = recording.digest == localizer.learnt_from
-    if own and not max(localizer.test) < presses:
-        raise InputError(
-            f"test press {max(localizer.test)} of the localizer: no such press, allowed are 0 to {presses - 1}"
-        )
-    test = np.array(localizer.test if own else range(presses), dtype=np.int64)
-    inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
-    rows, by_subset = [], []
-    for level in levels:
-        if not 0 <= level < localizer.fibres:
-            raise InputError(f"lost is {level}, allowed is 0 to {localizer.fibres - 1}, so that a fibre is left")
-        subsets = lost_subsets(localizer.fibres, level)
-        errors = np.stack([distances(localizer.places(inputs, subset), places_mm) for subset in subsets])
-        rows.append(_summary(level, errors))
-        by_subset += [
-            {"lost": list(subset), "mean_mm": mean}
-            for subset, mean in zip(subsets, errors.mean(axis=1).tolist(), strict=True)
-        ]
-    return {
-        "format": FORMAT,
-        "errors": rows,
-        "split": localizer.split if own else "none",
-        "test_presses": len(test),
-        "by_subset": by_subset,
-        "test": {
-            "press": test.tolist(),
-            "pressed_mm": places_mm.tolist(),
-            "found_mm": localizer.places(inputs).tolist(),
-        },
-        "provenance": dict(localizer.provenance),
-    }
+    held = np.zeros(len(recording.presses_mm), dtype=bool)
+    held[list(localizer.test)] = True
+    return HealthModel.fit(
+        recording.readings,
+        recording.times_s,
+        recording.begun[~held],
+        recording.lifted[~held],
+        rng=np.random.default_rng(int(localizer.provenance["seed"])),
+        provenance=localizer.provenance,
+    )
 
 
-def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = ()) -> Array:
-    """(Q, 2) places in mm found for every press of `recording`, without the fibres `lost`, by index."""
-    return localizer.places(localizer.inputs(recording), lost)
+def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = (), findings: Sequence[Finding] = ()) -> Found:
+    """Find the place of every press of `recording`, without the fibres `lost`, by index.
 
-
-def distances(found_mm: Array, pressed_mm: Array) -> Array:
-    """(Q,) distance of (Q, 2) places."""
-    return np.hypot(*(found_mm - pressed_mm).T)
-
-
-def _summary(lost: int, errors: Array) -> dict[str, Any]:
-    """A row of "errors" from (subsets, Q) errors in mm."""
-    means = errors.mean(axis=1)
-    return {
-        "lost": lost,
-        "subsets": len(errors),
-        "mean_mm": float(means.mean()),
-        "std_mm": float(means.std()),
-        "max_mm": float(means.max()),
-        "median_mm": float(np.median(errors)),
-        "p95_mm": float(np.percentile(errors, 95)),
-    }
+    Args:
+        findings: of `monitor.examine`; a fibre found at fault is left out from the press on since which it is.
+    """
+    presses = localizer.inputs(recording)
+    alive = presses.alive.copy()
+    for finding in findings:
+        alive[finding.since :, list(finding.fibres)] = False
+    return localizer.locate(replace(presses, alive=alive), lost)

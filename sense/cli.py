@@ -7,13 +7,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from design.console import json_option, load_spec, progress, seed_option, show_result, spec_option
+from design.errors import InputError
 
+from .cli_live import live
 from .rig.cli import describe, doctor, record
 
 if TYPE_CHECKING:
     from design.settings import Spec
 
+    from .health import HealthModel
+    from .localizer import Localizer
+    from .monitor import Finding
     from .recording import Recording
+
+METHODS, FEATURES = ("masked", "published"), ("full", "causal", "early", "published")
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
@@ -51,6 +58,7 @@ def sense() -> None:
 
 sense.add_command(record)
 sense.add_command(doctor)
+sense.add_command(live)
 
 
 @sense.command("import")
@@ -88,19 +96,29 @@ def export(recording: Path, file: Path) -> None:
 
 @sense.command()
 @recording_argument
+@click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
+@click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
 @click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
 @seed_option
 @spec_option
 @click.option("--out", type=_FOLDER, help="Folder for the results (default: the one RECORDING lies in).")
 @json_option
 def calibrate(
-    recording: Path, test_split: str | None, seed: int | None, spec: Path | None, out: Path | None, as_json: bool
+    recording: Path,
+    method: str | None,
+    features: str | None,
+    test_split: str | None,
+    seed: int | None,
+    spec: Path | None,
+    out: Path | None,
+    as_json: bool,
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
 
-    Writes localizer.safetensors, localizer.json, calibration.json, error_map.png and error_by_loss.png.
+    Writes localizer.safetensors, localizer.json, health.safetensors, health.json, calibration.json, error_map.png
+    and error_by_loss.png.
     """
-    overrides = {"split": test_split, "seed": seed}
+    overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     document = run_calibration(load_spec(spec), _open(recording), out or recording.absolute().parent, overrides)
     show_result(document, summary(document), as_json)
 
@@ -112,6 +130,7 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
     """
     from design.files import write_json
 
+    from . import health as watch
     from .calibration import calibrate as learn
     from .figures import draw_error_by_loss, draw_error_map
     from .output import refuse_unwritable, staged
@@ -120,18 +139,36 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
     refuse_unwritable(out)
     options = spec.section(Localizer, **overrides)
     with progress() as bar:
-        task = bar.add_task("training", total=options.epochs, note="")
+        task = bar.add_task("training", total=None, note="")
 
         def report(done: int, total: int) -> None:
-            bar.update(task, completed=done, note=f"epoch {done} of {total}")
+            bar.update(task, completed=done, total=total, note=f"step {done} of {total}")
 
         localizer, document = learn(recording, options, progress=report)
+        bar.update(task, total=None, note="the health of the fibres")
+        health = _health(recording, localizer)
     with staged(out) as folder:
         localizer.save(folder)
+        if health:
+            health.save(folder)
         write_json(folder / "calibration.json", document)
         draw_error_map(document, folder / "error_map.png")
         draw_error_by_loss(document, folder / "error_by_loss.png")
+    if not health:
+        for name in (watch.DOCUMENT, watch.WEIGHTS):  # of an earlier calibration, which must not speak for this one
+            (out / name).unlink(missing_ok=True)
     return document
+
+
+def _health(recording: "Recording", localizer: "Localizer") -> "HealthModel | None":
+    """What health is told by, or nothing, and a line that says so, where the recording does not suffice."""
+    from .calibration import learn_health
+
+    try:
+        return learn_health(recording, localizer)
+    except InputError as error:
+        click.echo(f"no watch is kept on the fibres' health: {error}", err=True)
+        return None
 
 
 @sense.command()
@@ -157,16 +194,62 @@ def evaluate(model: Path, recording: Path, lost: tuple[int, ...] | None, as_json
 @model_option
 @recording_argument
 @click.option("--mask", type=_Numbers(), default=(), help="Fibres to leave out, counted from 0.")
-@click.option("--out", type=_FILE, required=True, help="CSV file for the places: press, x_mm, y_mm.")
+@click.option("--out", type=_FILE, required=True, help="CSV file for the places and their radii.")
 def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path) -> None:
-    """Find the place of every press of RECORDING."""
-    from .calibration import locate as find
-    from .exchange import write_places
-    from .localizer import Localizer
+    """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
 
-    found = find(Localizer.load(model), _open(recording), mask)
+    \b
+    The columns of the CSV: press (counted from 0), x_mm, y_mm, sd_x_mm, sd_y_mm (standard
+    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases).
+    """
+    from .calibration import locate as find
+    from .localizer import Localizer
+    from .places import write_places
+
+    opened = _open(recording)
+    findings = _findings(model, opened)
+    for finding in findings:
+        click.echo(f"{finding.text}; left out from there on", err=True)
+    found = find(Localizer.load(model), opened, mask, findings)
     write_places(found, out)
-    click.echo(f"{len(found)} places -> {out}")
+    click.echo(f"{len(found.r50_mm)} places -> {out}")
+
+
+@sense.command()
+@model_option
+@recording_argument
+@json_option
+@click.pass_context
+def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
+    """Say which fibres of RECORDING are lost, damaged or drifting, from the readings alone.
+
+    Exit 1 if one is.
+    """
+    from dataclasses import asdict
+
+    from .health import HealthModel
+    from .monitor import examine, lines
+
+    known, opened = HealthModel.load(model), _open(recording)
+    findings = examine(known, opened.readings, opened.times_s, opened.begun, opened.lifted)
+    document = {
+        "format": "padforge-findings/1",
+        "presses": len(opened.begun),
+        "dead": list(known.dead),
+        "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
+    }
+    show_result(document, lines(findings, opened.fibres, known.dead), as_json)
+    context.exit(int(bool(findings)))
+
+
+def _findings(model: Path, recording: "Recording") -> "list[Finding]":
+    """What is wrong with the fibres of a recording, as far as the model's folder tells health."""
+    from .health import DOCUMENT, HealthModel
+    from .monitor import examine
+
+    if not (model / DOCUMENT).exists():
+        return []
+    return examine(HealthModel.load(model), recording.readings, recording.times_s, recording.begun, recording.lifted)
 
 
 def _open(path: Path) -> "Recording":
@@ -180,12 +263,13 @@ def _open(path: Path) -> "Recording":
 
 def summary(document: Mapping[str, Any]) -> list[str]:
     """The errors of a calibration document as a table for people."""
+    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
     return [
         f"error in mm on {document['test_presses']} presses (split: {document['split']})",
-        "lost  sets   mean    std    max  median    p95",
+        "lost  sets   mean    std    max median    p95  in r50  in r90",
         *(
-            f"{row['lost']:4d} {row['subsets']:5d} {row['mean_mm']:6.2f} {row['std_mm']:6.2f} "
-            f"{row['max_mm']:6.2f}  {row['median_mm']:6.2f} {row['p95_mm']:6.2f}"
+            f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+            f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
             for row in document["errors"]
         ),
     ]

@@ -1,6 +1,6 @@
 """`localizer.json`: what it may hold, so that nothing else gets past its reading."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from reprlib import repr as shortened
 from typing import Annotated, Any, Literal
 
@@ -10,17 +10,20 @@ from design.errors import InputError
 from design.settings import Section
 
 from .limits import MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
-from .presses import SIZES
-from .settings import Features, Split
+from .presses import PASTS, SIZES
+from .settings import Features, Method, Split
 
 LEAST_SPREAD_V = 1e-9
 """Least spread that an input is divided by: what varies less never varied."""
 
-FORMAT = "padforge-localizer/1"
+FORMAT = "padforge-localizer/2"
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Volts = Annotated[float, Field(ge=-2 * MAX_VOLTS, le=2 * MAX_VOLTS)]
 Spread = Annotated[float, Field(ge=LEAST_SPREAD_V, le=2 * MAX_VOLTS)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
+Factor = Annotated[float, Field(gt=0, le=1e6)]
 Distance = Annotated[float, Field(ge=0)]
 Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
 
@@ -30,6 +33,8 @@ class ScalingTable(Section):
 
     centre_v: list[list[Volts]]
     spread_v: list[list[Spread]]
+    memory: list[list[list[Memory]]]
+    usual_v: list[list[Volts]]
     middle_mm: Annotated[list[Place], Field(min_length=2, max_length=2)]
     span_mm: float = Field(gt=0, le=MAX_MM)
 
@@ -44,22 +49,27 @@ class ErrorRow(Section):
     max_mm: Distance
     median_mm: Distance
     p95_mm: Distance
+    within_r50: Share
+    within_r90: Share
 
 
 class LocalizerDocument(Section):
     """The whole of `localizer.json`, see `localizer.Localizer`."""
 
-    format: Literal["padforge-localizer/1"] = FORMAT
+    format: Literal["padforge-localizer/2"] = FORMAT
+    method: Method
     features: Features
     fibres: int = Field(ge=1, le=MAX_FIBRES)
     rate_hz: float = Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
     scaling: ScalingTable
+    factors: Annotated[list[Annotated[list[Factor], Field(min_length=3, max_length=3)]], Field(min_length=1)]
     weights_sha256: Digest
     split: Split
     test_presses: int
     errors: list[ErrorRow]
     learnt_from: Digest
     test: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    recalibrated_by: list[Digest]
     provenance: dict[str, JsonValue]
 
 
@@ -75,16 +85,29 @@ def read_document(document: Mapping[str, Any], where: str) -> LocalizerDocument:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise InputError(f"{where}: {key} is {shortened(first['input'])}: {first['msg'].lower()}") from error
-    size = SIZES[found.features]
-    for name, rows in (("centre_v", found.scaling.centre_v), ("spread_v", found.scaling.spread_v)):
-        if [len(row) for row in rows] != [size] * found.fibres:
+    size, past, table = SIZES[found.features], PASTS[found.features], found.scaling
+    shapes = {
+        "centre_v": (_sizes(table.centre_v), (found.fibres, size)),
+        "spread_v": (_sizes(table.spread_v), (found.fibres, size)),
+        "usual_v": (_sizes(table.usual_v), (found.fibres, past)),
+        "memory": (_sizes([row for fibre in table.memory for row in fibre]), (found.fibres * past, size)),
+        "memory of fibres": (_sizes(table.memory), (found.fibres, past)),
+    }
+    for name, (sizes, (rows, values)) in shapes.items():
+        if sizes != [values] * rows:
             raise InputError(
-                f"{where}: scaling.{name} has {len(rows)} rows of {shortened(sorted({len(row) for row in rows}))} "
-                f"values, expected {found.fibres} of {size} for features {found.features}"
+                f"{where}: scaling.{name} has {len(sizes)} rows of {shortened(sorted(set(sizes)))} values, "
+                f"expected {rows} of {values} for {found.fibres} fibres and features {found.features}"
             )
+    if found.method == "published" and found.features != "published":
+        raise InputError(f"{where}: method is published, features are {found.features}, expected published")
     if len(set(found.test)) != len(found.test) or found.test_presses != len(found.test):
         raise InputError(
             f"{where}: test has {len(found.test)} presses, {len(set(found.test))} of them different, "
             f"expected {found.test_presses} different ones"
         )
     return found
+
+
+def _sizes(rows: Sequence[Sequence[float]]) -> list[int]:
+    return [len(row) for row in rows]

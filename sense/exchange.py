@@ -1,8 +1,10 @@
-"""Recordings from and to other formats, the published MATLAB files and CSV, and places found as CSV.
+"""Recordings from and to other formats: the published MATLAB files, and CSV.
 
-The CSV form has a header and one line a reading: `time_s`, one column of volts per fibre (any names), then `x_mm` and
-`y_mm`. The last two hold the place of the press while the probe is sent down, and are empty on every other line; so
-the first line of a run of equal places is where a press begins, and the first line after it where it ends.
+The CSV form has a header and one line a reading: `time_s`, one column of volts per fibre (any names; an empty cell is
+a missing reading), then `x_mm` and `y_mm`. The last two hold the place of the press while the probe is sent down, `?`
+where it is not known, and are empty on every other line; so the first line of a run of equal places is where a press
+begins, and the first line after it where it ends. Where no line has a place, or the two columns are not there, presses
+are found in the readings (`touch`).
 """
 
 import csv
@@ -12,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.errors import InputError
-from design.files import atomic, write_text
+from design.files import atomic
 from design.published import load_mat
 
 from .limits import MAX_FIBRES
@@ -25,31 +27,42 @@ READINGS_PER_PRESS = 40
 DOWN_AT = 20
 """Reading of the published cycle at which the probe is sent down; it is sent up at the end of the cycle."""
 
+UNKNOWN = -1.7e308
+"""Stands for `?` among numbers; far beyond any place."""
+
 Array = NDArray[np.float64]
 
 
 def import_mat(path: str | Path) -> Recording:
     """Read a published recording: `voltage` (R, C) volts, `pos` (2, Q) mm, `tim` (1, R) s, 40 readings a press.
 
+    Without `pos`, or where it is NaN, the places of the presses are unknown.
+
     Raises:
         InputError: the file is torn, of another kind, or its variables do not fit together.
     """
     path = Path(path)
-    content = load_mat(path, ("voltage", "pos", "tim"))
-    voltage, pos, tim = (_numbers(content[name], f"{path}: {name}") for name in ("voltage", "pos", "tim"))
-    if pos.ndim != 2 or pos.shape[0] != 2 or pos.shape[1] == 0:
-        raise InputError(f"{path}: pos has shape {pos.shape}, expected (2, presses)")
-    presses = pos.shape[1]
-    least = READINGS_PER_PRESS * presses
-    if voltage.ndim != 2 or not least <= len(voltage) < least + READINGS_PER_PRESS:
+    content = load_mat(path, ("voltage", "tim"))
+    voltage, tim = (_numbers(content[name], f"{path}: {name}") for name in ("voltage", "tim"))
+    if voltage.ndim != 2 or len(voltage) < READINGS_PER_PRESS:
+        raise InputError(f"{path}: voltage has shape {voltage.shape}, expected at least {READINGS_PER_PRESS} rows")
+    if "pos" in content:
+        pos = _numbers(content["pos"], f"{path}: pos")
+        if pos.ndim != 2 or pos.shape[0] != 2 or pos.shape[1] == 0:
+            raise InputError(f"{path}: pos has shape {pos.shape}, expected (2, presses)")
+        places = pos.T
+    else:
+        places = np.full((len(voltage) // READINGS_PER_PRESS, 2), np.nan)
+    least = READINGS_PER_PRESS * len(places)
+    if not least <= len(voltage) < least + READINGS_PER_PRESS:
         raise InputError(
             f"{path}: voltage has shape {voltage.shape}, expected {READINGS_PER_PRESS} rows for each of the "
-            f"{presses} presses of pos, {least} in all"
+            f"{len(places)} presses of pos, {least} in all"
         )
-    begun = READINGS_PER_PRESS * np.arange(presses) + DOWN_AT
+    begun = READINGS_PER_PRESS * np.arange(len(places)) + DOWN_AT
     source = {"kind": "published", "file": path.name}
     try:
-        return Recording(voltage, tim.ravel(), pos.T, begun, begun - DOWN_AT + READINGS_PER_PRESS, source)
+        return Recording(voltage, tim.ravel(), places, begun, begun - DOWN_AT + READINGS_PER_PRESS, source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -64,41 +77,45 @@ def import_csv(path: str | Path) -> Recording:
     """Read a recording in the CSV form of this module.
 
     Raises:
-        InputError: the file is no such CSV; the message names the line.
+        InputError: the file is no such CSV, or no press is in it; the message names the line.
     """
     path = Path(path)
     table = _read_table(path)
-    places = table[:, -2:]
+    readings, times_s, places = table[:, 1:-2], table[:, 0], table[:, -2:]
     empty = np.isnan(places)
     half = empty[:, 0] != empty[:, 1]
     if half.any():
         raise InputError(f"{path}: line {int(np.argmax(half)) + 2} has one of x_mm and y_mm, expected both or neither")
     down = ~empty.any(axis=1)
-    before = np.vstack([np.full((1, 2), np.nan), places[:-1]])
-    begun = np.flatnonzero(down & (places != before).any(axis=1))
-    if len(begun) == 0:
-        raise InputError(f"{path}: has no press, expected x_mm and y_mm on the lines where the probe is down")
-    ends = np.append(np.flatnonzero(~down), len(table))
-    lifted = np.minimum(ends[np.searchsorted(ends, begun)], np.append(begun[1:], len(table)))
+    source = {"kind": "csv", "file": path.name}
     try:
-        return Recording(table[:, 1:-2], table[:, 0], places[begun], begun, lifted, {"kind": "csv", "file": path.name})
+        if not down.any():
+            return found_presses(readings, times_s, source)
+        before = np.vstack([np.full((1, 2), np.nan), places[:-1]])
+        begun = np.flatnonzero(down & (places != before).any(axis=1))
+        ends = np.append(np.flatnonzero(~down), len(table))
+        lifted = np.minimum(ends[np.searchsorted(ends, begun)], np.append(begun[1:], len(table)))
+        pressed = np.where(places[begun] == UNKNOWN, np.nan, places[begun])
+        return Recording(readings, times_s, pressed, begun, lifted, source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
 def _read_table(path: Path) -> Array:
-    """The numbers of a CSV with the expected header; an empty cell is NaN."""
+    """The numbers of a CSV with the expected header, the places last; an empty cell is NaN, and `?` is `UNKNOWN`."""
     names, lines = read_csv(path)
-    if names[:1] != ["time_s"] or names[-2:] != ["x_mm", "y_mm"] or not 4 <= len(names) <= 3 + MAX_FIBRES:
+    placed = names[-2:] == ["x_mm", "y_mm"]
+    fibres = len(names) - (3 if placed else 1)
+    if names[:1] != ["time_s"] or not 1 <= fibres <= MAX_FIBRES:
         found = ",".join(names)[:60] or "nothing"
         hint = "; values are separated by commas, not by semicolons" if ";" in found else ""
         raise InputError(f"{path}: header is {found!r}, expected time_s, one column per fibre, x_mm, y_mm{hint}")
-    table = np.empty((len(lines), len(names)))
+    table = np.full((len(lines), fibres + 3), np.nan)
     for number, line in enumerate(lines):
         if len(line) != len(names):
             raise InputError(f"{path}: line {number + 2} has {len(line)} values, expected {len(names)}")
         try:
-            table[number] = [cell or "nan" for cell in line]
+            table[number, : len(names)] = [{"": "nan", "?": UNKNOWN}.get(cell.strip(), cell) for cell in line]
         except ValueError as error:
             raise InputError(f"{path}: line {number + 2} holds no numbers ({error})") from error
     return table
@@ -114,7 +131,8 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     header = ["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm"]
     places: list[list[float | str]] = [["", ""] for _ in recording.times_s]
     for place, begun, lifted in zip(recording.presses_mm.tolist(), recording.begun, recording.lifted, strict=True):
-        places[begun:lifted] = [place] * int(lifted - begun)
+        cells: list[float | str] = ["?", "?"] if np.isnan(place).any() else place
+        places[begun:lifted] = [cells] * int(lifted - begun)
     with (
         writing(path),
         atomic(path) as temporary,
@@ -123,7 +141,7 @@ def export_csv(recording: Recording, path: str | Path) -> None:
         writer = csv.writer(file)
         writer.writerow(header)
         for time, volts, place in zip(recording.times_s.tolist(), recording.readings.tolist(), places, strict=True):
-            writer.writerow([time, *volts, *place])
+            writer.writerow([time, *("" if np.isnan(value) else value for value in volts), *place])
 
 
 def import_file(path: Path) -> Recording:
@@ -152,14 +170,3 @@ def export_file(recording: Recording, path: Path) -> None:
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(writers)}")
     writers[path.suffix.lower()](recording, path)
-
-
-def write_places(places_mm: Array, path: str | Path) -> None:
-    """Write (Q, 2) places found, mm from the pad's centre, as CSV: press (counted from 0), x_mm, y_mm; atomically.
-
-    Raises:
-        InputError: `path` cannot be written.
-    """
-    lines = [f"{press},{x:.4f},{y:.4f}\n" for press, (x, y) in enumerate(places_mm.tolist())]
-    with writing(Path(path)):
-        write_text(Path(path), "press,x_mm,y_mm\n" + "".join(lines))

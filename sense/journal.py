@@ -12,9 +12,9 @@ from .limits import MAX_INDEX, MAX_MM
 
 
 def read_journal(path: Path) -> dict[int, tuple[float, float, int, int]]:
-    """Place (x, y in mm) and readings (begun, lifted) of every press that is done, by its number, ascending.
+    """Place (x, y in mm, NaN where not known) and readings (begun, lifted) of every press that is done, by its number.
 
-    A press that was aborted and begun again counts as it was begun last.
+    Numbers ascend. A press that was aborted and begun again counts as it was begun last.
 
     Raises:
         InputError: the file is missing, or a line other than a torn last one is no entry.
@@ -65,7 +65,9 @@ def _whole(event: Mapping[str, Any], key: str) -> int:
 
 
 def _place(event: Mapping[str, Any], key: str) -> float:
-    value = event.get(key)
+    value = event.get(key, "missing")
+    if value is None:
+        return float("nan")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_MM:
-        raise ValueError(f"{key} is {shortened(value)}, expected a number from {-MAX_MM:g} to {MAX_MM:g}")
+        raise ValueError(f"{key} is {shortened(value)}, expected a number from {-MAX_MM:g} to {MAX_MM:g}, or null")
     return float(value)

@@ -34,11 +34,13 @@ def numbers(values: ArrayLike, kind: type[np.generic], name: str) -> NDArray[Any
     return array.astype(kind)
 
 
-def refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:
-    """Raise InputError if an entry of (N, M) values is not finite, or beyond `limit`."""
-    if not np.isfinite(values).all():
-        row = int(np.argmin(np.isfinite(values).all(axis=1)))
-        raise InputError(f"{name} hold NaN or infinity (first in row {row}), expected finite numbers")
+def refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str, missing: bool = False) -> None:
+    """Raise InputError if an entry of (N, M) values is not finite, or beyond `limit`; NaN is allowed if `missing`."""
+    sound = ~np.isinf(values) if missing else np.isfinite(values)
+    if not sound.all():
+        row = int(np.argmin(sound.all(axis=1)))
+        kind = "infinity" if missing else "NaN or infinity"
+        raise InputError(f"{name} hold {kind} (first in row {row}), expected finite numbers")
     beyond = np.abs(values) > limit
     if beyond.any():
         row = int(np.argmax(beyond.any(axis=1)))

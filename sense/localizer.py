@@ -15,66 +15,38 @@ from safetensors.numpy import load, save
 from design.errors import InputError
 from design.files import atomic, read_json
 
-from .document import FORMAT, LEAST_SPREAD_V, read_document
-from .network import Floats, Weights, forward, masked, refuse_unsound
+from .document import FORMAT, read_document
+from .network import Floats, Weights, forward, masked, pooled, refuse_unsound
 from .output import writing
-from .presses import INPUTS
+from .presses import SIZES, Inputs, press_inputs
 from .recording import Recording
+from .scaling import Scaled, Scaling
 
 DOCUMENT, WEIGHTS = "localizer.json", "localizer.safetensors"
+TABLE = "table"
+"""Name of the table among the weights."""
 RATE_TOLERANCE = 0.25
 """Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
-MAX_INPUT = 1e4
-"""Greatest scaled input, in spreads: what lies further off is no press, and is held there."""
+UNKNOWN = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
+"""Standard deviation and the radii of 50 and 90 % for a place anywhere in a square of half-width 1."""
 _CHUNK = 8192
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scaling:
-    """How inputs become numbers of about 1, and what the network gives becomes mm.
+class Found:
+    """Places found for Q presses, and how sure they are.
 
     Attributes:
-        centre, spread: (C, F) V; an input enters as (input - centre) / spread.
-        middle_mm: (2,) place that the network calls 0. span_mm: distance that it calls 1.
+        places_mm: (Q, 2). sd_mm: (Q, 2) standard deviation in x and in y.
+        r50_mm, r90_mm: (Q,) radius around the place that holds the press in 50 % and in 90 % of cases.
     """
 
-    centre: Array
-    spread: Array
-    middle_mm: Array
-    span_mm: float
-
-    @classmethod
-    def fit(cls, inputs: Array, places_mm: Array) -> "Scaling":
-        """From (Q, C, F) inputs and (Q, 2) places of the training presses.
-
-        A window is scaled by the geometric mean of its own spread and its fibre's: the fine windows of a touch keep
-        some of their smallness, and so of their noise. What never varied is left as large as it is.
-        """
-        own = inputs.std(axis=0)
-        fibre = np.sqrt((own**2).mean(axis=1, keepdims=True))
-        spread = np.sqrt(own * fibre)
-        low, high = places_mm.min(axis=0), places_mm.max(axis=0)
-        span = float((high - low).max() / 2)
-        return cls(inputs.mean(axis=0), np.where(spread >= LEAST_SPREAD_V, spread, 1.0), (low + high) / 2, span or 1.0)
-
-    def inputs(self, inputs: Array) -> Floats:
-        """(Q, C, F) volts to what the network takes."""
-        return np.clip((inputs - self.centre) / self.spread, -MAX_INPUT, MAX_INPUT).astype(np.float32)
-
-    def targets(self, places_mm: Array) -> Floats:
-        """(Q, 2) mm to what the network gives."""
-        return ((places_mm - self.middle_mm) / self.span_mm).astype(np.float32)
-
-    def places_mm(self, targets: Floats) -> Array:
-        """What the network gives to mm."""
-        return targets * self.span_mm + self.middle_mm
-
-    @property
-    def entries(self) -> int:
-        """D, the numbers that enter the network: the inputs, and one a fibre that says whether it lives."""
-        return self.centre.size + len(self.centre)
+    places_mm: Array
+    sd_mm: Array
+    r50_mm: Array
+    r90_mm: Array
 
 
 @dataclass(frozen=True)
@@ -84,20 +56,29 @@ class Localizer:
     Attributes:
         weights: of the network, see `network.Weights`.
         scaling: of its inputs and outputs.
-        features: which inputs it takes, a key of `presses.INPUTS`.
+        table: (S, S, C, F) scaled inputs by place, see `response.Response`; what a recalibration moves presses by.
+        method: which network and training, of `settings.Method`.
+        features: which inputs it takes, of `presses.FEATURES`.
+        factors: (K, 3) by number of lost fibres, what makes of the expected error a standard deviation, and the radii
+            of 50 % and of 90 %; found on presses never trained on.
         rate_hz: readings per second of the recording it learnt from.
         learnt_from: digest of that recording, `test`: its presses that were held back, by index, and `split`: how.
+        recalibrated_by: digests of the recordings that it was recalibrated by, all of whose presses it has seen.
         errors: on those, one row per number of lost fibres.
         provenance: where the localizer came from; free JSON.
     """
 
     weights: Weights
     scaling: Scaling
+    table: Floats
+    method: str
     features: str
+    factors: Array
     rate_hz: float
     learnt_from: str
-    split: str
-    test: tuple[int, ...]
+    split: str = "random"
+    test: tuple[int, ...] = ()
+    recalibrated_by: tuple[str, ...] = ()
     errors: Sequence[Mapping[str, Any]] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -106,8 +87,12 @@ class Localizer:
         """C, the number of fibres it was trained on, lost ones included."""
         return len(self.scaling.centre)
 
-    def inputs(self, recording: Recording) -> Floats:
-        """(Q, C, F) scaled inputs of every press of `recording`.
+    def inputs(self, recording: Recording) -> Scaled:
+        """The scaled inputs of every press of `recording`; raises what `raw_inputs` raises."""
+        return self.scaling.inputs(self.raw_inputs(recording))
+
+    def raw_inputs(self, recording: Recording) -> Inputs:
+        """The inputs of every press of `recording` in volts.
 
         Raises:
             InputError: the recording has other fibres or another rate than the one that was learnt from.
@@ -119,18 +104,37 @@ class Localizer:
                 f"recording has {recording.rate_hz:.3g} readings a second, allowed is {self.rate_hz:.3g}, "
                 f"at which the localizer was trained, within {RATE_TOLERANCE:.0%}"
             )
-        return self.scaling.inputs(INPUTS[self.features](recording.readings, recording.begun, recording.lifted))
+        return press_inputs(recording.readings, recording.begun, recording.lifted, self.features)
 
-    def places(self, inputs: Floats, lost: ArrayLike = ()) -> Array:
-        """(Q, C, F) scaled inputs to (Q, 2) places in mm, without what the fibres `lost`, by index, gave.
+    def locate(self, presses: Scaled, lost: ArrayLike = ()) -> Found:
+        """Find the places of Q presses without what the fibres `lost`, by index, gave.
+
+        A press of which no fibre is left is put in the middle, with radii that say it may be anywhere.
 
         Raises:
-            InputError: a lost fibre that is not there, or none left.
+            InputError: a lost fibre that is not there, or none left, or a published localizer that is to do without.
         """
-        alive = self._alive(lost)
-        chunks = [inputs[i : i + _CHUNK] for i in range(0, len(inputs), _CHUNK)]
-        found = [forward(self.weights, masked(chunk, alive)).mean(axis=0) for chunk in chunks]
-        return self.scaling.places_mm(np.concatenate(found)) if found else np.empty((0, 2))
+        alive: NDArray[np.bool_] = np.logical_and(presses.alive, self._alive(lost))
+        if self.method == "published" and np.size(lost):
+            raise InputError(f"lost fibres {lost}: a published localizer knows none, train one of method masked")
+        chunks = range(0, len(presses), _CHUNK)
+        found = [self._pooled(presses.inputs[i : i + _CHUNK], alive[i : i + _CHUNK]) for i in chunks]
+        places, spread = (
+            (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (np.empty((0, 2)),) * 2
+        )
+        level = np.minimum((~alive).sum(axis=1), len(self.factors) - 1)
+        to_sd, to_r50, to_r90 = self.factors[level].T * self.scaling.span_mm
+        radius = np.hypot(*spread.T)
+        sd, r50, r90 = to_sd[:, None] * spread, to_r50 * radius, to_r90 * radius
+        blind = np.logical_not(alive.all(axis=1) if self.method == "published" else alive.any(axis=1))
+        anywhere = np.array(UNKNOWN) * self.scaling.span_mm
+        places, sd = np.where(blind[:, None], 0.0, places), np.where(blind[:, None], anywhere[0], sd)
+        r50, r90 = np.where(blind, anywhere[1], r50), np.where(blind, anywhere[2], r90)
+        return Found(self.scaling.places_mm(places), sd, r50, r90)
+
+    def _pooled(self, inputs: Floats, alive: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        entries = inputs.reshape(len(inputs), -1) if self.method == "published" else masked(inputs, alive)
+        return pooled(forward(self.weights, entries))
 
     def _alive(self, lost: ArrayLike) -> NDArray[np.bool_]:
         alive = np.ones(self.fibres, dtype=bool)
@@ -152,24 +156,30 @@ class Localizer:
             InputError: something is not finite or no JSON, or `folder` cannot be written.
         """
         folder = Path(folder)
-        content = save({name: np.ascontiguousarray(weight) for name, weight in self.weights.items()})
+        arrays = {**self.weights, TABLE: self.table}
+        content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {
             "format": FORMAT,
+            "method": self.method,
             "features": self.features,
             "fibres": self.fibres,
             "rate_hz": self.rate_hz,
             "scaling": {
                 "centre_v": self.scaling.centre.tolist(),
                 "spread_v": self.scaling.spread.tolist(),
+                "memory": self.scaling.memory.tolist(),
+                "usual_v": self.scaling.usual.tolist(),
                 "middle_mm": self.scaling.middle_mm.tolist(),
                 "span_mm": self.scaling.span_mm,
             },
+            "factors": self.factors.tolist(),
             "weights_sha256": hashlib.sha256(content).hexdigest(),
             "split": self.split,
             "test_presses": len(self.test),
             "errors": [dict(row) for row in self.errors],
             "learnt_from": self.learnt_from,
             "test": list(self.test),
+            "recalibrated_by": list(self.recalibrated_by),
             "provenance": dict(self.provenance),
         }
         try:
@@ -200,22 +210,30 @@ class Localizer:
         scaling = Scaling(
             np.array(document.scaling.centre_v),
             np.array(document.scaling.spread_v),
+            np.array(document.scaling.memory).reshape(document.fibres, -1, SIZES[document.features]),
+            np.array(document.scaling.usual_v).reshape(document.fibres, -1),
             np.array(document.scaling.middle_mm),
             document.scaling.span_mm,
         )
         try:
             weights = load(content)
-            refuse_unsound(weights, scaling.entries)
+            table = weights.pop(TABLE)
+            scaling.refuse_unsound(table)
+            refuse_unsound(weights, scaling.entries(document.method), document.method)
         except (KeyError, TypeError, ValueError, SafetensorError) as error:
             raise InputError(f"{path}: no weights of the localizer that {DOCUMENT} describes ({error})") from error
         return cls(
             weights=weights,
             scaling=scaling,
+            table=table,
+            method=document.method,
             features=document.features,
+            factors=np.array(document.factors),
             rate_hz=document.rate_hz,
             learnt_from=document.learnt_from,
             split=document.split,
             test=tuple(document.test),
+            recalibrated_by=tuple(document.recalibrated_by),
             errors=[row.model_dump() for row in document.errors],
             provenance=document.provenance,
         )

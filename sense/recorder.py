@@ -133,11 +133,12 @@ class Recorder:
         """Note that the probe is sent down at `place_mm` (2,); `reading` is the index of the reading that follows.
 
         Args:
+            place_mm: NaN where it is not known.
             press: its number, by default one more than that of the last.
             more: what else is known of it, as JSON.
         """
         self._press, self._down = self._press if press is None else press, True
-        x, y = np.asarray(place_mm, dtype=np.float64).tolist()
+        x, y = (None if np.isnan(value) else value for value in np.asarray(place_mm, dtype=np.float64).tolist())
         self._note({"event": "begun", "press": self._press, "reading": reading, "x_mm": x, "y_mm": y, **more})
 
     def finish(self, reading: int, **more: Any) -> None:

@@ -34,18 +34,18 @@ class Recording:
     """Readings of a pad and the presses made meanwhile.
 
     Attributes:
-        readings: (R, C) volts, one row per reading, one column per fibre.
+        readings: (R, C) volts, one row per reading, one column per fibre; NaN where one is missing.
         times_s: (R,) ascending, s.
-        presses_mm: (Q, 2) places, mm from the pad's centre.
+        presses_mm: (Q, 2) places, mm from the pad's centre; NaN where a press's place is not known.
         begun: (Q,) index of the first reading after the probe was sent down.
         lifted: (Q,) index of the first reading after it was sent up; R if none was taken.
         source: where the recording came from; free JSON.
         torn_presses: presses that were left out because the end of the stream was torn off.
 
     Raises:
-        InputError: no numbers, shapes that do not fit together, values that are not finite or beyond the limits of
-            this module, times that do not ascend, presses that overlap, one without a reading before it, or a
-            source that JSON cannot hold.
+        InputError: no numbers, shapes that do not fit together, infinite values or such beyond the limits of
+            `limits`, no reading at all, half a place, times that do not ascend, presses that overlap, one without a
+            reading before it, or a source that JSON cannot hold.
     """
 
     readings: Array
@@ -73,7 +73,7 @@ class Recording:
         if not isinstance(other, Recording):
             return NotImplemented
         names = ("readings", "times_s", "presses_mm", "begun", "lifted")
-        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+        return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in names)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -81,6 +81,11 @@ class Recording:
     def fibres(self) -> int:
         """C, the number of recorded fibres."""
         return self.readings.shape[1]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(Q,) whether the place of each press is known."""
+        return ~np.isnan(self.presses_mm).any(axis=1)
 
     @property
     def rate_hz(self) -> float:
@@ -92,7 +97,8 @@ class Recording:
         """Hex SHA-256 of all readings and presses, wherever they are kept."""
         digest = hashlib.sha256()
         for array in (self.readings, self.times_s, self.presses_mm, self.begun, self.lifted):
-            digest.update(repr(array.shape).encode() + array.tobytes())
+            plain = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # one NaN of many
+            digest.update(repr(array.shape).encode() + plain.tobytes())
         return digest.hexdigest()
 
     @classmethod
@@ -179,12 +185,14 @@ def _validate(recording: Recording) -> None:
         raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
     if recording.begun.shape != (len(presses),) or recording.lifted.shape != (len(presses),):
         raise InputError(f"{len(presses)} presses have {recording.begun.size} begins and {recording.lifted.size} ends")
-    for name, values, limit, unit in (
-        ("readings", readings, MAX_VOLTS, "V"),
-        ("times", recording.times_s, MAX_S, "s"),
-        ("presses", presses, MAX_MM, "mm"),
-    ):
-        refuse_beyond(name, values.reshape(len(values), -1), limit, unit)
+    refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
+    refuse_beyond("times", recording.times_s[:, None], MAX_S, "s")
+    refuse_beyond("presses", presses, MAX_MM, "mm", missing=True)
+    if np.isnan(readings).all():
+        raise InputError(f"readings are all missing (NaN), all {readings.size} of them, expected some numbers")
+    half = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
+    if half.any():
+        raise InputError(f"press {int(np.argmax(half))} has one of x and y, expected both or neither")
     if (np.diff(recording.times_s) <= 0).any():
         row = int(np.argmax(np.diff(recording.times_s) <= 0)) + 1
         raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")

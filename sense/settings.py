@@ -6,7 +6,8 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from design.settings import Section
 
-Features = Literal["windows", "published"]
+Features = Literal["full", "causal", "early", "published"]
+Method = Literal["masked", "published"]
 Split = Literal["random", "chronological"]
 
 
@@ -84,8 +85,11 @@ class Rig(Section):
 class Localizer(Section):
     """`[localizer]`: how places are learnt from readings."""
 
+    method: Method = Field(
+        default="masked", description="one network for every loss of fibres, or published: 50 tanh, Levenberg-Marquardt"
+    )
     features: Features = Field(
-        default="windows", description="17 baseline-free window means a fibre, or the 3 published filtered values"
+        default="full", description="press and release; causal: up to its end; early: its first readings; or published"
     )
     split: Split = Field(
         default="random", description="presses held back for the test: drawn at random, or the last ones"
@@ -93,10 +97,10 @@ class Localizer(Section):
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")
     lost: int = Field(default=3, ge=0, le=8, description="train and test for up to this many lost fibres")
     members: int = Field(default=2, ge=1, le=64, description="networks whose places are averaged")
-    hidden: int = Field(default=192, ge=1, le=4096, description="width of the hidden layers")
+    hidden: int = Field(default=256, ge=1, le=4096, description="width of the hidden layers")
     layers: int = Field(default=3, ge=1, le=32, description="residual hidden layers after the first")
-    epochs: int = Field(default=240, ge=1, le=100_000, description="times every training press is shown")
-    batch: int = Field(default=128, ge=1, le=65_536, description="presses in a training step")
+    epochs: int = Field(default=600, ge=1, le=100_000, description="times the presses are shown, up to 16 000 steps")
+    batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     rate: float = Field(default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")
 

@@ -81,7 +81,7 @@ def test_run_makes_everything(chain):
     assert [row["lost"] for row in errors] == [0, 1]
     for name in ("design", "fabrication", "calibration", "morphology", "localizer"):
         document = json.loads((out / f"{name}.json").read_text())
-        assert document["format"] == f"padforge-{name}/1"
+        assert document["format"] == f"padforge-{name}/{2 if name == 'localizer' else 1}"
         assert set(document["provenance"]) >= {"command", "seed", "versions", "inputs"}
 
 

@@ -35,7 +35,7 @@ class Steering:
         if press == 0 or press % EVERY:
             return plan
         recording = Recording.open(self._run)
-        errors = np.linalg.norm(locate(self._localizer, recording) - recording.presses_mm, axis=1)
+        errors = np.linalg.norm(locate(self._localizer, recording).places_mm - recording.presses_mm, axis=1)
         places = plan.places_mm.copy()
         high = np.abs(plan.places_mm).max(axis=0)
         candidates = self._rng.uniform(-high, high, (_CANDIDATES, 2))

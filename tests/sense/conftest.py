@@ -7,7 +7,7 @@ from sense import Localizer, Recording, calibrate
 from sense import settings as sense_settings
 from sense.rig.simulated import simulate
 
-QUICK = sense_settings.Localizer(members=2, hidden=48, layers=2, epochs=60, batch=64)
+QUICK = sense_settings.Localizer(members=2, hidden=48, layers=2, epochs=100, batch=64)
 
 
 @pytest.fixture(scope="session")

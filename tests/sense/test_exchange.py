@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from design.errors import InputError
 from sense import Recording, export_csv, import_csv, import_mat
-from sense.exchange import write_places
+from sense.exchange import export_file
 
 MAT = "para5_long_first4500.mat"
 
@@ -58,7 +58,7 @@ def test_readings_of_an_unfinished_last_press_are_kept(tmp_path: Path) -> None:
     [
         ("voltage", np.ones((119, 4)), r"voltage has shape \(119, 4\), expected 40 rows for each of the 3 presses"),
         ("voltage", np.ones((4, 120)), "voltage has shape"),
-        ("voltage", np.full((120, 4), np.nan), "readings hold NaN"),
+        ("voltage", np.full((120, 4), np.nan), "readings are all missing"),
         ("voltage", np.ones((120, 4)) * 1j, "expected real numbers"),
         ("voltage", np.array(["a", "b"], dtype=object), "expected real numbers"),
         ("pos", np.ones((3, 3)), r"pos has shape \(3, 3\)"),
@@ -76,8 +76,41 @@ def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value:
 
 def test_an_unrelated_mat_is_refused(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "other.mat", {"apples": 3})
-    with pytest.raises(InputError, match=r"no variable voltage, pos, tim \(found apples\)"):
+    with pytest.raises(InputError, match=r"no variable voltage, tim \(found apples\)"):
         import_mat(tmp_path / "other.mat")
+
+
+def test_a_mat_without_places_has_presses_of_unknown_place(tmp_path: Path) -> None:
+    content = good()
+    scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
+    blind = import_mat(tmp_path / "blind.mat")
+    assert not blind.known.any()
+    assert blind.begun.tolist() == [20, 60, 100]
+    pos = np.array(content["pos"], dtype=float)
+    pos[:, 1] = np.nan
+    scipy.io.savemat(tmp_path / "partly.mat", content | {"pos": pos})
+    assert import_mat(tmp_path / "partly.mat").known.tolist() == [True, False, True]
+
+
+def holed(recording: Recording) -> Recording:
+    """The recording with a reading, a row and a fibre's readings missing, and two places unknown."""
+    readings, places = np.array(recording.readings), np.array(recording.presses_mm)
+    readings[5, 1] = readings[70] = readings[:, 2] = np.nan
+    places[[0, 7]] = np.nan
+    return Recording(readings, recording.times_s, places, recording.begun, recording.lifted, recording.source)
+
+
+@pytest.mark.parametrize("name", ["run", "run.csv", "run.h5"])
+def test_what_is_missing_stays_missing_and_nothing_else_is(recording: Recording, tmp_path: Path, name: str) -> None:
+    holes = holed(recording)
+    if name == "run":
+        holes.save(tmp_path / name, {})
+    else:
+        export_file(holes, tmp_path / name)
+    found = Recording.open(tmp_path / name)
+    assert found == holes
+    assert found.digest == holes.digest
+    assert found.known.sum() == len(holes.known) - 2
 
 
 def test_csv_gives_back_every_number(recording: Recording, tmp_path: Path) -> None:
@@ -110,12 +143,11 @@ def test_a_press_lasts_while_its_place_stands_on_the_line(tmp_path: Path) -> Non
         (lines([*FINE, "6,1,2"]), "line 8 has 3 values, expected 5"),
         (lines([*FINE, "6,1,two,,"]), "line 8 holds no numbers"),
         (lines([*FINE, "6,1,2,3,"]), "line 8 has one of x_mm and y_mm"),
-        (lines([*FINE, "6,1,nan,,"]), r"readings hold NaN.*row 6"),
-        (lines([*FINE, "6,,2,,"]), r"readings hold NaN.*row 6"),
+        (lines([*FINE, "6,1,-inf,,"]), r"readings hold infinity.*row 6"),
         (lines([*FINE, "2,1,2,,"]), "do not ascend at reading 6"),
         (lines(FINE[1:]), "press 0 goes from reading 0"),
         (lines([*FINE, "6,1,2,8,8", "7,1,2,9,9"]), "press 3 goes from"),
-        (lines([*FINE, "6,1,2,inf,8"]), "presses hold NaN or infinity"),
+        (lines([*FINE, "6,1,2,inf,8"]), "presses hold infinity"),
     ],
 )
 def test_other_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -131,11 +163,6 @@ def test_bytes_at_random_are_an_input_error_and_nothing_else(tmp_path_factory, c
         (folder / name).write_bytes(content)
         with pytest.raises(InputError):
             read(folder / name)
-
-
-def test_places_are_written_one_line_a_press(tmp_path: Path) -> None:
-    write_places(np.array([[1.23456, -2.0], [0.0, 3.5]]), tmp_path / "places.csv")
-    assert (tmp_path / "places.csv").read_text() == "press,x_mm,y_mm\n0,1.2346,-2.0000\n1,0.0000,3.5000\n"
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
@@ -168,5 +195,3 @@ def test_a_folder_for_a_file_and_a_file_for_a_folder_are_one_line(recording: Rec
     for path in (tmp_path, tmp_path / "file" / "r.csv"):
         with pytest.raises(InputError, match="cannot be written"):
             export_csv(recording, path)
-        with pytest.raises(InputError, match="cannot be written"):
-            write_places(np.zeros((1, 2)), path)

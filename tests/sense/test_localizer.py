@@ -13,32 +13,53 @@ from hypothesis import strategies as st
 from design.errors import InputError
 from sense import Localizer, Recording, network, training
 from sense import settings as sense_settings
-from sense.localizer import Scaling
-from sense.training import draw_alive, one_cycle
+from sense.network import pooled
+from sense.presses import Inputs
+from sense.scaling import Scaled, Scaling
+from sense.training import draw_alive, looked_up, one_cycle
 
 
-@given(seed=st.integers(0, 2**32 - 1), members=st.integers(1, 3), layers=st.integers(1, 4))
-def test_numpy_and_torch_agree(seed: int, members: int, layers: int) -> None:
-    options = sense_settings.Localizer(members=members, layers=layers, hidden=24)
+@given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4))
+def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
+    options = sense_settings.Localizer(layers=layers, hidden=24)
     generator = torch.Generator().manual_seed(seed)
     weights = training.initial(3 * 5 + 3, options, generator)
-    inputs = torch.randn(members, 7, 3, 5, generator=generator)
-    alive = torch.rand(members, 7, 3, generator=generator) < 0.6
-    expected = training.forward(weights, training.masked(inputs, alive)).detach().numpy()
+    inputs = torch.randn(7, 3, 5, generator=generator)
+    alive = torch.rand(7, 3, generator=generator) < 0.6
+    expected = training.forward(weights, training.masked(inputs, alive)[None]).detach().numpy()
     plain = {name: weight.detach().numpy() for name, weight in weights.items()}
-    for member in range(members):
-        found = network.forward(plain, network.masked(inputs[member].numpy(), alive[member].numpy()))
-        assert found.dtype == np.float32
-        assert np.allclose(found[member], expected[member], atol=2e-5)
+    found = network.forward(plain, network.masked(inputs.numpy(), alive.numpy()))
+    assert found.dtype == np.float32
+    assert np.allclose(found, expected, atol=2e-5)
 
 
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
 def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed: int) -> None:
     lost = min(lost, fibres - 1)
-    alive = draw_alive(2, 400, fibres, lost, torch.Generator().manual_seed(seed))
-    gone = (~alive).sum(dim=2)
+    alive = draw_alive(800, fibres, lost, torch.Generator().manual_seed(seed))
+    gone = (~alive).sum(dim=1)
     assert gone.max() <= lost
     assert set(gone.unique().tolist()) == set(range(lost + 1))
+
+
+@given(seed=st.integers(0, 999), x=st.floats(-1, 1), y=st.floats(-1, 1))
+def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float) -> None:
+    """Against a bilinear function, which linear interpolation gives exactly."""
+    a, b, c, d = np.random.default_rng(seed).standard_normal(4)
+    grid = np.linspace(-1, 1, 9)
+    u, v = np.meshgrid(grid, grid, indexing="ij")
+    table = torch.from_numpy((a + b * u + c * v + d * u * v)[:, :, None])
+    found = looked_up(table, torch.tensor([[x, y]], dtype=torch.float64))
+    assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
+
+
+def test_the_spread_of_members_adds_to_what_they_expect() -> None:
+    outputs = np.zeros((2, 1, 4), dtype=np.float32)
+    outputs[:, 0, 0] = [-0.3, 0.5]
+    outputs[:, 0, 2:] = np.log(0.2)
+    place, sd = pooled(outputs)
+    assert place[0].tolist() == pytest.approx([0.1, 0.0])
+    assert sd[0].tolist() == pytest.approx([np.sqrt(2 * 0.04 + 0.16), np.sqrt(2 * 0.04)])
 
 
 def test_the_rate_rises_once_and_ends_at_nothing() -> None:
@@ -51,17 +72,55 @@ def test_the_rate_rises_once_and_ends_at_nothing() -> None:
 
 
 def test_a_masked_fibre_changes_nothing(localizer: Localizer, recording: Recording) -> None:
-    inputs = localizer.inputs(recording)
-    spoilt = inputs.copy()
+    presses = localizer.inputs(recording)
+    spoilt = presses.inputs.copy()
     spoilt[:, 1] = np.nan
-    assert np.array_equal(localizer.places(spoilt, [1]), localizer.places(inputs, [1]))
-    assert not np.array_equal(localizer.places(inputs, [1]), localizer.places(inputs))
+    masked = localizer.locate(presses, [1])
+    assert np.array_equal(localizer.locate(Scaled(spoilt, presses.alive), [1]).places_mm, masked.places_mm)
+    assert not np.array_equal(masked.places_mm, localizer.locate(presses).places_mm)
+
+
+def test_a_fibre_that_gave_no_readings_is_as_good_as_masked(localizer: Localizer, recording: Recording) -> None:
+    readings = np.array(recording.readings)
+    readings[:, 1] = np.nan
+    found = localizer.locate(localizer.inputs(replace(recording, readings=readings)))
+    expected = localizer.locate(localizer.inputs(recording), [1])
+    assert np.array_equal(found.places_mm, expected.places_mm)
+    assert np.array_equal(found.r90_mm, expected.r90_mm)
+
+
+def test_a_press_without_any_fibre_may_be_anywhere(localizer: Localizer, recording: Recording) -> None:
+    readings = np.array(recording.readings)
+    readings[recording.begun[7] - 15 : recording.lifted[7] + 25] = np.nan
+    found = localizer.locate(localizer.inputs(replace(recording, readings=readings)))
+    assert found.places_mm[7] == pytest.approx(localizer.scaling.middle_mm)
+    assert found.r50_mm[7] < found.r90_mm[7]
+    assert found.r50_mm[7] > 0.5 * localizer.scaling.span_mm
+    assert np.isfinite(found.places_mm).all()
+
+
+def test_the_radii_of_a_press_anywhere_hold_what_they_say() -> None:
+    from sense.localizer import UNKNOWN
+
+    far = np.hypot(*np.random.default_rng(0).uniform(-1, 1, (2, 200_000)))
+    assert np.mean(far <= UNKNOWN[1]) == pytest.approx(0.5, abs=0.005)
+    assert np.mean(far <= UNKNOWN[2]) == pytest.approx(0.9, abs=0.005)
 
 
 def test_a_press_is_located_alone_as_among_others(localizer: Localizer, recording: Recording) -> None:
-    inputs = localizer.inputs(recording)
-    assert np.allclose(localizer.places(inputs[17:18]), localizer.places(inputs)[17:18], atol=1e-4)
-    assert localizer.places(inputs[:0]).shape == (0, 2)
+    presses = localizer.inputs(recording)
+    found = localizer.locate(presses)
+    assert np.allclose(localizer.locate(presses[17:18]).places_mm, found.places_mm[17:18], atol=1e-4)
+    assert localizer.locate(presses[:0]).places_mm.shape == (0, 2)
+
+
+def test_less_is_known_with_fibres_lost(localizer: Localizer, recording: Recording) -> None:
+    presses = localizer.inputs(recording)
+    means = [localizer.locate(presses, range(lost)).r90_mm.mean() for lost in range(4)]
+    assert means == sorted(means)
+    found = localizer.locate(presses)
+    assert (found.r50_mm < found.r90_mm).all()
+    assert (found.sd_mm > 0).all()
 
 
 @pytest.mark.parametrize(
@@ -71,16 +130,18 @@ def test_masks_that_cannot_be_are_refused(
     localizer: Localizer, recording: Recording, lost: list[int], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        localizer.places(localizer.inputs(recording), lost)
+        localizer.locate(localizer.inputs(recording), lost)
 
 
 def test_files_keep_every_bit(localizer: Localizer, recording: Recording, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     found = Localizer.load(tmp_path)
     assert all(np.array_equal(found.weights[name], weight) for name, weight in localizer.weights.items())
-    inputs = localizer.inputs(recording)
-    assert np.array_equal(found.inputs(recording), inputs)
-    assert np.array_equal(found.places(inputs, [2]), localizer.places(inputs, [2]))
+    presses = localizer.inputs(recording)
+    assert np.array_equal(found.inputs(recording).inputs, presses.inputs)
+    again, before = found.locate(presses, [2]), localizer.locate(presses, [2])
+    assert np.array_equal(again.places_mm, before.places_mm)
+    assert np.array_equal(again.r90_mm, before.r90_mm)
     assert found.errors == localizer.errors
     assert found.test == localizer.test
     found.save(tmp_path / "again")
@@ -123,12 +184,18 @@ def test_recordings_that_do_not_suit_are_refused(localizer: Localizer, recording
         localizer.inputs(faster)
 
 
+def raw(windows: np.ndarray, history: np.ndarray | None = None) -> Inputs:
+    past = np.zeros((*windows.shape[:2], 0)) if history is None else history
+    return Inputs(windows, past, np.ones(windows.shape[:2], dtype=bool))
+
+
 @given(seed=st.integers(0, 999), gain=st.floats(1e-3, 1e3))
 def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None:
     rng = np.random.default_rng(seed)
     inputs, places = rng.standard_normal((30, 3, 4)), rng.uniform(-9, 9, (30, 2))
-    plain, scaled = Scaling.fit(inputs, places), Scaling.fit(gain * inputs, places)
-    assert np.allclose(plain.inputs(inputs), scaled.inputs(gain * inputs), atol=1e-4)
+    (plain, table), (scaled, same) = (Scaling.fit(raw(factor * inputs), places) for factor in (1, gain))
+    assert np.allclose(plain.inputs(raw(inputs)).inputs, scaled.inputs(raw(gain * inputs)).inputs, atol=1e-4)
+    assert np.allclose(table, same, atol=1e-3)
     assert np.abs(plain.targets(places)).max() <= 1 + 1e-6
     assert np.allclose(plain.places_mm(plain.targets(places)), places, atol=1e-5)
 
@@ -136,7 +203,15 @@ def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None
 def test_a_dead_fibre_is_scaled_to_finite_numbers() -> None:
     inputs = np.zeros((10, 2, 3))
     inputs[:, 0] = np.random.default_rng(0).standard_normal((10, 3))
-    assert np.isfinite(Scaling.fit(inputs, np.zeros((10, 2))).inputs(inputs)).all()
+    assert np.isfinite(Scaling.fit(raw(inputs), np.zeros((10, 2)))[0].inputs(raw(inputs)).inputs).all()
+
+
+def test_a_fibre_that_was_never_there_is_scaled_to_finite_numbers() -> None:
+    rng = np.random.default_rng(0)
+    inputs = replace(raw(rng.standard_normal((10, 2, 3))), alive=np.tile([True, False], (10, 1)))
+    scaling, table = Scaling.fit(inputs, rng.uniform(-9, 9, (10, 2)))
+    assert np.isfinite(scaling.inputs(inputs).inputs).all()
+    assert np.isfinite(table).all()
 
 
 def edited(document: dict, path: str, value: object) -> dict:
@@ -157,6 +232,15 @@ def edited(document: dict, path: str, value: object) -> dict:
         ("fibres", 3, r"scaling\.centre_v"),
         ("fibres", 0, "fibres"),
         ("fibres", True, "fibres"),
+        ("method", "guess", "method"),
+        ("method", "published", "features"),
+        ("factors", [], "factors"),
+        ("factors.0", [1.0, 1.0], "factors"),
+        ("factors.0.0", -1.0, "factors"),
+        ("scaling.memory", [], r"scaling\.memory"),
+        ("scaling.memory.0.0", [1.0], r"scaling\.memory"),
+        ("scaling.memory.0.0.0", np.nan, "memory"),
+        ("scaling.usual_v.0", [1.0], r"scaling\.usual_v"),
         *(("rate_hz", value, "rate_hz") for value in (0, -1.0, "13", np.nan, np.inf, 1e-300, None)),
         *(
             (f"scaling.{key}.0.0", value, key)
@@ -233,17 +317,20 @@ def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer,
 @pytest.mark.parametrize("lost", [[10**20], [0.5], [True], ["a"]])
 def test_a_mask_that_is_no_index_is_refused(localizer: Localizer, recording: Recording, lost: list) -> None:
     with pytest.raises(InputError, match=r"lost fibre .*no such fibre, allowed are 0 to 3"):
-        localizer.places(localizer.inputs(recording), lost)
+        localizer.locate(localizer.inputs(recording), lost)
 
 
 def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localizer, recording: Recording) -> None:
     readings = 1000.0 * np.random.default_rng(0).choice([-1, 1], recording.readings.shape)
-    still = Scaling(localizer.scaling.centre, np.full_like(localizer.scaling.spread, 1e-40), np.zeros(2), 1e5)
+    spread = np.full_like(localizer.scaling.spread, 1e-40)
+    still = replace(localizer.scaling, spread=spread, middle_mm=np.zeros(2), span_mm=1e5)
     found = replace(localizer, scaling=still)
-    assert np.isfinite(found.places(found.inputs(replace(recording, readings=readings)))).all()
+    places = found.locate(found.inputs(replace(recording, readings=readings)))
+    assert np.isfinite(places.places_mm).all()
+    assert np.isfinite(places.r90_mm).all()
 
 
 def test_a_fibre_that_varies_by_rounding_only_is_not_blown_up() -> None:
     inputs = 3.3 + 1e-15 * np.random.default_rng(0).standard_normal((10, 2, 3))
-    scaling = Scaling.fit(inputs, np.zeros((10, 2)))
+    scaling, _ = Scaling.fit(raw(inputs), np.zeros((10, 2)))
     assert (scaling.spread == 1).all()

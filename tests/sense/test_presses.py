@@ -5,7 +5,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.presses import DOWN, INPUTS, UP, published_inputs, window_inputs
+from sense.presses import (
+    DOWN,
+    FEATURES,
+    PAST,
+    PASTS,
+    REST,
+    SIZES,
+    SLOW,
+    UP,
+    bridged,
+    history,
+    press_inputs,
+    published_inputs,
+    window_inputs,
+)
 
 PRESSES, FIBRES = 5, 3
 BEGUN = 40 * np.arange(PRESSES) + 20
@@ -35,6 +49,9 @@ def test_published_inputs_are_medians_before_in_and_after() -> None:
     assert np.allclose(found[2], np.stack(expected, axis=1))
 
 
+INPUTS = {"full": window_inputs, "published": published_inputs}
+
+
 @pytest.mark.parametrize("name", INPUTS)
 def test_a_press_is_told_by_its_own_readings_only(name: str) -> None:
     readings, press = noise(), 2
@@ -60,11 +77,68 @@ def test_windows_forget_the_rest_and_keep_the_scale(offset: float, gain: float) 
     assert np.allclose(window_inputs(gain * noise() + offset, BEGUN, LIFTED), gain * plain)
 
 
-@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("name", FEATURES)
 @given(gaps=st.lists(st.integers(1, 30), min_size=2, max_size=20), after=st.integers(0, 30))
 def test_presses_of_any_length_have_inputs_within_the_readings(name: str, gaps: list[int], after: int) -> None:
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     readings = np.random.default_rng(0).uniform(1, 2, (edges[-1] + after, 2))
-    found = INPUTS[name](readings, edges[::2], edges[1::2])
-    assert found.shape[:2] == (len(edges) // 2, 2)
-    assert np.isfinite(found).all()
+    found = press_inputs(readings, edges[::2], edges[1::2], name)
+    assert found.windows.shape == (len(edges) // 2, 2, SIZES[name])
+    assert found.history.shape == (len(edges) // 2, 2, PASTS[name])
+    assert np.isfinite(found.windows).all()
+    assert np.isfinite(found.history).all()
+    assert found.alive.all()
+
+
+def test_a_press_up_to_its_end_knows_nothing_of_its_release() -> None:
+    readings, press = noise(), 2
+    before = {name: press_inputs(readings, BEGUN, LIFTED, name).windows[press] for name in ("causal", "early")}
+    readings[LIFTED[press] :] = 99
+    after = {name: press_inputs(readings, BEGUN, LIFTED, name).windows[press] for name in ("causal", "early")}
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    readings[BEGUN[press] + 8 :] = 77
+    assert np.array_equal(press_inputs(readings, BEGUN, LIFTED, "early").windows[press], before["early"])
+
+
+def test_history_is_what_came_before_relative_to_the_rest() -> None:
+    readings = np.random.default_rng(3).standard_normal((6000, 2))
+    begun = np.array([300, 5000])
+    found = history(readings, begun)
+    rest = readings[5000 + REST[0] : 5000].mean(axis=0)
+    for number, (first, end) in enumerate(PAST):
+        assert np.allclose(found[1, :, number], readings[5000 + first : 5000 + end].mean(axis=0) - rest)
+    samples = readings[5000 - SLOW[0] : 5000 : SLOW[0] // 200]
+    assert np.allclose(found[1, :, len(PAST)], np.median(samples, axis=0) - rest)
+    readings[5000:] = 99
+    assert np.array_equal(history(readings, begun), found)
+
+
+def test_history_before_the_first_reading_is_the_first_reading() -> None:
+    readings = np.arange(40.0)[:, None] + np.zeros((1, 2))
+    found = history(readings, np.array([20]))
+    assert np.allclose(found[0, 0, len(PAST) - 1], readings[0, 0] - readings[10:20, 0].mean())
+
+
+def test_short_gaps_are_bridged_and_do_not_spread() -> None:
+    readings = noise()
+    holed = readings.copy()
+    holed[105] = np.nan
+    holed[:3, 1] = np.nan
+    filled = bridged(holed)
+    assert np.allclose(filled[105], (readings[104] + readings[106]) / 2)
+    assert np.array_equal(filled[:3, 1], np.repeat(readings[3, 1], 3))
+    there = ~np.isnan(holed)
+    assert np.array_equal(filled[there], readings[there])
+    assert press_inputs(holed, BEGUN, LIFTED, "full").alive.all()
+
+
+def test_a_fibre_without_readings_counts_as_lost_in_those_presses_only() -> None:
+    readings = noise()
+    readings[95:130, 1] = np.nan
+    found = press_inputs(readings, BEGUN, LIFTED, "full")
+    assert np.array_equal(~found.alive, np.outer(np.arange(PRESSES) == 2, np.arange(FIBRES) == 1))
+    readings[:, 2] = np.nan
+    found = press_inputs(readings, BEGUN, LIFTED, "full")
+    assert not found.alive[:, 2].any()
+    assert np.isfinite(found.windows).all()
+    assert np.isfinite(found.history).all()

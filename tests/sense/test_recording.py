@@ -110,8 +110,10 @@ def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: {"readings": spoiled(r.readings, (7, 0), np.nan)}, r"readings hold NaN.*row 7"),
-        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.inf)}, r"presses hold NaN or infinity.*row 3"),
+        (lambda r: {"readings": spoiled(r.readings, (7, 0), np.inf)}, r"readings hold infinity.*row 7"),
+        (lambda r: {"readings": np.full_like(r.readings, np.nan)}, "readings are all missing"),
+        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.inf)}, r"presses hold infinity.*row 3"),
+        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.nan)}, "press 3 has one of x and y"),
         (lambda r: {"times_s": spoiled(r.times_s, 9, 0.0)}, "do not ascend at reading 9"),
         (lambda r: {"times_s": r.times_s[:-1]}, r"times have shape"),
         (lambda r: {"readings": r.readings[:, :0]}, r"readings have shape"),
@@ -174,7 +176,7 @@ def test_implausible_readings_in_the_stream_are_refused(tmp_path: Path) -> None:
             for value in ("1e999", "1e30", "20.0", "true", '"20"', "-1", "NaN")
         ),
         *(('"press": 0,', f'"press": {value},') for value in ("1e999", "0.0", "false", '"0"', "null", "9" * 30)),
-        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"', "NaN", "null")),
+        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"')),
         ('"event": "begun", ', ""),
         ('{"event"', "[" * 100_000 + '{"event"'),
         ('{"event"', '3\n{"event"'),

@@ -1,0 +1,134 @@
+"""Evaluation: how far off a localizer is, by sets of lost fibres, by place, and whether its radii hold."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.errors import InputError
+from design.losses import lost_subsets
+
+from .localizer import Found, Localizer
+from .presses import bridged, window_inputs
+from .recording import Recording
+
+FORMAT = "padforge-calibration/1"
+CELLS = 5
+"""Cells along a side of the map of errors by place."""
+ACTIVE = 0.02
+"""Share of its total variation that a fibre must change by to be active in a press (paper, table III)."""
+
+Array = NDArray[np.float64]
+
+
+def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
+    """Errors of a localizer for every set of lost fibres of the sizes `levels`.
+
+    On the recording it was trained on, only the presses held back then count; of any other, all of known place do.
+
+    Returns:
+        A document with "errors", one row per level: how many sets of lost fibres were tried; mean, standard deviation
+        and greatest of their mean errors; median and 95th percentile over all their presses, mm; shares of presses
+        within the radii of 50 and 90 %. Besides "split" ("none" for another recording), "test_presses", "by_subset"
+        (mean error of each set), "by_place" (`by_place`), "idle_share" of each fibre, and "test" (places pressed, and
+        found with all fibres).
+
+    Raises:
+        InputError: no level, one that leaves no fibre, no place known, a recording seen in a recalibration, or one that does not
+            suit the localizer.
+    """
+    levels, presses = tuple(levels), len(recording.presses_mm)
+    if not levels:
+        raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
+    digest = recording.digest
+    if digest in localizer.recalibrated_by:
+        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
+    own = digest == localizer.learnt_from
+    if own and not max(localizer.test) < presses:
+        raise InputError(
+            f"test press {max(localizer.test)} of the localizer: no such press, allowed are 0 to {presses - 1}"
+        )
+    test = np.array(localizer.test, dtype=np.int64) if own else np.flatnonzero(recording.known)
+    if len(test) == 0:
+        raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
+    inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
+    rows, by_subset = [], []
+    for level in levels:
+        if not 0 <= level < localizer.fibres:
+            raise InputError(f"lost is {level}, allowed is 0 to {localizer.fibres - 1}, so that a fibre is left")
+        subsets = lost_subsets(localizer.fibres, level)
+        found = [localizer.locate(inputs, subset) for subset in subsets]
+        rows.append(_summary(level, found, places_mm))
+        by_subset += [
+            {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
+            for subset, each in zip(subsets, found, strict=True)
+        ]
+    whole = localizer.locate(inputs)
+    return {
+        "format": FORMAT,
+        "errors": rows,
+        "split": localizer.split if own else "none",
+        "test_presses": len(test),
+        "by_subset": by_subset,
+        "by_place": by_place(whole.places_mm, places_mm),
+        "idle_share": idle_share(recording).tolist(),
+        "test": {
+            "press": test.tolist(),
+            "pressed_mm": places_mm.tolist(),
+            "found_mm": whole.places_mm.tolist(),
+            "r90_mm": whole.r90_mm.tolist(),
+        },
+        "provenance": dict(localizer.provenance),
+    }
+
+
+def distances(found_mm: Array, pressed_mm: Array) -> Array:
+    """(Q,) distance of (Q, 2) places."""
+    return np.hypot(*(found_mm - pressed_mm).T)
+
+
+def by_place(found_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
+    """Presses, mean and greatest error in each cell of the pad that was pressed; "x_mm", "y_mm" are its middle."""
+    low, high = pressed_mm.min(axis=0), pressed_mm.max(axis=0)
+    side = np.where(high > low, (high - low) / CELLS, 1.0)
+    cells = np.minimum(((pressed_mm - low) / side).astype(int), CELLS - 1)
+    errors = distances(found_mm, pressed_mm)
+    rows = []
+    for cell in np.unique(cells, axis=0):
+        inside = (cells == cell).all(axis=1)
+        x, y = low + (cell + 0.5) * side
+        rows.append(
+            {
+                "x_mm": float(x),
+                "y_mm": float(y),
+                "presses": int(inside.sum()),
+                "mean_mm": float(errors[inside].mean()),
+                "max_mm": float(errors[inside].max()),
+            }
+        )
+    return rows
+
+
+def idle_share(recording: Recording) -> Array:
+    """(C,) share of presses in which each fibre is idle: it changes by less than 2 % of its range over all presses."""
+    changes = window_inputs(bridged(recording.readings), recording.begun, recording.lifted, release=False)[:, :, -1]
+    variation = np.ptp(changes, axis=0)
+    return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
+
+
+def _summary(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
+    """A row of "errors" from what was found with each set of so many lost fibres."""
+    errors = np.stack([distances(each.places_mm, places_mm) for each in found])
+    means = errors.mean(axis=1)
+    return {
+        "lost": lost,
+        "subsets": len(errors),
+        "mean_mm": float(means.mean()),
+        "std_mm": float(means.std()),
+        "max_mm": float(means.max()),
+        "median_mm": float(np.median(errors)),
+        "p95_mm": float(np.percentile(errors, 95)),
+        "within_r50": float(np.mean([error <= each.r50_mm for error, each in zip(errors, found, strict=True)])),
+        "within_r90": float(np.mean([error <= each.r90_mm for error, each in zip(errors, found, strict=True)])),
+    }
