@@ -74,7 +74,7 @@ def report(folder: Path) -> None:
 
 
 @cli.command()
-@click.argument("name", type=click.Choice(["contact", "objective", "search", "filter", "mould"]))
+@click.argument("name", type=click.Choice(["contact", "objective", "search", "filter", "localizer", "mould"]))
 @out_option("out/bench")
 @json_option
 def bench(name: str, out: Path, as_json: bool) -> None:
@@ -87,12 +87,14 @@ def bench(name: str, out: Path, as_json: bool) -> None:
     from design.bench_table import lines
     from fabricate.bench import bench_mould
     from sense.bench_filter import bench_filter
+    from sense.bench_localizer import bench_localizer
 
     benches = {
         "contact": bench_contact,
         "objective": bench_objective,
         "search": bench_search,
         "filter": bench_filter,
+        "localizer": bench_localizer,
         "mould": bench_mould,
     }
     with progress() as bar:

@@ -5,6 +5,7 @@ import io
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from itertools import cycle
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from .files import provenance, write_json, write_text
-from .palette import ALARM, FAINT, HORIZONTAL, INK, VERTICAL
+from .palette import CURVES, FAINT, INK
 from .plan import save_figure
 
 FORMAT = "padforge-bench/1"
@@ -101,7 +102,7 @@ def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:
     scale, unit = (1e3, "ms") if min(row.seconds for row in measured) < 0.1 else (1, "s")
     cases = list(dict.fromkeys(row.case for row in measured))
     figure = Figure(figsize=(4 * len(cases), 3.8), layout="constrained")
-    colours = dict(zip(dict.fromkeys(row.way for row in rows), (INK, VERTICAL, HORIZONTAL, ALARM), strict=False))
+    colours = dict(zip(dict.fromkeys(row.way for row in measured), cycle(CURVES), strict=False))
     panels = figure.subplots(1, len(cases), sharey=True, squeeze=False)[0]
     for axes, case in zip(panels, cases, strict=True):
         for way, colour in colours.items():

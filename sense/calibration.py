@@ -14,7 +14,7 @@ from design.settings import validated
 
 from . import settings
 from .evaluation import distances, evaluate
-from .health import HealthModel
+from .health import FELT, RECORDED, HealthModel
 from .localizer import Found, Localizer
 from .monitor import Finding
 from .network import refuse_unsound
@@ -66,10 +66,11 @@ def calibrate(
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by["inputs"] = {"recording": recording.digest}
-    localizer = replace(
-        learn(recording, training, options, rng, progress), split=options.split, test=tuple(test.tolist())
-    )
-    localizer = replace(localizer, provenance=made_by)
+    from design.threads import one_torch_thread
+
+    with one_torch_thread():
+        localizer = learn(recording, training, options, rng, progress)
+    localizer = replace(localizer, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     levels = range(min(options.lost, recording.fibres - 1) + 1) if options.method == "masked" else (0,)
     document = evaluate(localizer, recording, levels)
     document |= {"training_presses": len(training), "settings": options.model_dump()}
@@ -86,19 +87,31 @@ def learn(
     """Train a localizer on the presses `training` of a recording, by index.
 
     Of them, a share is not trained on but ends the training and finds the radii: drawn at random, or the last ones, as
-    the split is.
+    the split is. Presses are shown as they were commanded and, once more, as they would be found in the readings.
 
     Raises:
         InputError: the training diverged.
     """
-    raw = press_inputs(recording.readings, recording.begun, recording.lifted, options.features)[training]
-    places_mm = recording.presses_mm[training]
-    taught, checked = split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
-    scaling, table = Scaling.fit(raw[taught], places_mm[taught])
-    presses, targets = scaling.inputs(raw), scaling.targets(places_mm)
+    taught, checked = (
+        training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
+    )
+    edges = recording.begun, recording.lifted
+    raw = press_inputs(recording.readings, *edges, options.features)
+    shown_raw, shown_mm, held_mm = raw[taught], recording.presses_mm[taught], recording.presses_mm[checked]
+    if options.method == "masked":
+        from .felt import felt  # compiled, which takes a moment to load
+
+        again = felt(recording.readings, recording.times_s, *edges)
+        shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
+        shown_mm = np.concatenate([shown_mm, shown_mm])
+    scaling, table = Scaling.fit(shown_raw, shown_mm)
+    held_presses = scaling.inputs(raw[checked])
     from .training import Samples, train  # torch, seconds to import, is needed here only
 
-    shown, held = (Samples(presses.inputs[part], presses.alive[part], targets[part]) for part in (taught, checked))
+    shown, held = (
+        Samples(presses.inputs, presses.alive, scaling.targets(places))
+        for presses, places in ((scaling.inputs(shown_raw), shown_mm), (held_presses, held_mm))
+    )
     if options.method == "masked":
         weights = train(shown, held, table, options, rng, progress)
     else:
@@ -120,7 +133,7 @@ def learn(
         learnt_from=recording.digest,
     )
     levels = min(options.lost, recording.fibres - 1) + 1 if options.method == "masked" else 1
-    return replace(localizer, factors=radii(localizer, presses[checked], places_mm[checked], levels))
+    return replace(localizer, factors=radii(localizer, held_presses, held_mm, levels))
 
 
 def radii(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Array:
@@ -159,22 +172,33 @@ def split_presses(
     return np.sort(order[:-held]), np.sort(order[-held:])
 
 
-def learn_health(recording: Recording, localizer: Localizer) -> HealthModel:
+def learn_health(recording: Recording, localizer: Localizer) -> dict[str, HealthModel]:
     """Learn what the healthy pad gives from the presses of the recording that `localizer` did not hold back.
+
+    Returns:
+        By name of the files, one model for recordings whose presses were commanded, and one for those that are found.
 
     Raises:
         InputError: too few presses, or no living fibre.
     """
+    from .felt import felt
+
     held = np.zeros(len(recording.presses_mm), dtype=bool)
     held[list(localizer.test)] = True
-    return HealthModel.fit(
-        recording.readings,
-        recording.times_s,
-        recording.begun[~held],
-        recording.lifted[~held],
-        rng=np.random.default_rng(int(localizer.provenance["seed"])),
-        provenance=localizer.provenance,
-    )
+    readings, times_s = recording.readings, recording.times_s
+    commanded = recording.begun, recording.lifted
+    seed = int(localizer.provenance["seed"])
+    return {
+        name: HealthModel.fit(
+            readings,
+            times_s,
+            begun[~held],
+            lifted[~held],
+            rng=np.random.default_rng(seed),
+            provenance=localizer.provenance,
+        )
+        for name, (begun, lifted) in ((RECORDED, commanded), (FELT, felt(readings, times_s, *commanded)))
+    }
 
 
 def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = (), findings: Sequence[Finding] = ()) -> Found:

@@ -1,12 +1,12 @@
 """The published localizer as a preset: 50 tanh neurons trained by Levenberg-Marquardt (`design.levenberg_marquardt`).
 
-It knows no lost fibres; the published way is to train another network for every set of them (`robustness`).
+It knows no lost fibres; the published way is to train another network for every set of them (`robustness`). Set torch
+to one thread: see `design.levenberg_marquardt`.
 """
 
 import numpy as np
 
 from design.levenberg_marquardt import fit
-from design.threads import one_torch_thread
 
 from .network import Weights
 from .training import Samples
@@ -26,8 +26,7 @@ def train_published(learn: Samples, check: Samples, rng: np.random.Generator) ->
         Weights as `network.forward` takes them, the scales of the published network folded in.
     """
     x, y, *checks = (_flat(part) for part in (learn.inputs, learn.places, check.inputs, check.places))
-    with one_torch_thread():
-        network = fit(x, y, rng, HIDDEN, check=(checks[0], checks[1]))
+    network = fit(x, y, rng, HIDDEN, check=(checks[0], checks[1]))
     into, onto = network.inputs, network.targets
     plain = network.hidden[:, :-1]
     slope = np.divide(plain, into.half, out=np.zeros_like(plain), where=into.half > 0)

@@ -10,6 +10,7 @@ from design.console import json_option, load_spec, progress, seed_option, show_r
 from design.errors import InputError
 
 from .cli_live import live
+from .cli_studies import recalibrate, robustness, size_curve
 from .rig.cli import describe, doctor, record
 
 if TYPE_CHECKING:
@@ -59,6 +60,9 @@ def sense() -> None:
 sense.add_command(record)
 sense.add_command(doctor)
 sense.add_command(live)
+sense.add_command(recalibrate)
+sense.add_command(robustness)
+sense.add_command(size_curve)
 
 
 @sense.command("import")
@@ -115,8 +119,8 @@ def calibrate(
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
 
-    Writes localizer.safetensors, localizer.json, health.safetensors, health.json, calibration.json, error_map.png
-    and error_by_loss.png.
+    Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
+    error_map.png and error_by_loss.png.
     """
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     document = run_calibration(load_spec(spec), _open(recording), out or recording.absolute().parent, overrides)
@@ -149,26 +153,27 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
         health = _health(recording, localizer)
     with staged(out) as folder:
         localizer.save(folder)
-        if health:
-            health.save(folder)
+        for name, model in health.items():
+            model.save(folder, name)
         write_json(folder / "calibration.json", document)
         draw_error_map(document, folder / "error_map.png")
         draw_error_by_loss(document, folder / "error_by_loss.png")
     if not health:
-        for name in (watch.DOCUMENT, watch.WEIGHTS):  # of an earlier calibration, which must not speak for this one
-            (out / name).unlink(missing_ok=True)
+        for name in (watch.RECORDED, watch.FELT):  # of an earlier calibration, which must not speak for this one
+            for file in watch.files_of(out, name):
+                file.unlink(missing_ok=True)
     return document
 
 
-def _health(recording: "Recording", localizer: "Localizer") -> "HealthModel | None":
-    """What health is told by, or nothing, and a line that says so, where the recording does not suffice."""
+def _health(recording: "Recording", localizer: "Localizer") -> "dict[str, HealthModel]":
+    """Models that health is told by, or none, and a line that says so, where the recording does not suffice."""
     from .calibration import learn_health
 
     try:
         return learn_health(recording, localizer)
     except InputError as error:
         click.echo(f"no watch is kept on the fibres' health: {error}", err=True)
-        return None
+        return {}
 
 
 @sense.command()
@@ -244,10 +249,10 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
 
 def _findings(model: Path, recording: "Recording") -> "list[Finding]":
     """What is wrong with the fibres of a recording, as far as the model's folder tells health."""
-    from .health import DOCUMENT, HealthModel
+    from .health import RECORDED, HealthModel, files_of
     from .monitor import examine
 
-    if not (model / DOCUMENT).exists():
+    if not files_of(model, RECORDED)[0].exists():
         return []
     return examine(HealthModel.load(model), recording.readings, recording.times_s, recording.begun, recording.lifted)
 

@@ -109,5 +109,5 @@ def read_document(document: Mapping[str, Any], where: str) -> LocalizerDocument:
     return found
 
 
-def _sizes(rows: Sequence[Sequence[float]]) -> list[int]:
+def _sizes(rows: Sequence[Sequence[Any]]) -> list[int]:
     return [len(row) for row in rows]

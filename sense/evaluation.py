@@ -1,6 +1,7 @@
 """Evaluation: how far off a localizer is, by sets of lost fibres, by place, and whether its radii hold."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,8 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
         found with all fibres).
 
     Raises:
-        InputError: no level, one that leaves no fibre, no place known, a recording seen in a recalibration, or one that does not
-            suit the localizer.
+        InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
+            or was seen in its recalibration.
     """
     levels, presses = tuple(levels), len(recording.presses_mm)
     if not levels:
@@ -53,17 +54,7 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     if len(test) == 0:
         raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
     inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
-    rows, by_subset = [], []
-    for level in levels:
-        if not 0 <= level < localizer.fibres:
-            raise InputError(f"lost is {level}, allowed is 0 to {localizer.fibres - 1}, so that a fibre is left")
-        subsets = lost_subsets(localizer.fibres, level)
-        found = [localizer.locate(inputs, subset) for subset in subsets]
-        rows.append(_summary(level, found, places_mm))
-        by_subset += [
-            {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
-            for subset, each in zip(subsets, found, strict=True)
-        ]
+    rows, by_subset = errors_by_loss(localizer.fibres, levels, partial(localizer.locate, inputs), places_mm)
     whole = localizer.locate(inputs)
     return {
         "format": FORMAT,
@@ -81,6 +72,32 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
         },
         "provenance": dict(localizer.provenance),
     }
+
+
+def errors_by_loss(
+    fibres: int, levels: Iterable[int], locate: Callable[[tuple[int, ...]], Found], places_mm: Array
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """ "errors" and "by_subset" as `evaluate` gives them.
+
+    Args:
+        fibres: how many there are. levels: how many are lost.
+        locate: finds the presses without the fibres given by index. places_mm: (Q, 2) where they were.
+
+    Raises:
+        InputError: a level that leaves no fibre.
+    """
+    rows, by_subset = [], []
+    for level in levels:
+        if not 0 <= level < fibres:
+            raise InputError(f"lost is {level}, allowed is 0 to {fibres - 1}, so that a fibre is left")
+        subsets = lost_subsets(fibres, level)
+        found = [locate(subset) for subset in subsets]
+        rows.append(summary(level, found, places_mm))
+        by_subset += [
+            {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
+            for subset, each in zip(subsets, found, strict=True)
+        ]
+    return rows, by_subset
 
 
 def distances(found_mm: Array, pressed_mm: Array) -> Array:
@@ -117,7 +134,7 @@ def idle_share(recording: Recording) -> Array:
     return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
 
 
-def _summary(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
+def summary(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
     """A row of "errors" from what was found with each set of so many lost fibres."""
     errors = np.stack([distances(each.places_mm, places_mm) for each in found])
     means = errors.mean(axis=1)

@@ -40,7 +40,8 @@ EXTRAS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 LEAST_SCALE = 1e-3
 """Least spread of what is new in a rest: where nothing is, nothing is divided by it."""
 _MEDIAN_T = 0.7267
-"""Median of the absolute value of Student's t with `FREEDOM` degrees of freedom."""
+_FAR_T = 6.869
+"""Median, and what one in a thousand lies beyond, of the absolute value of Student's t with `FREEDOM` degrees."""
 
 
 @dataclass(frozen=True)
@@ -268,8 +269,8 @@ def _constant(traces: Array) -> NDArray[np.bool_]:
 def _step_filters(traces: Array, noise: Array) -> Array:
     """Filters that answer 1 to the spread of a healthy trace and most to a step: step' S^-1 / sqrt(step' S^-1 step).
 
-    S is the second moment of healthy answers (D. O. North, 1943). What varies unlike a normal law, where the probe
-    touches, is scaled down by its far quantile.
+    S is the second moment of healthy answers (D. O. North, 1943). What lies out further, where the probe touches, is
+    scaled down until its far quantile is that of Student's t.
     """
     step = (np.arange(TRACE) >= STEPS[:, None]).astype(float)
     step -= step[:, :REST].mean(axis=1, keepdims=True)
@@ -279,7 +280,7 @@ def _step_filters(traces: Array, noise: Array) -> Array:
         filters[fibre] = np.linalg.solve(own.T @ own / len(own) + noise[fibre] ** 2 * np.eye(TRACE), step.T).T
         filters[fibre] /= np.sqrt((filters[fibre] * step).sum(axis=1, keepdims=True))
         far = np.quantile(np.abs(own @ filters[fibre].T), 0.999, axis=0)
-        filters[fibre] /= np.maximum(far / 3.3, 1.0)[:, None]
+        filters[fibre] /= np.maximum(far / _FAR_T, 1.0)[:, None]
     return filters
 
 

@@ -8,7 +8,9 @@ are found in the readings (`touch`).
 """
 
 import csv
+from math import isnan
 from pathlib import Path
+from reprlib import repr as shortened
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,7 @@ Array = NDArray[np.float64]
 def import_mat(path: str | Path) -> Recording:
     """Read a published recording: `voltage` (R, C) volts, `pos` (2, Q) mm, `tim` (1, R) s, 40 readings a press.
 
-    Without `pos`, or where it is NaN, the places of the presses are unknown.
+    `pos` may lie the other way, (Q, 2); without it, or where it is NaN, the places of the presses are unknown.
 
     Raises:
         InputError: the file is torn, of another kind, or its variables do not fit together.
@@ -48,9 +50,9 @@ def import_mat(path: str | Path) -> Recording:
         raise InputError(f"{path}: voltage has shape {voltage.shape}, expected at least {READINGS_PER_PRESS} rows")
     if "pos" in content:
         pos = _numbers(content["pos"], f"{path}: pos")
-        if pos.ndim != 2 or pos.shape[0] != 2 or pos.shape[1] == 0:
+        if pos.ndim != 2 or 2 not in pos.shape or 0 in pos.shape:
             raise InputError(f"{path}: pos has shape {pos.shape}, expected (2, presses)")
-        places = pos.T
+        places = pos.T if pos.shape[0] == 2 else pos
     else:
         places = np.full((len(voltage) // READINGS_PER_PRESS, 2), np.nan)
     least = READINGS_PER_PRESS * len(places)
@@ -67,7 +69,9 @@ def import_mat(path: str | Path) -> Recording:
         raise InputError(f"{path}: {error}") from error
 
 
-def _numbers(values: NDArray[np.generic], what: str) -> Array:
+def _numbers(values: object, what: str) -> Array:
+    if not isinstance(values, np.ndarray):
+        raise InputError(f"{what} is a {type(values).__name__}, expected a full matrix of real numbers")
     if values.dtype.kind not in "fiu":
         raise InputError(f"{what} holds {values.dtype}, expected real numbers")
     return values.astype(np.float64)
@@ -90,7 +94,7 @@ def import_csv(path: str | Path) -> Recording:
     source = {"kind": "csv", "file": path.name}
     try:
         if not down.any():
-            return found_presses(readings, times_s, source)
+            return _found(readings, times_s, source)
         before = np.vstack([np.full((1, 2), np.nan), places[:-1]])
         begun = np.flatnonzero(down & (places != before).any(axis=1))
         ends = np.append(np.flatnonzero(~down), len(table))
@@ -101,21 +105,37 @@ def import_csv(path: str | Path) -> Recording:
         raise InputError(f"{path}: {error}") from error
 
 
+def _found(readings: Array, times_s: Array, source: dict[str, str]) -> Recording:
+    """A recording of the presses that the readings show, their places unknown."""
+    from .touch import as_commanded, find_presses
+
+    first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
+    Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)
+    presses = find_presses(readings, times_s)
+    if len(presses.touched) == 0:
+        raise InputError("has no press: no line has x_mm and y_mm, and none is found in the readings")
+    begun, lifted = as_commanded(presses, times_s)
+    return Recording(readings, times_s, np.full((len(begun), 2), np.nan), begun, lifted, source)
+
+
 def _read_table(path: Path) -> Array:
     """The numbers of a CSV with the expected header, the places last; an empty cell is NaN, and `?` is `UNKNOWN`."""
     names, lines = read_csv(path)
     placed = names[-2:] == ["x_mm", "y_mm"]
     fibres = len(names) - (3 if placed else 1)
     if names[:1] != ["time_s"] or not 1 <= fibres <= MAX_FIBRES:
-        found = ",".join(names)[:60] or "nothing"
+        found = ",".join(names) or "nothing"
         hint = "; values are separated by commas, not by semicolons" if ";" in found else ""
-        raise InputError(f"{path}: header is {found!r}, expected time_s, one column per fibre, x_mm, y_mm{hint}")
+        raise InputError(
+            f"{path}: header is {shortened(found)}, expected time_s, one column per fibre, x_mm, y_mm{hint}"
+        )
     table = np.full((len(lines), fibres + 3), np.nan)
     for number, line in enumerate(lines):
         if len(line) != len(names):
             raise InputError(f"{path}: line {number + 2} has {len(line)} values, expected {len(names)}")
+        places = [UNKNOWN if cell.strip() == "?" else cell for cell in line[1 + fibres :]]
         try:
-            table[number, : len(names)] = [{"": "nan", "?": UNKNOWN}.get(cell.strip(), cell) for cell in line]
+            table[number, : len(names)] = [cell or "nan" for cell in (*line[: 1 + fibres], *places)]
         except ValueError as error:
             raise InputError(f"{path}: line {number + 2} holds no numbers ({error})") from error
     return table
@@ -131,7 +151,7 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     header = ["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm"]
     places: list[list[float | str]] = [["", ""] for _ in recording.times_s]
     for place, begun, lifted in zip(recording.presses_mm.tolist(), recording.begun, recording.lifted, strict=True):
-        cells: list[float | str] = ["?", "?"] if np.isnan(place).any() else place
+        cells: list[float | str] = ["?", "?"] if isnan(place[0]) else place
         places[begun:lifted] = [cells] * int(lifted - begun)
     with (
         writing(path),
@@ -141,7 +161,7 @@ def export_csv(recording: Recording, path: str | Path) -> None:
         writer = csv.writer(file)
         writer.writerow(header)
         for time, volts, place in zip(recording.times_s.tolist(), recording.readings.tolist(), places, strict=True):
-            writer.writerow([time, *("" if np.isnan(value) else value for value in volts), *place])
+            writer.writerow([time, *("" if isnan(value) else value for value in volts), *place])
 
 
 def import_file(path: Path) -> Recording:

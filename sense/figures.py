@@ -17,7 +17,7 @@ def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
     test = document["test"]
     pressed, found = np.array(test["pressed_mm"]), np.array(test["found_mm"])
     errors = np.hypot(*(found - pressed).T)
-    figure, axes = _canvas(6.4, 5.6)
+    figure, axes = canvas(6.4, 5.6)
     lines = list(np.stack([pressed, found], axis=1))
     axes.add_collection(LineCollection(lines, colors=INK, linewidths=0.6, alpha=0.55))
     dots = axes.scatter(
@@ -35,14 +35,14 @@ def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
         color=INK,
         fontsize=11,
     )
-    _explain(axes, "dot: place pressed; line: to the place found")
+    explain(axes, "dot: place pressed; line: to the place found")
     save_figure(figure, path)
 
 
 def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
     """Draw the error against the number of lost fibres: `error_by_loss.png` of a calibration document."""
     rows = document["errors"]
-    figure, axes = _canvas(6.0, 4.4)
+    figure, axes = canvas(6.0, 4.4)
     for at, row in enumerate(rows):
         means = [s["mean_mm"] for s in document["by_subset"] if len(s["lost"]) == row["lost"]]
         # Spread sideways in order of the error, so that no two dots of a level hide each other.
@@ -62,11 +62,12 @@ def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
     axes.set_title(
         f"One network, {document['test_presses']} presses never trained on\n", loc="left", color=INK, fontsize=11
     )
-    _explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
+    explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
     save_figure(figure, path)
 
 
-def _canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:
+def canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:
+    """A figure in the house's style, and its axes."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     axes = figure.subplots()
     axes.set_axisbelow(True)
@@ -78,5 +79,6 @@ def _canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def _explain(axes: Any, text: str) -> None:
+def explain(axes: Any, text: str) -> None:
+    """Say under the title what the marks are."""
     axes.text(0, 1.015, text, transform=axes.transAxes, color=INK, fontsize=8.5)

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from design.errors import InputError
 from design.files import atomic
 
+from .limits import MAX_VALUES
 from .output import writing
 from .recording import Recording
 
@@ -61,7 +63,7 @@ def import_hdf5(path: str | Path) -> Recording:
             kind = file.attrs.get("format")
             if kind != FORMAT:
                 raise InputError(f"{path}: format is {kind!r}, expected {FORMAT!r}")
-            arrays: dict[str, Any] = {attribute: np.asarray(file[name]) for name, attribute in _ARRAYS.items()}
+            arrays: dict[str, Any] = {attribute: _values(file, name) for name, attribute in _ARRAYS.items()}
             source = json.loads(str(file.attrs["source"]))
     except (OSError, KeyError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError):
@@ -71,3 +73,19 @@ def import_hdf5(path: str | Path) -> Recording:
         return Recording(**arrays, source=source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _values(file: Any, name: str) -> NDArray[Any]:
+    """The values of a dataset, which may claim more than any memory holds, since what was never written takes no room.
+
+    Raises:
+        ValueError: there is no such dataset, or it is too large.
+    """
+    import h5py
+
+    dataset = file[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise ValueError(f"{name} is no dataset")
+    if dataset.size is None or dataset.size > MAX_VALUES:
+        raise ValueError(f"{name} holds {dataset.size} values, allowed are {MAX_VALUES}")
+    return np.asarray(dataset)

@@ -25,7 +25,8 @@ from .limits import MAX_FIBRES
 from .output import writing
 from .residuals import MEMBERS, REST, Shapes, Weights, expected, member, shapes_of, traces_of, train
 
-DOCUMENT, WEIGHTS = "health.json", "health.safetensors"
+RECORDED, FELT = "health", "health_live"
+"""Names of the files of a model: learnt from presses as they were commanded, and as they are found in the readings."""
 FALSE_ALARMS = 1e-5
 """False alarms a press, all fibres and kinds of fault together: one in 100 000 healthy presses."""
 BLOCK = 50
@@ -164,13 +165,13 @@ class HealthModel:
                 f"at which health was learnt, within {RATE_TOLERANCE:.0%}"
             )
 
-    def save(self, folder: str | Path) -> None:
-        """Write `health.safetensors` and `health.json`; reading them back gives the same to the last bit.
+    def save(self, folder: str | Path, name: str = RECORDED) -> None:
+        """Write NAME.safetensors and NAME.json; reading them back gives the same to the last bit.
 
         Raises:
             InputError: the provenance is no JSON, or `folder` cannot be written.
         """
-        folder = Path(folder)
+        path, weights = files_of(folder, name)
         content = save({name: np.ascontiguousarray(array) for name, array in self._arrays().items()})
         document = {
             "format": FORMAT,
@@ -185,36 +186,35 @@ class HealthModel:
         try:
             text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         except (TypeError, ValueError) as error:
-            raise InputError(f"{folder / DOCUMENT}: health cannot be written as JSON ({error})") from error
-        with writing(folder), atomic(folder / WEIGHTS) as new_weights, atomic(folder / DOCUMENT) as new_document:
+            raise InputError(f"{path}: health cannot be written as JSON ({error})") from error
+        with writing(path.parent), atomic(weights) as new_weights, atomic(path) as new_document:
             new_weights.write_bytes(content)
             new_document.write_text(text, encoding="utf-8")
 
     @classmethod
-    def load(cls, folder: str | Path) -> "HealthModel":
+    def load(cls, folder: str | Path, name: str = RECORDED) -> "HealthModel":
         """Read what `save` wrote.
 
         Raises:
             InputError: a file is missing, torn or of another kind, a value is none that `save` writes, or the two do
                 not belong together.
         """
-        folder = Path(folder)
-        document = validated(HealthDocument, read_json(folder / DOCUMENT, FORMAT), f"{folder / DOCUMENT}:")
-        path = folder / WEIGHTS
+        path, weights = files_of(folder, name)
+        document = validated(HealthDocument, read_json(path, FORMAT), f"{path}:")
         try:
-            content = path.read_bytes()
+            content = weights.read_bytes()
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+            raise InputError(f"{weights}: cannot be read ({error.strerror})") from error
         if hashlib.sha256(content).hexdigest() != document.weights_sha256:
-            raise InputError(f"{path}: not the weights that {DOCUMENT} was written with; learn health again")
+            raise InputError(f"{weights}: not the weights that {path.name} was written with; learn health again")
         dead = sorted(set(document.dead))
         if dead != document.dead or len(dead) >= document.fibres or not set(dead) < set(range(document.fibres)):
-            raise InputError(f"{folder / DOCUMENT}: dead is {document.dead}, expected some of {document.fibres} fibres")
+            raise InputError(f"{path}: dead is {document.dead}, expected some of {document.fibres} fibres")
         try:
             arrays = load(content)
             refuse_unsound(arrays, document.fibres - len(dead))
         except (KeyError, TypeError, ValueError, SafetensorError) as error:
-            raise InputError(f"{path}: no weights of the health that {DOCUMENT} describes ({error})") from error
+            raise InputError(f"{weights}: no weights of the health that {path.name} describes ({error})") from error
         parts: dict[str, dict[str, Any]] = {"shapes": {}, "weights": {}, "evidence": {}, "tail": {}}
         for name, array in arrays.items():
             part, _, key = name.partition(".")
@@ -239,6 +239,11 @@ class HealthModel:
         parts["tail"] = asdict(self.tail)
         flat = {f"{part}.{key}": np.asarray(value) for part, values in parts.items() for key, value in values.items()}
         return flat | {"rests": self.rests}
+
+
+def files_of(folder: str | Path, name: str) -> tuple[Path, Path]:
+    """The document and the weights of the model `name` in a folder."""
+    return Path(folder) / f"{name}.json", Path(folder) / f"{name}.safetensors"
 
 
 def check_presses(readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> None:

@@ -63,6 +63,10 @@ class Inputs:
     def __getitem__(self, rows: Indices | slice) -> "Inputs":
         return Inputs(self.windows[rows], self.history[rows], self.alive[rows])
 
+    def __add__(self, other: "Inputs") -> "Inputs":
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("windows", "history", "alive"))
+        return Inputs(*(np.concatenate(pair) for pair in pairs))
+
     def __len__(self) -> int:
         return len(self.windows)
 

@@ -85,7 +85,7 @@ class Recording:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(Q,) whether the place of each press is known."""
-        return ~np.isnan(self.presses_mm).any(axis=1)
+        return ~(np.isnan(self.presses_mm[:, 0]) | np.isnan(self.presses_mm[:, 1]))
 
     @property
     def rate_hz(self) -> float:

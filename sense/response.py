@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .document import LEAST_SPREAD_V
+
 Array = NDArray[np.float64]
 
 BUMPS = 21
@@ -56,14 +58,14 @@ class Response:
             past, answer = history[there, fibre], windows[there, fibre]
             usual[fibre] = past.mean(axis=0)
             spread = past.std(axis=0)
-            past = np.divide(past - usual[fibre], spread, out=np.zeros_like(past), where=spread > 0)
+            past = np.divide(past - usual[fibre], spread, out=np.zeros_like(past), where=spread > LEAST_SPREAD_V)
             known = np.hstack([at_presses[there], past])
             weights = np.linalg.solve(known.T @ known + penalty, known.T @ answer)
             memory[fibre] = np.divide(
                 weights[-pasts:].T if pasts else np.empty((windows.shape[2], 0)),
                 spread,
                 out=np.zeros((windows.shape[2], pasts)),
-                where=spread > 0,
+                where=spread > LEAST_SPREAD_V,
             ).T
             table[:, fibre] = at_table @ weights[: at_presses.shape[1]]
         return cls(table.reshape(STEPS + 1, STEPS + 1, fibres, -1), memory, usual)

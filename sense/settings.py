@@ -98,7 +98,7 @@ class Localizer(Section):
     lost: int = Field(default=3, ge=0, le=8, description="train and test for up to this many lost fibres")
     members: int = Field(default=2, ge=1, le=64, description="networks whose places are averaged")
     hidden: int = Field(default=256, ge=1, le=4096, description="width of the hidden layers")
-    layers: int = Field(default=3, ge=1, le=32, description="residual hidden layers after the first")
+    layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")
     epochs: int = Field(default=600, ge=1, le=100_000, description="times the presses are shown, up to 16 000 steps")
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     rate: float = Field(default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule")

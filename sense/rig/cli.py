@@ -136,7 +136,7 @@ def _devices(rig: str, order: Order) -> Iterator[tuple["Arm", "Converter", "Rig"
     from .arduino import Arduino
     from .ur5 import UR5
 
-    arm, converter = UR5(order.rig.host), Arduino(_port(order.rig), order.rig.converter_rate_hz, order.rig.channels)
+    arm, converter = UR5(order.rig.host), Arduino(port_of(order.rig), order.rig.converter_rate_hz, order.rig.channels)
     try:
         yield arm, converter, order.rig
     finally:
@@ -144,7 +144,7 @@ def _devices(rig: str, order: Order) -> Iterator[tuple["Arm", "Converter", "Rig"
         arm.close()
 
 
-def _port(rig: "Rig") -> str:
+def port_of(rig: "Rig") -> str:
     """The board's port, looked for where it is not set."""
     from .devices import RigFault
     from .serial_link import find_ports
@@ -239,8 +239,13 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
 
 
 def describe(recording: "Recording", out: Path) -> str:
-    """A recording in one line."""
+    """A recording in one line, with what is missing of it."""
+    import numpy as np
+
+    unknown = int((~recording.known).sum())
+    missing = int(np.isnan(recording.readings).sum())
     return (
-        f"{len(recording.presses_mm)} presses, {len(recording.readings)} readings of {recording.fibres} fibres "
-        f"at {recording.rate_hz:.1f} Hz -> {out}"
+        f"{len(recording.presses_mm)} presses{f' ({unknown} of unknown place)' * (unknown > 0)}, "
+        f"{len(recording.readings)} readings of {recording.fibres} fibres"
+        f"{f', {missing} values missing,' * (missing > 0)} at {recording.rate_hz:.1f} Hz -> {out}"
     )

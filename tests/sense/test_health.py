@@ -16,7 +16,7 @@ from design.errors import InputError
 from sense import Recording, residuals
 from sense import settings as sense_settings
 from sense.evidence import HYPOTHESES, Tail, climb, noise_of
-from sense.health import DOCUMENT, WEIGHTS, HealthModel
+from sense.health import RECORDED, HealthModel, files_of
 from sense.health_document import LEAST_PRESSES
 from sense.monitor import TEXTS, Finding, Monitor, examine, lines
 from sense.residuals import INPUTS, MEMBERS, TARGETS, TRACE, expected, traces_of
@@ -24,6 +24,9 @@ from sense.rig.simulated import simulate
 
 Array = NDArray[np.float64]
 LEARNT, PRESSES, BAD_FROM = 600, 900, 660
+
+
+DOCUMENT, WEIGHTS = (path.name for path in files_of("", RECORDED))
 
 
 @pytest.fixture(scope="module")

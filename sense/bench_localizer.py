@@ -1,0 +1,179 @@
+"""Test error of localizers against the time they train, on a simulated recording, for three kinds of inputs.
+
+The published network is trained three ways, by budgets: Levenberg-Marquardt, as published; L-BFGS; and Adam. The masked
+network, which bears lost fibres as well, is trained as in a calibration. All learn from the same presses.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design import Morphology
+from design.bench import seconds
+from design.bench_table import Row, write_bench
+
+from . import settings
+from .classic import HIDDEN
+from .network import Floats, Weights, forward, masked, pooled
+from .presses import press_inputs
+from .recording import Recording
+from .rig.simulated import simulate
+from .scaling import Scaling
+
+PRESSES, TEST = 1500, 300
+EPOCHS = (3, 10, 30, 100)
+"""Steps of Levenberg-Marquardt at most; it looks at all presses in each."""
+ITERATIONS = (30, 100, 300)
+"""Of L-BFGS, which does likewise."""
+PASSES = (30, 100, 300)
+"""Of Adam, through batches of BATCH presses."""
+STEPS = (100, 400, 1600)
+"""Of the masked network, one member of its usual size."""
+FEATURES = ("published", "causal", "full")
+MARQUARDT = ("published",)
+"""Inputs that Levenberg-Marquardt is tried on: with F times as many, each of its steps takes F^2 to F^3 as long."""
+BATCH, ADAM_RATE = 128, 3e-3
+
+Array = NDArray[np.float64]
+Predict = Callable[[Array], Array]
+
+
+def bench_localizer(out: Path, report: Callable[[str], None]) -> dict[str, Any]:
+    """Train on PRESSES simulated presses less TEST, in every way, and write the table and figure to `out`."""
+    from design.threads import one_torch_thread
+
+    recording = simulate(Morphology.random(3, knots=5, seed=0), settings.Rig(presses=PRESSES, seed=0))
+    rows = []
+    with one_torch_thread():
+        for features in FEATURES:
+            rows += _rows(recording, features, lambda step: report(f"localizer, {step}"))
+    rows += _prediction(recording)
+    return write_bench("localizer", rows, out, "mean error (mm)", ("LM", EPOCHS[-1]))
+
+
+def _rows(recording: Recording, features: str, report: Callable[[str], None]) -> Iterator[Row]:
+    raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
+    scaling, table = Scaling.fit(raw[:-TEST], recording.presses_mm[:-TEST])
+    scaled, targets = scaling.inputs(raw), scaling.targets(recording.presses_mm)
+    flat = scaled.inputs.reshape(len(scaled), -1).astype(np.float64)
+    x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
+    ways: list[tuple[str, int, Callable[[], Predict]]] = [
+        *(("LM", size, partial(_marquardt, x, y, size)) for size in EPOCHS if features in MARQUARDT),
+        *(("L-BFGS", size, partial(_bfgs, x, y, size)) for size in ITERATIONS),
+        *(("Adam", size, partial(_adam, x, y, size)) for size in PASSES),
+        *(("masked", size, partial(_masked, scaled.inputs[:-TEST], targets[:-TEST], table, size)) for size in STEPS),
+    ]
+    for _, _, work in {way: (way, size, work) for way, size, work in reversed(ways)}.values():
+        work()  # the smallest of every way, once before the clock: it also pays for imports
+    for way, size, work in ways:
+        report(f"{features}, {way} {size}")
+        begin = time.perf_counter()
+        predict = work()
+        spent = time.perf_counter() - begin
+        off = scaling.places_mm(predict(flat[-TEST:]).astype(np.float32)) - recording.presses_mm[-TEST:]
+        yield Row(features, way, size, float(np.hypot(*off.T).mean()), spent, None)
+
+
+def _marquardt(x: Array, y: Array, epochs: int) -> Predict:
+    from design.levenberg_marquardt import fit
+
+    return fit(x, y, np.random.default_rng(0), HIDDEN, epochs)
+
+
+class _Published:
+    """The published network with its squared error, for optimisers that are given slopes."""
+
+    def __init__(self, x: Array, y: Array) -> None:
+        import torch
+
+        from design.levenberg_marquardt import first_weights
+
+        varies = np.ptp(x, axis=0) > 0
+        self.weights = [w.requires_grad_() for w in first_weights(varies, HIDDEN, y.shape[1], np.random.default_rng(0))]
+        self._x, self._y = torch.from_numpy(np.column_stack([x, np.ones(len(x))])), torch.from_numpy(y)
+
+    def slope(self, rows: Any = slice(None)) -> Any:
+        """The mean squared error of some presses; leaves its slope in the weights."""
+        hidden, output = self.weights
+        hidden.grad = output.grad = None
+        neurons = (self._x[rows] @ hidden.T).tanh()
+        loss = (neurons @ output[:, :-1].T + output[:, -1] - self._y[rows]).square().mean()
+        loss.backward()
+        return loss
+
+    def __call__(self, x: Array) -> Array:
+        hidden, output = (weight.detach().numpy() for weight in self.weights)
+        return np.tanh(x @ hidden[:, :-1].T + hidden[:, -1]) @ output[:, :-1].T + output[:, -1]
+
+
+def _bfgs(x: Array, y: Array, iterations: int) -> Predict:
+    import torch
+
+    network = _Published(x, y)
+    torch.optim.LBFGS(
+        network.weights, max_iter=iterations, tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe"
+    ).step(network.slope)
+    return network
+
+
+def _adam(x: Array, y: Array, passes: int) -> Predict:
+    import torch
+
+    network, generator = _Published(x, y), torch.Generator().manual_seed(0)
+    optimizer = torch.optim.Adam(network.weights, lr=ADAM_RATE)
+    for _ in range(passes):
+        for rows in torch.randperm(len(x), generator=generator).split(BATCH):
+            network.slope(rows)
+            optimizer.step()
+    return network
+
+
+def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
+    from .training import Samples, train
+
+    alive = np.ones(inputs.shape[:2], dtype=bool)
+    held = slice(None, None, 12)  # ends the training
+    learnt = np.arange(len(inputs)) % 12 > 0
+    shown, check = (Samples(inputs[part], alive[part], targets[part]) for part in (learnt, held))
+    batches = max(1, int(learnt.sum()) // settings.Localizer().batch)
+    options = settings.Localizer(members=1, epochs=-(-steps // batches))
+    weights = train(shown, check, table, options, np.random.default_rng(0), lambda done, total: None)
+
+    return lambda x: _places(weights, x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)).astype(np.float64)
+
+
+def _prediction(recording: Recording) -> Iterator[Row]:
+    """Time to find one press with networks of the usual size; what they were taught does not matter for it."""
+    rng = np.random.default_rng(0)
+    one = _scaled(recording, "published")[:1].reshape(1, -1).astype(np.float64)
+    published = _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
+    yield Row("one press", "published", 0, None, seconds(partial(published, one)), None)
+    inputs = _scaled(recording, "full")[:1]
+    weights = _untrained(inputs.size + inputs.shape[1])
+    yield Row("one press", "masked", 0, None, seconds(lambda: _places(weights, inputs)), None)
+
+
+def _scaled(recording: Recording, features: str) -> Floats:
+    raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
+    return Scaling.fit(raw, recording.presses_mm)[0].inputs(raw).inputs
+
+
+def _places(weights: Weights, inputs: Floats) -> Floats:
+    return pooled(forward(weights, masked(inputs, np.array(True))))[0]
+
+
+def _untrained(entries: int) -> Weights:
+    """A masked network of the usual size as training begins."""
+    import torch
+
+    from .training import initial
+
+    options, generator = settings.Localizer(), torch.Generator().manual_seed(0)
+    members = [initial(entries, options, generator) for _ in range(options.members)]
+    axis = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
+    return {name: torch.cat([each[name] for each in members], dim=axis[name]).detach().numpy() for name in axis}
