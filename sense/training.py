@@ -23,7 +23,7 @@ from torch.nn import functional
 from . import settings
 from .network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Floats, Weights
 
-MOST_STEPS = 16_000
+MOST_STEPS = 11_000
 """Steps of training at most: with moved presses, the length of the recording does not matter beyond."""
 WARM_UP = 0.2
 """Share of the steps in which the rate of learning rises."""

@@ -34,11 +34,11 @@ def test_slopes_are_those_of_the_error() -> None:
     rng = np.random.default_rng(0)
     x, y = rng.standard_normal((20, 4)), rng.standard_normal((20, 2))
     network = bench._Published(x, y)
-    at = float(network.slope())
+    at = network.slope().item()
     assert at == pytest.approx(np.mean((network(x) - y) ** 2))
     slope, step = network.weights[0].grad[2, 1].item(), 1e-6  # type: ignore[index]
     network.weights[0].data[2, 1] += step
-    assert (float(network.slope()) - at) / step == pytest.approx(slope, rel=1e-3)
+    assert (network.slope().item() - at) / step == pytest.approx(slope, rel=1e-3)
 
 
 @pytest.mark.parametrize("way", [bench._bfgs, bench._adam])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from design.errors import InputError
@@ -19,6 +19,7 @@ from sense.scaling import Scaled, Scaling
 from sense.training import draw_alive, looked_up, one_cycle
 
 
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4))
 def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
     options = sense_settings.Localizer(layers=layers, hidden=24)
@@ -189,6 +190,7 @@ def raw(windows: np.ndarray, history: np.ndarray | None = None) -> Inputs:
     return Inputs(windows, past, np.ones(windows.shape[:2], dtype=bool))
 
 
+@settings(max_examples=6)  # each fits the whole pad twice
 @given(seed=st.integers(0, 999), gain=st.floats(1e-3, 1e3))
 def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None:
     rng = np.random.default_rng(seed)

