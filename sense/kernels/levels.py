@@ -30,7 +30,7 @@ GIVE_UP_S = 1.0
 """Looks that leave the levels for longer without agreeing are no change: the noise has grown."""
 FIRST_LOOKS = 8
 """Looks that the noise is learnt from before any change is told."""
-ROUGH_LOOKS = 4
+ROUGH_LOOKS = 8
 """How rough the first estimates of the noise are: of n looks it is widened by the share ROUGH_LOOKS / n."""
 OFF, OFF_PER_S = 0.05, 0.4
 """Shares of a step by which the level after it, and its slope, may still be off: silicone has not settled then."""

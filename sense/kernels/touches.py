@@ -26,7 +26,7 @@ STRONGEST = 20.0
 """Spreads beyond which a fibre counts no more: a broken one would drown the others."""
 CLEAR = 5.0
 """Spreads from which on a fibre's step adds to the typical press in volts."""
-LEARNT, AGREEING = 5, 0.5
+LEARNT, AGREEING = 3, 0.5
 """Touches, and their agreement, from which on their way tells anything."""
 RECENT = 0.05
 """Share of the newest touch in what is known of touches."""

@@ -41,6 +41,48 @@ def test_other_files_are_refused(tmp_path):
             import_hdf5(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"times_s": None}, "times_s"),
+        ({"times_s": "group"}, "times_s is no dataset"),
+        ({"times_s": "empty"}, "times_s holds None values"),
+        ({"readings_v": "huge"}, r"readings_v holds 1000000000000 values, allowed are 1073741824"),
+        ({"readings_v": "text"}, "readings are .*expected an array of real numbers"),
+        ({"readings_v": np.full((40, 2), np.inf)}, "readings hold infinity"),
+        ({"presses_mm": np.array([[1.0, np.nan]])}, "press 0 has one of x and y"),
+        ({"begun": np.array([20.5])}, "begun are .*whole numbers"),
+        ({"times_s": np.arange(39.0)}, "times have shape"),
+    ],
+)
+def test_datasets_that_do_not_fit_are_one_clear_line(tmp_path, change, reason):
+    import h5py
+
+    fine = {
+        "times_s": np.arange(40.0),
+        "readings_v": np.ones((40, 2)),
+        "presses_mm": np.ones((1, 2)),
+        "begun": np.array([20]),
+        "lifted": np.array([40]),
+    }
+    with h5py.File(tmp_path / "r.h5", "w") as file:
+        file.attrs["format"], file.attrs["source"] = "padforge-hdf5/1", "{}"
+        for name, values in (fine | change).items():
+            if isinstance(values, np.ndarray):
+                file[name] = values
+            elif values == "group":
+                file.create_group(name)
+            elif values == "empty":
+                file[name] = h5py.Empty("f8")
+            elif values == "huge":
+                file.create_dataset(name, shape=(10**6, 10**6), dtype="f8", chunks=(100, 100))
+            elif values is not None:
+                file[name] = values
+    with pytest.raises(InputError, match=rf"r\.h5: .*{reason}") as refusal:
+        import_hdf5(tmp_path / "r.h5")
+    assert "\n" not in str(refusal.value)
+
+
 @pytest.mark.parametrize("suffix", ["h5", "csv"])
 def test_export_and_import_by_command(tmp_path, suffix):
     RECORDING.save(tmp_path / "run", {})

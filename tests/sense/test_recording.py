@@ -11,6 +11,7 @@ import pytest
 import sense.recording
 from design.errors import InputError
 from sense import Recorder, Recording
+from sense.rig.cli import describe
 
 
 @pytest.fixture
@@ -151,6 +152,46 @@ def test_what_no_rig_records_is_refused(recording: Recording, change, message: s
     with pytest.raises(InputError, match=message) as caught:
         replace(recording, **change(recording))
     assert "\n" not in str(caught.value)
+
+
+def test_one_missing_reading_is_as_another(recording: Recording) -> None:
+    other_nan = np.array([0x7FF8000000000001], dtype=np.uint64).view(np.float64)[0]
+    one, other = (
+        replace(recording, readings=spoiled(recording.readings, (7, 0), nan), presses_mm=spoiled(places, 3, nan))
+        for nan, places in ((np.nan, recording.presses_mm), (-other_nan, recording.presses_mm))
+    )
+    assert one == other
+    assert one.digest == other.digest
+    assert one != recording
+    assert one.digest != recording.digest
+    assert one.known.tolist() == [press != 3 for press in range(len(recording.presses_mm))]
+
+
+def test_uneven_times_are_fine_and_a_missing_one_is_told(recording: Recording) -> None:
+    uneven = np.cumsum(np.random.default_rng(0).exponential(0.07, len(recording.times_s)))
+    assert replace(recording, times_s=uneven).rate_hz == pytest.approx(1 / 0.07 / np.log(2), rel=0.1)
+    with pytest.raises(InputError, match=r"times hold NaN or infinity \(first in row 11\), expected finite numbers"):
+        replace(recording, times_s=spoiled(recording.times_s, 11, np.nan))
+
+
+def test_a_recording_of_one_press_and_two_readings_is_one(tmp_path: Path) -> None:
+    least = Recording(np.ones((2, 1)), np.arange(2.0), np.full((1, 2), np.nan), np.array([1]), np.array([2]))
+    least.save(tmp_path / "run", {})
+    assert Recording.open(tmp_path / "run") == least
+
+
+def test_a_recording_tells_in_one_line_what_it_lacks(recording: Recording) -> None:
+    whole = describe(recording, Path("out"))
+    assert whole == f"300 presses, 12000 readings of 4 fibres at {recording.rate_hz:.1f} Hz -> out"
+    holed = replace(
+        recording,
+        readings=spoiled(recording.readings, slice(3), np.nan),
+        presses_mm=spoiled(recording.presses_mm, [3, 5], np.nan),
+    )
+    assert describe(holed, Path("out")) == (
+        f"300 presses (2 of unknown place), 12000 readings of 4 fibres, 12 values missing, "
+        f"at {recording.rate_hz:.1f} Hz -> out"
+    )
 
 
 def test_indices_may_be_whole_floats(recording: Recording) -> None:

@@ -106,7 +106,6 @@ def evenly(presses: int, held_s: float, apart_s: float) -> Spans:
     [
         ([(3.0, 4.5)], 5.0, 0.15),
         ([(3.0, 4.5)], RATE_HZ, 0.15),
-        (evenly(20, 1.5, 2.0), 1000.0, 0.15),
         (evenly(100, 0.15, 1.5), RATE_HZ, 0.15),
         (evenly(100, 0.4, 0.4), RATE_HZ, 0.15),
         (evenly(100, 0.4, 0.4), 100.0, 0.15),
@@ -115,7 +114,7 @@ def evenly(presses: int, held_s: float, apart_s: float) -> Spans:
         (evenly(3, 120.0, 60.0), RATE_HZ, 0.15),
         (evenly(60, 1.5, 2.0), RATE_HZ, 0.4),
     ],
-    ids=["one 5 Hz", "one", "1 kHz", "taps", "quick", "quick 100 Hz", "close", "held", "held long", "slow"],
+    ids=["one 5 Hz", "one", "taps", "quick", "quick 100 Hz", "close", "held", "held long", "slow"],
 )
 def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> None:
     times, readings = recorded(spans, rate_hz=rate_hz, ramp_s=ramp_s)
