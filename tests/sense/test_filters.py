@@ -37,6 +37,8 @@ def excess_robust(y, x, lam):
     """
     here = ~np.isnan(y)
     y, x = y[here], x[here]
+    if len(x) == 0:
+        return 0.0
     turn = np.sign(np.diff(x))
     least, greatest = np.where(turn > 0, lam, -lam), np.where(turn < 0, -lam, lam)
     least, greatest = np.append(least, 0.0), np.append(greatest, 0.0)
