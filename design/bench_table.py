@@ -116,6 +116,7 @@ def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:
         axes.grid(color=FAINT, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(error_label)
-    panels[-1].legend(frameon=False)
+    shown = {label: curve for axes in panels for curve, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    panels[-1].legend(shown.values(), shown.keys(), frameon=False)
     figure.suptitle(f"{name}: error against run time", x=0.01, ha="left", color=INK)
     return figure

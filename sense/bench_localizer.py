@@ -79,10 +79,16 @@ def _rows(recording: Recording, features: str, report: Callable[[str], None]) ->
         yield Row(features, way, size, float(np.hypot(*off.T).mean()), spent, None)
 
 
+def _held(presses: int) -> NDArray[np.bool_]:
+    """(Q,) presses that end a training, where it looks at some, and are not learnt from."""
+    return np.arange(presses) % 12 == 0
+
+
 def _marquardt(x: Array, y: Array, epochs: int) -> Predict:
     from design.levenberg_marquardt import fit
 
-    return fit(x, y, np.random.default_rng(0), HIDDEN, epochs)
+    held = _held(len(x))
+    return fit(x[~held], y[~held], np.random.default_rng(0), HIDDEN, epochs, check=(x[held], y[held]))
 
 
 class _Published:
@@ -137,10 +143,9 @@ def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predi
     from .training import Samples, train
 
     alive = np.ones(inputs.shape[:2], dtype=bool)
-    held = slice(None, None, 12)  # ends the training
-    learnt = np.arange(len(inputs)) % 12 > 0
-    shown, check = (Samples(inputs[part], alive[part], targets[part]) for part in (learnt, held))
-    batches = max(1, int(learnt.sum()) // settings.Localizer().batch)
+    held = _held(len(inputs))
+    shown, check = (Samples(inputs[part], alive[part], targets[part]) for part in (~held, held))
+    batches = max(1, int((~held).sum()) // settings.Localizer().batch)
     options = settings.Localizer(members=1, epochs=-(-steps // batches))
     weights = train(shown, check, table, options, np.random.default_rng(0), lambda done, total: None)
 

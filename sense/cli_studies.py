@@ -133,7 +133,7 @@ def size_curve(recording: Path, seed: int | None, spec: Path | None, out: Path, 
 
     refuse_unwritable(out)
     options, opened = load_spec(spec).section(Options, seed=seed), Recording.open(recording)
-    with _reported("localizers") as report:
+    with _reported("training") as report:
         document = study(opened, options, progress=report)
     with staged(out) as folder:
         write_json(folder / "size_curve.json", document)

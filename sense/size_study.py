@@ -5,7 +5,10 @@ floor, e(n) = c + a n^-b, is what such curves follow (Hestness et al. 2017, Deep
 empirically); it leads on to what more presses would bring.
 """
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event, Lock
 from typing import Any
 
 import numpy as np
@@ -24,14 +27,13 @@ SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Shares of the training presses."""
 LEAST_PRESSES = 10
 """Presses of the smallest localizer."""
-STEPS = 2500
-"""Training steps of every one: fewer than of a calibration, whose errors are therefore somewhat lower."""
 EXPONENTS = np.linspace(0.1, 1.5, 57)
 """Exponents b that are tried."""
 DRAWS = 400
 """Resamplings that the uncertainty is found by."""
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 def size_curve(
@@ -44,8 +46,9 @@ def size_curve(
 
     Args:
         recording: with presses of known place.
-        options: how to learn; one member is trained, for `STEPS` steps. The defaults if None.
-        progress: called with (localizers done, localizers in all).
+        options: how to learn; of the members one is trained, so errors are somewhat above those of a calibration. The
+            defaults if None.
+        progress: called with (steps done, steps in all).
 
     Returns:
         A document with "points" ("presses", "mean_mm", "standard_error_mm" on the test presses), "fit" ("floor_mm",
@@ -66,13 +69,9 @@ def size_curve(
         )
     order = rng.permutation(training)
     sizes = [round(share * len(order)) for share in SHARES]
-    errors = []
-    for done, size in enumerate(sizes):
-        progress(done, len(sizes))
-        localizer = learn(recording, np.sort(order[:size]), _budget(options, size), rng)
-        found = localizer.locate(localizer.inputs(recording)[test])
-        errors.append(distances(found.places_mm, recording.presses_mm[test]))
-    progress(len(sizes), len(sizes))
+    options = options.model_copy(update={"members": 1, "method": "masked"})
+    found = _found(recording, [np.sort(order[:size]) for size in sizes], test, options, progress)
+    errors = [distances(places_mm, recording.presses_mm[test]) for places_mm in found]
     table, counts = np.array(errors), np.array(sizes, dtype=float)
     fit = fit_power_law(counts, table.mean(axis=1))
     forecast = _forecast(counts, table, fit, rng)
@@ -88,18 +87,47 @@ def size_curve(
         "fit": dict(zip(("floor_mm", "factor_mm", "exponent"), fit, strict=True)),
         "forecast": forecast,
         "advice": _advice(sizes[-1], table[-1].mean(), forecast),
-        "settings": _budget(options, sizes[-1]).model_dump(),
+        "settings": options.model_dump(),
         "provenance": made_by,
     }
 
 
-def _budget(options: settings.Localizer, presses: int) -> settings.Localizer:
-    """Options of a training of `STEPS` steps, or of what the options themselves allow, for so many presses."""
-    from .training import training_steps
+def _found(
+    recording: Recording,
+    trainings: Sequence[Indices],
+    test: Indices,
+    options: settings.Localizer,
+    progress: Callable[[int, int], None],
+) -> list[Array]:
+    """Places (Q, 2) that localizers trained on each of `trainings` find for the test presses."""
+    from design.threads import one_torch_thread
 
-    steps = min(STEPS, training_steps(10**9, options))
-    epochs = -(-steps // max(1, presses // options.batch))
-    return options.model_copy(update={"members": 1, "epochs": epochs, "method": "masked"})
+    from .training import StoppedError, training_steps
+
+    # As many as a calibration takes for so many presses: of one short training for all, the most presses would seem to
+    # bring little.
+    steps = [training_steps(len(training), options) for training in trainings]
+    done, lock, stop = [0] * len(steps), Lock(), Event()
+
+    def train(number: int) -> Array:
+        def report(step: int, total: int) -> None:
+            if stop.is_set():
+                raise StoppedError
+            with lock:
+                done[number] = round(step / total * steps[number])
+                progress(sum(done), sum(steps))
+
+        training = trainings[number]
+        localizer = learn(recording, training, options, np.random.default_rng([options.seed, len(training)]), report)
+        return localizer.locate(localizer.inputs(recording)[test]).places_mm
+
+    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {number: pool.submit(train, number) for number in reversed(range(len(steps)))}  # the longest first
+        try:
+            return [running[number].result() for number in range(len(steps))]
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
 
 
 def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:

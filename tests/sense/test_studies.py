@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import padforge
 from design.errors import InputError
-from sense import Localizer, Recording, evaluate, loss_study, size_study
+from sense import Localizer, Recording, evaluate, loss_study
 from sense.loss_study import MANY, ONE, robustness
 from sense.settings import Localizer as Options
 from sense.size_study import fit_power_law, power_law, size_curve
@@ -22,9 +22,8 @@ QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A published network of three neurons, and few steps."""
+    """A published network of three neurons."""
     monkeypatch.setattr("sense.classic.HIDDEN", 3)
-    monkeypatch.setattr(size_study, "STEPS", 10)
 
 
 def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
@@ -167,3 +166,15 @@ def test_the_commands_write_documents_and_figures(
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "neither --model nor --retrain" in err
     assert not Path("other").exists()
+
+
+def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
+    long, heard = QUICK.model_copy(update={"epochs": 100_000}), []
+
+    def interrupted(done: int, total: int) -> None:
+        heard.append(done / total)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        size_curve(recording, long, progress=interrupted)
+    assert max(heard) < 0.5
