@@ -232,11 +232,10 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     """
     from dataclasses import asdict
 
-    from .health import HealthModel
-    from .monitor import examine, lines
+    from .monitor import lines
 
-    known, opened = HealthModel.load(model), _open(recording)
-    findings = examine(known, opened.readings, opened.times_s, opened.begun, opened.lifted)
+    opened = _open(recording)
+    known, findings = _examined(model, opened)
     document = {
         "format": "padforge-findings/1",
         "presses": len(opened.begun),
@@ -249,12 +248,20 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
 
 def _findings(model: Path, recording: "Recording") -> "list[Finding]":
     """What is wrong with the fibres of a recording, as far as the model's folder tells health."""
-    from .health import RECORDED, HealthModel, files_of
+    from .health import RECORDED, files_of
+
+    return _examined(model, recording)[1] if files_of(model, RECORDED)[0].exists() else []
+
+
+def _examined(model: Path, recording: "Recording") -> "tuple[HealthModel, list[Finding]]":
+    """What health is told by, presses that were found by what was learnt from such, and what is wrong."""
+    from .exchange import FOUND
+    from .health import FELT, RECORDED, HealthModel
     from .monitor import examine
 
-    if not files_of(model, RECORDED)[0].exists():
-        return []
-    return examine(HealthModel.load(model), recording.readings, recording.times_s, recording.begun, recording.lifted)
+    name = FELT if FOUND.items() <= recording.source.items() else RECORDED
+    known = HealthModel.load(model, name)
+    return known, examine(known, recording.readings, recording.times_s, recording.begun, recording.lifted)
 
 
 def _open(path: Path) -> "Recording":

@@ -29,6 +29,8 @@ READINGS_PER_PRESS = 40
 DOWN_AT = 20
 """Reading of the published cycle at which the probe is sent down; it is sent up at the end of the cycle."""
 
+FOUND = {"presses": "found"}
+"""What the source of a recording says whose presses were found in its readings."""
 UNKNOWN = -1.7e308
 """Stands for `?` among numbers; far beyond any place."""
 
@@ -115,7 +117,7 @@ def _found(readings: Array, times_s: Array, source: dict[str, str]) -> Recording
     if len(presses.touched) == 0:
         raise InputError("has no press: no line has x_mm and y_mm, and none is found in the readings")
     begun, lifted = as_commanded(presses, times_s)
-    return Recording(readings, times_s, np.full((len(begun), 2), np.nan), begun, lifted, source)
+    return Recording(readings, times_s, np.full((len(begun), 2), np.nan), begun, lifted, source | FOUND)
 
 
 def _read_table(path: Path) -> Array:
