@@ -13,7 +13,7 @@ from design.losses import lost_subsets
 from design.settings import validated
 
 from . import settings
-from .evaluation import distances, evaluate
+from .evaluation import conformal, evaluate
 from .health import FELT, RECORDED, HealthModel
 from .localizer import Found, Localizer
 from .monitor import Finding
@@ -137,21 +137,11 @@ def learn(
 
 
 def radii(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Array:
-    """(levels, 3) what makes of expected errors, by number of lost fibres, standard deviations and radii.
-
-    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
-    distance over expected error on presses never trained on, a rank higher than their share, as if the next were one.
-    """
+    """(levels, 3) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
     plain = replace(localizer, factors=np.ones((1, 3)))
-    out = np.empty((levels, 3))
-    for level in range(levels):
-        found = [(plain.locate(presses, subset)) for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
-        off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
-        ratios = [distances(each.places_mm, places_mm) / each.r50_mm for each in found]
-        share = 1 + 1 / len(presses)
-        out[level, 0] = np.sqrt(np.square(off).mean())
-        out[level, 1:] = np.quantile(ratios, [min(1.0, 0.5 * share), min(1.0, 0.9 * share)])
-    return np.clip(out, 1e-6, 1e6)
+    by_level = (lost_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
+    found = ([plain.locate(presses, subset) for subset in subsets] for subsets in by_level)
+    return np.clip([conformal(each, places_mm) for each in found], 1e-6, 1e6)
 
 
 def split_presses(

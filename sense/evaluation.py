@@ -1,6 +1,6 @@
 """Evaluation: how far off a localizer is, by sets of lost fibres, by place, and whether its radii hold."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -103,6 +103,24 @@ def errors_by_loss(
 def distances(found_mm: Array, pressed_mm: Array) -> Array:
     """(Q,) distance of (Q, 2) places."""
     return np.hypot(*(found_mm - pressed_mm).T)
+
+
+def conformal(found: Sequence[Found], places_mm: Array) -> Array:
+    """(3,) factors by which standard deviations and the radii of 50 and 90 % must grow to be right for these presses.
+
+    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
+    distance over radius on presses never trained on, a rank higher than their share, as if the next were one; so of few
+    presses they are the more cautious.
+
+    Args:
+        found: the Q presses, with each of some sets of lost fibres. places_mm: (Q, 2).
+    """
+    off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
+    errors = [distances(each.places_mm, places_mm) for each in found]
+    share = 1 + 1 / len(places_mm)
+    r50 = np.quantile([error / each.r50_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.5 * share))
+    r90 = np.quantile([error / each.r90_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.9 * share))
+    return np.array([np.sqrt(np.square(off).mean()), r50, r90])
 
 
 def by_place(found_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:

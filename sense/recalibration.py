@@ -17,7 +17,7 @@ from design.files import provenance
 from design.losses import lost_subsets
 
 from .correction import fit_correction
-from .evaluation import distances, summary
+from .evaluation import conformal, distances, summary
 from .localizer import Found, Localizer
 from .presses import Inputs
 from .recording import Recording
@@ -184,19 +184,8 @@ class _Trial:
         return [summary(len(level[0]), [found[lost] for lost in level], self._places_mm) for level in self._levels()]
 
     def widened(self, found: Found_by_loss) -> Array:
-        """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do.
-
-        Conformal, as `calibration.radii`, so of few presses the more cautious.
-        """
-        out = np.ones((len(self._levels()), 3))
-        share = 1 + 1 / len(self._places_mm)
-        for level, sets in enumerate(self._levels()):
-            off = [(found[lost].places_mm - self._places_mm) / found[lost].sd_mm for lost in sets]
-            out[level, 0] = np.sqrt(np.square(off).mean())
-            for column, (name, part) in enumerate((("r50_mm", 0.5), ("r90_mm", 0.9)), start=1):
-                ratios = [self._errors(found[lost]) / getattr(found[lost], name) for lost in sets]
-                out[level, column] = np.quantile(ratios, min(1.0, part * share))
-        return np.maximum(out, 1.0)
+        """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do."""
+        return np.maximum([conformal([found[lost] for lost in sets], self._places_mm) for sets in self._levels()], 1.0)
 
     def _levels(self) -> list[list[tuple[int, ...]]]:
         sizes = dict.fromkeys(len(lost) for lost in self._subsets)
