@@ -11,14 +11,20 @@ from numpy.typing import NDArray
 
 from .contact import boustrophedon, signals
 from .errors import InputError
+from .levenberg_marquardt import Network, fit_many
 from .losses import lost_subsets
 from .morphology import Morphology
 from .settings import Contact
+from .threads import one_torch_thread
 
 Array = NDArray[np.float64]
+Loss = tuple[int, ...]
+"""Fibres that are lost, by index."""
 
 JITTER = 5 / 49
 """Greatest shift of a press off its serpentine, grid units, as published."""
+BATCH = 7
+"""Networks trained at once: a batch for each core, and the batches of a level of about one size."""
 
 
 @dataclass(frozen=True)
@@ -74,35 +80,68 @@ def evaluate(
     fibres = 2 * pad.grid
     levels = [number for number in lost if number < fibres]
     losses = [lost_subsets(fibres, number, subsets or math.comb(fibres, number)) for number in levels]
-    learned, fresh = training_presses(pad.grid, side, seed), fresh_presses(pad.grid, test, seed)
-    recorded, found = signals(pad, learned, contact), signals(pad, fresh, contact)
+    trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
+    trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
 
-    def error(loss: tuple[int, ...]) -> float:
-        from .levenberg_marquardt import fit
+    def means(batch: list[Loss]) -> Array:
+        networks = trial.learn(batch, hidden)
+        return np.array([trial.errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
 
-        kept = np.setdiff1d(np.arange(fibres), loss)
-        rng = np.random.default_rng([2, seed, len(loss), *loss])
-        network = fit(recorded[:, kept], learned, rng, hidden)
-        return float(np.linalg.norm(network(found[:, kept]) - fresh, axis=1).mean())
-
-    errors = _side_by_side(error, [loss for level in losses for loss in level])
-    ends = np.cumsum([len(level) for level in losses])[:-1]
+    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = [pool.map(means, batches(level)) for level in losses]
+        by_level = [np.concatenate(list(parts)) for parts in found]
     return [
         LossError(number, len(level), float(level.mean()), float(level.std()), float(level.max()))
-        for number, level in zip(levels, np.split(np.array(errors), ends), strict=True)
+        for number, level in zip(levels, by_level, strict=True)
     ]
 
 
-def _side_by_side(error: Callable[[tuple[int, ...]], float], losses: list[tuple[int, ...]]) -> list[float]:
-    """error(loss) of every loss, one thread a core, torch on one thread in each: it lets go of the interpreter."""
-    import torch
+def batches(losses: Sequence[Loss]) -> list[list[Loss]]:
+    """Losses in parts that are trained at once."""
+    return [list(losses[begin : begin + BATCH]) for begin in range(0, len(losses), BATCH)]
 
-    threads = torch.get_num_threads()
-    try:
-        with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(error, losses))
-    finally:
-        torch.set_num_threads(threads)
+
+@dataclass(frozen=True)
+class Trial:
+    """Presses to learn from and fresh ones to test on, with what a pad signals for them.
+
+    Attributes:
+        learned: (Q, 2) places, grid units, and recorded: (Q, C) their signals. fresh: (T, 2) and found: (T, C) alike.
+        seed: of the networks, besides the fibres they are to do without.
+    """
+
+    learned: Array
+    recorded: Array
+    fresh: Array
+    found: Array
+    seed: int
+
+    @classmethod
+    def of(cls, pad: Morphology, side: int, test: int, seed: int, answer: Callable[[Array], Array]) -> "Trial":
+        """A serpentine of side^2 presses to learn from and `test` fresh ones; `answer` gives signals for places."""
+        learned, fresh = training_presses(pad.grid, side, seed), fresh_presses(pad.grid, test, seed)
+        return cls(learned, answer(learned), fresh, answer(fresh), seed)
+
+    def learn(self, losses: Sequence[Loss], hidden: int, repeat: int = 0) -> list[Network]:
+        """A network for each of some losses of the same size, trained on the fibres that are left.
+
+        Args:
+            repeat: networks of another one start from other weights and split the presses otherwise.
+        """
+        kept = [self._kept(loss) for loss in losses]
+        rngs = [np.random.default_rng([2, self.seed, len(loss), *loss, repeat]) for loss in losses]
+        return fit_many(np.stack([self.recorded[:, own] for own in kept]), self.learned, rngs, hidden)
+
+    def errors(self, network: Network, loss: Loss) -> Array:
+        """(T,) distances at which a network that does without some fibres finds the fresh presses."""
+        return self.distances(network, loss, self.found, self.fresh)
+
+    def distances(self, network: Network, loss: Loss, signals: Array, places: Array) -> Array:
+        """(Q,) distances of where a network finds presses by their signals (Q, C) to their places (Q, 2)."""
+        return np.linalg.norm(network(signals[:, self._kept(loss)]) - places, axis=1)
+
+    def _kept(self, loss: Loss) -> NDArray[np.int64]:
+        return np.setdiff1d(np.arange(self.recorded.shape[1]), loss)
 
 
 def training_presses(grid: int, side: int, seed: int) -> Array:

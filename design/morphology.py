@@ -92,6 +92,28 @@ class Morphology:
         inner = columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2)
         return cls(assemble(inner), pitch_mm)
 
+    def tiled(self, times: int) -> "Morphology":
+        """A pad of M `times` fibres a family, this one's course repeated over its surface, times x times.
+
+        A tile of M + 1 grid units along a fibre is compressed to M, so that fibre ends stay one unit apart throughout.
+        """
+        _require_counts(times, 0)
+        grid, size = self.grid, self.grid * times
+        out = np.empty((2 * size, times * (self.knots.shape[1] - 1) + 3, 2))
+        for family in (0, 1):
+            travel = 0.5 + self.knots[family * grid : (family + 1) * grid, :, family] * grid / (grid + 1)
+            cross = self.knots[family * grid : (family + 1) * grid, :, 1 - family]
+            # The last knot of a tile is the first of the next one.
+            along = [travel[:, :-1] + grid * tile for tile in range(times)]
+            inner = np.concatenate([*along, travel[:, -1:] + grid * (times - 1)], axis=1)
+            level = np.concatenate([np.tile(cross[:, :-1], times), cross[:, -1:]], axis=1)
+            for tile in range(times):
+                rows = out[family * size + tile * grid : family * size + (tile + 1) * grid]
+                rows[:, 1:-1, family], rows[:, 1:-1, 1 - family] = inner, level + grid * tile
+                rows[:, [0, -1], family] = 0, size + 1
+                rows[:, [0, -1], 1 - family] = (np.arange(1, grid + 1) + grid * tile)[:, None]
+        return type(self)(out, self.pitch_mm)
+
     @classmethod
     def load(cls, path: str | Path) -> "Morphology":
         """Read a `morphology.json` or a published `.mat`.

@@ -99,8 +99,9 @@ class _Published:
 
         from design.levenberg_marquardt import first_weights
 
-        varies = np.ptp(x, axis=0) > 0
-        self.weights = [w.requires_grad_() for w in first_weights(varies, HIDDEN, y.shape[1], np.random.default_rng(0))]
+        rng = np.random.default_rng(0)
+        weights = first_weights(np.ptp(x, axis=0) > 0, HIDDEN, rng), rng.uniform(-0.5, 0.5, (y.shape[1], HIDDEN + 1))
+        self.weights = [torch.from_numpy(part).requires_grad_() for part in weights]
         self._x, self._y = torch.from_numpy(np.column_stack([x, np.ones(len(x))])), torch.from_numpy(y)
 
     def slope(self, rows: Any = slice(None)) -> Any:
