@@ -2,8 +2,10 @@
 
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,6 +14,7 @@ from design.console import json_option, load_spec, out_option, progress, seed_op
 from design.errors import Fault, InputError
 from fabricate.cli import fabricate
 from sense.cli import sense
+from sense.studies.cli import study
 
 if TYPE_CHECKING:
     from design.settings import Section, Spec
@@ -27,12 +30,14 @@ def cli() -> None:
     padforge design --out out/pad                    optimise the fibres
     padforge fabricate out/pad/morphology.json       make the mould
     padforge sense calibrate out/pad/recording       learn places from presses
+    padforge study robustness                        the paper's figures, for pads of your own
     """
 
 
 cli.add_command(design)
 cli.add_command(fabricate)
 cli.add_command(sense)
+cli.add_command(study)
 
 
 @cli.command()
@@ -73,8 +78,20 @@ def report(folder: Path) -> None:
     click.echo(f"report: {write_report(folder)}")
 
 
+BENCHES = {
+    "contact": "design.bench:bench_contact",
+    "objective": "design.bench:bench_objective",
+    "search": "design.bench_search:bench_search",
+    "networks": "design.bench_networks:bench_networks",
+    "filter": "sense.bench_filter:bench_filter",
+    "localizer": "sense.bench_localizer:bench_localizer",
+    "mould": "fabricate.bench:bench_mould",
+}
+"""Where each bench is, imported when it is asked for."""
+
+
 @cli.command()
-@click.argument("name", type=click.Choice(["contact", "objective", "search", "filter", "localizer", "mould"]))
+@click.argument("name", type=click.Choice(list(BENCHES)))
 @out_option("out/bench")
 @json_option
 def bench(name: str, out: Path, as_json: bool) -> None:
@@ -82,24 +99,13 @@ def bench(name: str, out: Path, as_json: bool) -> None:
 
     Writes NAME.json, NAME.csv and NAME.png.
     """
-    from design.bench import bench_contact, bench_objective
-    from design.bench_search import bench_search
-    from design.bench_table import lines
-    from fabricate.bench import bench_mould
-    from sense.bench_filter import bench_filter
-    from sense.bench_localizer import bench_localizer
+    from pkgutil import resolve_name
 
-    benches = {
-        "contact": bench_contact,
-        "objective": bench_objective,
-        "search": bench_search,
-        "filter": bench_filter,
-        "localizer": bench_localizer,
-        "mould": bench_mould,
-    }
+    from design.bench_table import lines
+
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
-        document = benches[name](out, lambda step: bar.update(task, note=step))
+        document = resolve_name(BENCHES[name])(out, lambda step: bar.update(task, note=step))
     show_result(document, lines(document), as_json)
 
 
@@ -171,97 +177,56 @@ def _require_replaceable(recorded: Path) -> None:
 
 
 def write_report(folder: Path) -> Path:
-    """Write `report.html` from the files in `folder`; stages that have left none are left out."""
-    from design.files import read_json, write_text
-    from design.page import page, tiles
+    """Write `report.html` from the files in `folder`; stages that have left none are left out.
 
-    key_figures: list[tuple[str, str]] = []
-    body: list[str] = []
-    for name, section in (("design", _design), ("fabrication", _mould), ("calibration", _calibration)):
-        path = folder / f"{name}.json"
+    Raises:
+        InputError: no stage has left anything, or a file is damaged.
+    """
+    from design.files import read_json, write_text
+    from design.page import Section, page
+    from design.report import design_sections, origin, provenance_section
+    from fabricate.report import fabrication_sections
+    from sense import report as sensed
+
+    stages = (
+        ("design", folder / "design.json", design_sections),
+        ("fabrication", folder / "fabrication.json", fabrication_sections),
+        ("recording", folder / "recording" / "start.json", sensed.recording_sections),
+        ("calibration", folder / "calibration.json", sensed.calibration_sections),
+        ("robustness", folder / "robustness.json", sensed.robustness_sections),
+    )
+    sections: list[Section] = []
+    origins: list[list[object]] = []
+    for name, path, made_of in stages:
         if path.exists():
             document = read_json(path, f"padforge-{name}/1")
-            try:
-                figures, pieces = section(folder, document)
-            except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-                raise InputError(f"{path}: not as padforge writes it ({error!r})") from error
-            key_figures += figures
-            body += pieces
-    if not body:
-        raise InputError(f"{folder}: no design.json, fabrication.json or calibration.json to report on")
+            with _as_written(path):
+                sections += made_of(folder, document)
+                origins.append(origin(folder, name, document))
+    studies: list[str] = []
+    for path, document in sensed.find_studies(folder):
+        with _as_written(path):
+            studies += sensed.study_pieces(path, document)
+            origins.append(origin(folder, f"study {path.stem}", document))
+    if not origins:
+        raise InputError(f"{folder}: no design.json, fabrication.json, calibration.json or study to report on")
+    if studies:
+        sections.append(Section("Studies", studies))
     lead = "Fibres, mould and calibration of one soft strain-sensor pad."
-    write_text(folder / "report.html", page(f"Pad report: {folder.name}", lead, [tiles(key_figures), *body]))
+    title = f"Pad report: {folder.resolve().name}"
+    write_text(folder / "report.html", page(title, lead, [*sections, provenance_section(origins)]))
     return folder / "report.html"
 
 
-Pieces = tuple[list[tuple[str, str]], list[str]]
-
-
-def _design(folder: Path, document: dict[str, Any]) -> Pieces:
-    from design.page import figures, heading, paragraph, table
-
-    spread = {int(name[-1]): value for name, value in document["terms"].items() if name.startswith("ambiguity")}
-    broken = [[v["rule"], ", ".join(map(str, v["fibres"])), v["measured"], v["limit"]] for v in document["violations"]]
-    enforced = document["provenance"]["settings"]["rules"]["enforce"]
-    holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
-    return [(holds, "design rules"), (f"{spread[0]:.3f}", "ambiguity, grid units")], [
-        heading("Fibres"),
-        figures(
-            [(folder / "design.svg", "The plan: horizontal and vertical fibres, their crossings, and the contact.")]
-        ),
-        table(["fibres lost", "ambiguity (grid units)"], list(spread.items())),
-        paragraph(f"Rules of [rules], checked on the exact curves: {holds}."),
-        *([table(["rule", "fibres", "measured", "limit"], broken)] if broken else []),
-    ]
-
-
-def _mould(folder: Path, document: dict[str, Any]) -> Pieces:
-    from design.page import figures, heading, table
-
-    worst = max((f["status"] for f in document["findings"]), key=["pass", "warn", "fail"].index)
-    size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
-    shown = ("number", "fibre", "depth_mm", "in_pad_mm", "cut_mm")
-    return [(worst, "mould checks"), (f"{document['silicone_volume_ml']:.1f} ml", "silicone to cast")], [
-        heading("Mould"),
-        figures(
-            [
-                (folder / "mould.png", f"The mould, {size} mm, shaded by height."),
-                (folder / "tracks.png", "The fibres as they lie in the mould; the deeper one interrupts the other."),
-            ]
-        ),
-        table(["check", "verdict", "finding"], [[f["name"], f["status"], f["message"]] for f in document["findings"]]),
-        heading("Fibres to cut"),
-        table(
-            ["number", "fibre", "depth (mm)", "in the pad (mm)", "cut (mm)"],
-            [[fibre[name] for name in shown] for fibre in document["fibres"]],
-        ),
-    ]
-
-
-def _calibration(folder: Path, document: dict[str, Any]) -> Pieces:
-    from design.page import figures, heading, paragraph, table
-
-    names = ("lost", "subsets", "mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
-    errors = [[row[name] for name in names] + [f"{row['within_r90']:.1%}"] for row in document["errors"]]
-    return [
-        (f"{errors[0][2]:.2f} mm", "mean error, all fibres"),
-        (f"{errors[-1][2]:.2f} mm", f"{errors[-1][0]} lost"),
-    ], [
-        heading("Calibration"),
-        paragraph(
-            f"Errors on {document['test_presses']} presses never trained on ({document['split']} split); "
-            "one network serves every loss."
-        ),
-        figures(
-            [
-                (folder / "error_map.png", "Where presses were, and how far off they were found."),
-                (folder / "error_by_loss.png", "Error by number of lost fibres."),
-            ]
-        ),
-        table(
-            ["lost", "subsets", "mean (mm)", "std (mm)", "worst (mm)", "median (mm)", "95 % (mm)", "within r90"], errors
-        ),
-    ]
+@contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """Blame a document that is not as padforge writes it on its file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{path}: not as padforge writes it ({error!r})") from error
 
 
 def main() -> None:

@@ -70,13 +70,18 @@ def canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:
     """A figure in the house's style, and its axes."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     axes = figure.subplots()
+    tidy(axes)
+    return figure, axes
+
+
+def tidy(axes: Any) -> None:
+    """Put axes in the house's style."""
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
     axes.tick_params(color=FAINT, labelcolor=INK)
     axes.xaxis.label.set_color(INK)
     axes.yaxis.label.set_color(INK)
-    return figure, axes
 
 
 def explain(axes: Any, text: str) -> None:

@@ -1,0 +1,136 @@
+"""`padforge study ...`: the paper's figures and tables for any pads, carried further."""
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from design.console import json_option, load_spec, out_option, progress, show_result, spec_option
+from design.errors import InputError
+
+if TYPE_CHECKING:
+    from design.morphology import Morphology
+
+    from .study import Study
+
+DEFAULT_PADS = ("square", "random-5", "optimised")
+
+
+@click.group()
+def study() -> None:
+    """Reproduce the paper's figures and tables for pads of your own, and go beyond them.
+
+    \b
+    padforge study robustness                              square grid, a random pad and an optimised one
+    padforge study robustness square out/pad/morphology.json
+    padforge study scaling --jobs 2 --out out/study
+
+    A PAD is a morphology.json, a published .mat, `square`, `random-N` (N knots a fibre) or `optimised` (found by a
+    short search); `square@8` has a grid of 8.
+    Each study writes NAME.json, NAME.csv, NAME.png and NAME.md. Broken off, it goes on with --resume.
+    """
+
+
+def _command(name: str, default: tuple[str, ...] = DEFAULT_PADS, seed: int = 0) -> Callable[..., Any]:
+    """A study's command: pads and options that all have, and what is done with the study that it makes."""
+
+    def decorate(make: "Callable[..., Study]") -> click.Command:
+        @wraps(make)
+        def command(
+            pads: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
+        ) -> None:
+            from .pads import load_pads
+            from .study import lines, run
+
+            with progress() as bar:
+                task = bar.add_task(name, total=None, note="pads")
+                made = make(load_pads(pads or default, seed), seed=seed, **options)
+
+                def report(done: int, total: int, last: str) -> None:
+                    bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
+
+                document = run(made, out, jobs=jobs, resume=resume, progress=report)
+            show_result(document, [*lines(document), "", f"{name} -> {out / name}.png"], as_json)
+
+        options = (
+            click.argument("pads", metavar="[PAD]...", nargs=-1),
+            click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=seed, help="Seed of random choices."),
+            click.option("--jobs", type=click.IntRange(1, 256), help="Tasks at once (default: one a core)."),
+            click.option("--resume", is_flag=True, help="Go on where a study into the same folder was broken off."),
+            out_option("out/study"),
+            json_option,
+        )
+        for option in reversed(options):
+            command = option(command)
+        return study.command(name)(command)
+
+    return decorate
+
+
+@_command("robustness")
+@click.option("--lost", type=click.IntRange(0, 8), default=3, show_default=True, help="Fibres lost at once, at most.")
+@click.option(
+    "--signals",
+    "rule",
+    type=click.Choice(["published", "exact"]),
+    default="published",
+    show_default=True,
+    help="Fibres sampled as in the paper, or exact.",
+)
+@click.option("--presses", type=click.IntRange(4), default=1024, show_default=True, help="To train on, a square.")
+@spec_option
+def robustness(pads: "dict[str, Morphology]", *, spec: Path | None, **options: Any) -> "Study":
+    """Errors by number of lost fibres, over all sets of them, and maps before and after (figures 3, 4 and 5).
+
+    For recordings of a built pad (figures 13 and 14) see `padforge sense robustness`.
+    """
+    from design.settings import Contact
+
+    from .robustness import robustness_study
+
+    return robustness_study(pads, contact=load_spec(spec).section(Contact), **options)
+
+
+@_command("sensitivity")
+def sensitivity(pads: "dict[str, Morphology]", **options: Any) -> "Study":
+    """Objects of other sizes and shapes, and other ones in use than in training (figure 6)."""
+    from .sensitivity import sensitivity_study
+
+    return sensitivity_study(pads, **options)
+
+
+@_command("scaling", default=("square", "optimised"))
+@click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
+def scaling(pads: "dict[str, Morphology]", *, grids: str, **options: Any) -> "Study":
+    """Larger surfaces, the pads repeated over them as tiles (figures 7 and 8)."""
+    from .scaling import scaling_study
+
+    return scaling_study(pads, grids=_numbers(grids), **options)
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        numbers = tuple(sorted({int(part) for part in text.split(",")}))
+    except ValueError:
+        numbers = ()
+    if not numbers or not 2 <= numbers[0] <= numbers[-1] <= 256:
+        raise InputError(f"grids is {text!r}, expected numbers from 2 to 256 with commas between them")
+    return numbers
+
+
+@_command("force")
+def force(pads: "dict[str, Morphology]", **options: Any) -> "Study":
+    """Depth and force of a press from the signals that locate it, with a model of indentation."""
+    from .force import force_study
+
+    return force_study(pads, **options)
+
+
+@_command("shape")
+def shape(pads: "dict[str, Morphology]", **options: Any) -> "Study":
+    """Which object was pressed, from the signals that locate it."""
+    from .shape import shape_study
+
+    return shape_study(pads, **options)

@@ -1,0 +1,160 @@
+"""What every study shares: work in tasks that survive being broken off, and results as table, figure and text."""
+
+import csv
+import io
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from design.checkpoint import Checkpoints, State
+from design.files import provenance, write_json, write_text
+from design.threads import one_torch_thread
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Task:
+    """A piece of a study's work that is done in one go.
+
+    Attributes:
+        name: what is shown while it runs.
+        make: its result, arrays by name; the same whatever else is done, and when.
+    """
+
+    name: str
+    make: Callable[[], State]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a study found.
+
+    Attributes:
+        rows: of its table, all with the same keys, values as JSON has them.
+        text: paragraphs that say what it shows, without markup.
+        maps: further JSON that the figure needs, by name.
+    """
+
+    rows: list[dict[str, Any]]
+    text: list[str]
+    maps: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study, ready to be run.
+
+    Attributes:
+        name: stem of its files. title: of its text.
+        settings: all that its results depend on, as JSON has it; a run is resumed with the same alone.
+        tasks: its work. conclude: findings from the tasks' results, in their order.
+        draw: the figure from the finished document.
+    """
+
+    name: str
+    title: str
+    settings: dict[str, Any]
+    tasks: Sequence[Task]
+    conclude: Callable[[list[State]], Findings]
+    draw: Callable[[Mapping[str, Any]], "Figure"]
+
+
+def run(
+    study: Study,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    resume: bool = False,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+) -> dict[str, Any]:
+    """Do a study's work and write NAME.json, NAME.csv, NAME.png and NAME.md.
+
+    Results of tasks are kept in `out` until all are done.
+
+    Args:
+        out: folder. jobs: tasks at once; as many as there are cores if None. resume: whether to go on from tasks that
+            an earlier run into the same folder has done; else they are thrown away.
+        progress: called with (tasks done, tasks in all, the last one's name).
+
+    Returns:
+        The document: "format", "rows", "text", "settings", "provenance" and the findings' maps.
+
+    Raises:
+        InputError: tasks to go on from that belong to other settings.
+    """
+    from design.plan import save_figure
+
+    kept = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings})
+    findings = study.conclude(_done(study.tasks, kept, jobs or os.cpu_count() or 1, resume, progress))
+    document = {
+        "format": f"padforge-study-{study.name}/1",
+        "title": study.title,
+        "text": findings.text,
+        "rows": findings.rows,
+        **findings.maps,
+        "settings": study.settings,
+        "provenance": provenance(f"padforge study {study.name}", study.settings.get("seed"), packages=("torch",)),
+    }
+    write_text(out / f"{study.name}.csv", _csv(findings.rows))
+    write_text(out / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
+    save_figure(study.draw(document), out / f"{study.name}.png")
+    write_json(out / f"{study.name}.json", document)
+    kept.clear()
+    return document
+
+
+def _done(
+    tasks: Sequence[Task], kept: Checkpoints, jobs: int, resume: bool, progress: Callable[[int, int, str], None]
+) -> list[State]:
+    """The results of all tasks, those that are kept not made again."""
+    states = kept.begin(resume)
+    progress(len(states), len(tasks), "")
+    # Threads, since torch and the kernels let go of the interpreter: nothing is copied, and one cache of compiled code.
+    with one_torch_thread(), ThreadPoolExecutor(jobs) as pool:
+        running = {pool.submit(task.make): number for number, task in enumerate(tasks) if number not in states}
+        try:
+            for future in as_completed(running):
+                number = running[future]
+                states[number] = future.result()
+                kept.save(number, states[number])
+                progress(len(states), len(tasks), tasks[number].name)
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return [states[number] for number in range(len(tasks))]
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Rows as text, the first one their keys; numbers with four digits."""
+    return [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
+
+
+def lines(document: Mapping[str, Any]) -> list[str]:
+    """A study as a table for people, and what it shows."""
+    cells = table(document["rows"])
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    told = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in cells]
+    return [*told, "", *document["text"]]
+
+
+def _cell(value: object) -> str:
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _markdown(document: Mapping[str, Any], figure: str) -> str:
+    head, *body = (f"| {' | '.join(row)} |" for row in table(document["rows"]))
+    rule = f"|{' --- |' * len(document['rows'][0])}"
+    parts = [f"# {document['title']}", *document["text"], f"![{document['title']}]({figure})"]
+    return "\n\n".join([*parts, "\n".join([head, rule, *body])]) + "\n"
