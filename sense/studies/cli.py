@@ -1,5 +1,7 @@
 """`padforge study ...`: the paper's figures and tables for any pads, carried further."""
 
+import os
+import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -7,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from design.cli import INTERRUPTED
 from design.console import json_option, load_spec, out_option, progress, show_result, spec_option
 from design.errors import InputError
 
@@ -51,7 +54,13 @@ def _command(name: str, default: tuple[str, ...] = DEFAULT_PADS, seed: int = 0) 
                 def report(done: int, total: int, last: str) -> None:
                     bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
 
-                document = run(made, out, jobs=jobs, resume=resume, progress=report)
+                try:
+                    document = run(made, out, jobs=jobs, resume=resume, progress=report)
+                except KeyboardInterrupt:
+                    bar.stop()
+                    print("padforge: interrupted; --resume goes on from what was finished", file=sys.stderr, flush=True)
+                    # At once: threads in the middle of their arithmetic cannot be told to stop, nor be waited for.
+                    os._exit(INTERRUPTED)
             show_result(document, [*lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (

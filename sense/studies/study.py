@@ -3,10 +3,12 @@
 import csv
 import io
 import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from design.checkpoint import Checkpoints, State
@@ -114,18 +116,49 @@ def _done(
     """The results of all tasks, those that are kept not made again."""
     states = kept.begin(resume)
     progress(len(states), len(tasks), "")
-    # Threads, since torch and the kernels let go of the interpreter: nothing is copied, and one cache of compiled code.
-    with one_torch_thread(), ThreadPoolExecutor(jobs) as pool:
-        running = {pool.submit(task.make): number for number, task in enumerate(tasks) if number not in states}
-        try:
-            for future in as_completed(running):
-                number = running[future]
-                states[number] = future.result()
-                kept.save(number, states[number])
-                progress(len(states), len(tasks), tasks[number].name)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    missing = [number for number in range(len(tasks)) if number not in states]
+    with one_torch_thread():
+        for number, state in _results({number: tasks[number] for number in missing}, jobs):
+            states[number] = state
+            kept.save(number, state)
+            progress(len(states), len(tasks), tasks[number].name)
     return [states[number] for number in range(len(tasks))]
+
+
+def _results(tasks: Mapping[int, Task], jobs: int) -> Iterator[tuple[int, State]]:
+    """Results of tasks as they are done, so many at once.
+
+    Threads, since torch and the kernels let go of the interpreter: nothing is copied, and compiled code is shared. They
+    are daemons, so that a task of minutes does not hold up whoever interrupts the study.
+    """
+    begun: SimpleQueue[int] = SimpleQueue()
+    done: SimpleQueue[tuple[int, State | BaseException]] = SimpleQueue()
+    for number in tasks:
+        begun.put(number)
+
+    def work() -> None:
+        while not begun.empty():
+            try:
+                number = begun.get_nowait()
+            except Empty:  # another thread was faster
+                return
+            try:
+                done.put((number, tasks[number].make()))
+            except BaseException as error:
+                done.put((number, error))
+
+    for _ in range(min(jobs, len(tasks))):
+        Thread(target=work, daemon=True).start()
+    try:
+        for _ in tasks:
+            number, result = done.get()
+            if isinstance(result, BaseException):
+                raise result
+            yield number, result
+    finally:
+        while not begun.empty():
+            with suppress(Empty):
+                begun.get_nowait()
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:

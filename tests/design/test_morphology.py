@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design import InputError, Morphology
+from design import InputError, Morphology, signals
 from design.morphology import assemble
 
 
@@ -115,3 +115,21 @@ def test_numbers_and_nesting_beyond_measure_are_refused(tmp_path, pitch):
     path.write_text('{"format": "padforge-morphology/1", "knots": [], "pitch_mm": ' + pitch + "}")
     with pytest.raises(InputError, match=r"pad\.json"):
         Morphology.load(path)
+
+
+def test_a_pad_repeated_as_tiles_answers_alike_in_each_of_them():
+    tile = Morphology.random(3, 4, seed=2, pitch_mm=5.0)
+    pad = tile.tiled(4)
+    assert (pad.grid, pad.pitch_mm) == (12, 5.0)
+    places = np.random.default_rng(0).uniform(3.6, 6.4, (50, 2))
+    answers = signals(pad, places).reshape(50, 2, 4, 3)
+    moved = signals(pad, places + np.array([3, 0])).reshape(50, 2, 4, 3)
+    # One tile to the right: the same horizontals, the verticals of the next tile.
+    np.testing.assert_allclose(moved[:, 0], answers[:, 0], atol=1e-9)
+    np.testing.assert_allclose(moved[:, 1, 1:], answers[:, 1, :-1], atol=1e-9)
+
+
+def test_straight_fibres_repeated_are_straight_fibres():
+    places = np.random.default_rng(1).uniform(1, 8, (40, 2))
+    tiled, straight = Morphology.straight(2).tiled(4), Morphology.straight(8)
+    np.testing.assert_allclose(signals(tiled, places), signals(straight, places), atol=1e-12)
