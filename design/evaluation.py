@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .contact import boustrophedon, signals
 from .errors import InputError
-from .levenberg_marquardt import Network, fit_many
+from .levenberg_marquardt import Network, best_device, fit_many
 from .losses import lost_subsets
 from .morphology import Morphology
 from .settings import Contact
@@ -24,7 +24,7 @@ Loss = tuple[int, ...]
 JITTER = 5 / 49
 """Greatest shift of a press off its serpentine, grid units, as published."""
 BATCH = 7
-"""Networks trained at once: a batch for each core, and the batches of a level of about one size."""
+"""Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ def evaluate(
 
 def batches(losses: Sequence[Loss]) -> list[list[Loss]]:
     """Losses in parts that are trained at once."""
-    return [list(losses[begin : begin + BATCH]) for begin in range(0, len(losses), BATCH)]
+    size = BATCH if best_device() == "cpu" else len(losses)
+    return [list(losses[begin : begin + size]) for begin in range(0, len(losses), size)]
 
 
 @dataclass(frozen=True)

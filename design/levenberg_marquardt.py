@@ -102,7 +102,7 @@ def fit_many(
     epochs: int = EPOCHS,
     check: tuple[Array, Array] | None = None,
     also: Array | None = None,
-    device: str = "cpu",
+    device: str | None = None,
 ) -> list[Network]:
     """Train networks of one shape at once: 70 % of the samples to learn from, 15 % for validation, 15 % left aside.
 
@@ -113,7 +113,7 @@ def fit_many(
         hidden: neurons of the hidden layer. epochs: at most so many steps.
         check: inputs (S, C, D) and targets (C, O) of validation; where given, all samples are learnt from.
         also: (A, Q, O) targets that are as right as those of `targets`: a sample counts by the one it comes nearest to.
-        device: where torch computes, such as "cuda".
+        device: where torch computes; the GPU if None and there is one.
 
     Returns:
         S networks, each of the epoch that did best on validation. What a network becomes depends on its `rng` and its
@@ -142,14 +142,22 @@ def fit_many(
     if check is not None:
         places = onto.there(check[1][None])
         validate = [(scale.there(own), places) for own, scale in zip(check[0], into, strict=True)]
-    samples_of = partial(_stacked, device=device)
-    trained = train(_tensor(starts, device), samples_of(learn), samples_of(validate), epochs)
+    at = device or best_device()
+    samples_of = partial(_stacked, device=at)
+    trained = train(_tensor(starts, at), samples_of(learn), samples_of(validate), epochs)
     return [
         Network(into_neurons.T, onto_outputs.T, scale, onto, int(taken))
         for scale, into_neurons, onto_outputs, taken in zip(
             into, *(part.cpu().numpy() for part in trained), strict=True
         )
     ]
+
+
+def best_device() -> str:
+    """The name torch has for the GPU, if there is one, else for the processor."""
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def _stacked(pairs: Sequence[tuple[Array, Array]], device: str) -> "tuple[Tensor, Tensor]":

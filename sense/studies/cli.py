@@ -36,20 +36,20 @@ def study() -> None:
     """
 
 
-def _command(name: str, default: tuple[str, ...] = DEFAULT_PADS, seed: int = 0) -> Callable[..., Any]:
-    """A study's command: pads and options that all have, and what is done with the study that it makes."""
+def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
+    """A study's command, of pads or what else `of` says: options that all have, and what is done with the study that
+    the decorated function makes of the names given and the seed."""
 
     def decorate(make: "Callable[..., Study]") -> click.Command:
         @wraps(make)
         def command(
-            pads: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
+            names: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
         ) -> None:
-            from .pads import load_pads
             from .study import lines, run
 
             with progress() as bar:
                 task = bar.add_task(name, total=None, note="pads")
-                made = make(load_pads(pads or default, seed), seed=seed, **options)
+                made = make(names, seed=seed, **options)
 
                 def report(done: int, total: int, last: str) -> None:
                     bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
@@ -64,8 +64,8 @@ def _command(name: str, default: tuple[str, ...] = DEFAULT_PADS, seed: int = 0) 
             show_result(document, [*lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (
-            click.argument("pads", metavar="[PAD]...", nargs=-1),
-            click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=seed, help="Seed of random choices."),
+            click.argument("names", metavar=f"[{of}]...", nargs=-1),
+            click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Seed of random choices."),
             click.option("--jobs", type=click.IntRange(1, 256), help="Tasks at once (default: one a core)."),
             click.option("--resume", is_flag=True, help="Go on where a study into the same folder was broken off."),
             out_option("out/study"),
@@ -76,6 +76,12 @@ def _command(name: str, default: tuple[str, ...] = DEFAULT_PADS, seed: int = 0) 
         return study.command(name)(command)
 
     return decorate
+
+
+def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_PADS) -> "dict[str, Morphology]":
+    from .pads import load_pads
+
+    return load_pads(names or default, seed)
 
 
 @_command("robustness")
@@ -90,7 +96,7 @@ def _command(name: str, default: tuple[str, ...] = DEFAULT_PADS, seed: int = 0) 
 )
 @click.option("--presses", type=click.IntRange(4), default=1024, show_default=True, help="To train on, a square.")
 @spec_option
-def robustness(pads: "dict[str, Morphology]", *, spec: Path | None, **options: Any) -> "Study":
+def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
     """Errors by number of lost fibres, over all sets of them, and maps before and after (figures 3, 4 and 5).
 
     For recordings of a built pad (figures 13 and 14) see `padforge sense robustness`.
@@ -99,24 +105,24 @@ def robustness(pads: "dict[str, Morphology]", *, spec: Path | None, **options: A
 
     from .robustness import robustness_study
 
-    return robustness_study(pads, contact=load_spec(spec).section(Contact), **options)
+    return robustness_study(_pads(names, seed), seed=seed, contact=load_spec(spec).section(Contact), **options)
 
 
 @_command("sensitivity")
-def sensitivity(pads: "dict[str, Morphology]", **options: Any) -> "Study":
+def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
     """Objects of other sizes and shapes, and other ones in use than in training (figure 6)."""
     from .sensitivity import sensitivity_study
 
-    return sensitivity_study(pads, **options)
+    return sensitivity_study(_pads(names, seed), seed=seed)
 
 
-@_command("scaling", default=("square", "optimised"))
+@_command("scaling")
 @click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
-def scaling(pads: "dict[str, Morphology]", *, grids: str, **options: Any) -> "Study":
+def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
     """Larger surfaces, the pads repeated over them as tiles (figures 7 and 8)."""
     from .scaling import scaling_study
 
-    return scaling_study(pads, grids=_numbers(grids), **options)
+    return scaling_study(_pads(names, seed, ("square", "optimised")), grids=_numbers(grids), seed=seed)
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -130,16 +136,28 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 @_command("force")
-def force(pads: "dict[str, Morphology]", **options: Any) -> "Study":
+def force(names: tuple[str, ...], *, seed: int) -> "Study":
     """Depth and force of a press from the signals that locate it, with a model of indentation."""
     from .force import force_study
 
-    return force_study(pads, **options)
+    return force_study(_pads(names, seed), seed=seed)
 
 
 @_command("shape")
-def shape(pads: "dict[str, Morphology]", **options: Any) -> "Study":
+def shape(names: tuple[str, ...], *, seed: int) -> "Study":
     """Which object was pressed, from the signals that locate it."""
     from .shape import shape_study
 
-    return shape_study(pads, **options)
+    return shape_study(_pads(names, seed), seed=seed)
+
+
+@_command("drift", of="PAD_OR_RECORDING")
+def drift(names: tuple[str, ...], *, seed: int) -> "Study":
+    """Denoising and drift compensation, on pads as simulated and on recordings; idle shares (figure 12, table III)."""
+    from .drift import drift_study
+    from .pads import is_recording, load_pads, load_recordings
+
+    names = names or DEFAULT_PADS
+    recordings = [name for name in names if is_recording(name)]
+    pads = [name for name in names if name not in recordings]
+    return drift_study(load_pads(pads, seed), load_recordings(recordings), seed=seed)

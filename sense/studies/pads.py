@@ -2,19 +2,22 @@
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from design.errors import InputError
 from design.morphology import Morphology
+
+if TYPE_CHECKING:
+    from ..recording import Recording
 
 NAMED = re.compile(r"(square|optimised|random-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
 """Straight fibres, random ones of N knots, and what a short search finds; their grid after an @."""
 GRID = 4
 
 
-def load_pads(names: tuple[str, ...], seed: int) -> dict[str, Morphology]:
+def load_pads(names: Sequence[str], seed: int) -> dict[str, Morphology]:
     """Pads by the label that tables and figures give them, in order.
 
     Args:
@@ -23,13 +26,39 @@ def load_pads(names: tuple[str, ...], seed: int) -> dict[str, Morphology]:
     Raises:
         InputError: no such file or name, a file that is no morphology, or a name given twice.
     """
-    pads: dict[str, Morphology] = {}
-    for name in names:
-        label, pad = _load(name, seed)
-        if label in pads:
-            raise InputError(f"{name}: a pad called {label} is there already, expected each once")
-        pads[label] = pad
-    return pads
+    return _labelled([(name, *_load(name, seed)) for name in names])
+
+
+def load_recordings(names: Sequence[str]) -> "dict[str, Recording]":
+    """Recordings by label, as `Recording.open` reads them; raises InputError as it does, and for a label met twice."""
+    from ..recording import Recording
+
+    def label(path: Path) -> str:
+        return path.resolve().parent.name if path.name == "recording" else path.stem
+
+    return _labelled([(name, label(Path(name)), Recording.open(name)) for name in names])
+
+
+def is_recording(name: str) -> bool:
+    """Whether a path is that of a recording: a folder, or a file that holds readings."""
+    from ..recording import FILES
+
+    path = Path(name)
+    if path.suffix.lower() == ".mat" and path.is_file():
+        from design.published import load_mat
+
+        return "voltage" in load_mat(path, ())
+    return path.is_dir() or path.suffix.lower() in FILES
+
+
+def _labelled(parts: list[tuple[str, str, Any]]) -> dict[str, Any]:
+    """Things by label, from what the user called them, their labels and themselves."""
+    found: dict[str, Any] = {}
+    for name, label, thing in parts:
+        if label in found:
+            raise InputError(f"{name}: one called {label} is there already, expected each once")
+        found[label] = thing
+    return found
 
 
 def _load(name: str, seed: int) -> tuple[str, Morphology]:

@@ -185,7 +185,7 @@ def test_pads_are_told_by_file_or_by_name(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["robustness", "nowhere.json"], "nowhere.json: no such file, and none of square, optimised, random-N"),
-        (["robustness", "square", "square"], "a pad called square is there already"),
+        (["robustness", "square", "square"], "one called square is there already"),
         (["robustness", "square", "--presses", "1000"], "presses is 1000, allowed is a square number from 4"),
         (["robustness", "square@0"], "square@0: no such file"),
         (["scaling", "square", "--grids", "4,x"], "grids is '4,x', expected numbers from 2 to 256"),
