@@ -20,12 +20,12 @@ from typing import Self
 import torch
 from torch import Tensor
 
-FAILURES = 4
+FAILURES = 5
 """Steps in a row without a new best on validation that end the training."""
 RIDGE = 1e-6
 """Penalty of squared output weights per sample: keeps them finite where neurons are alike."""
-FIRST_DAMPING = 10.0
-"""In units of the mean curvature: high, for small first steps lead to smoother networks."""
+FIRST_DAMPING = 1.0
+"""In units of the mean curvature: high, since small first steps lead to smoother networks."""
 EASE = 0.2
 """Least factor by which a step that was taken lowers the damping."""
 LEAST_DAMPING, MOST_DAMPING = 1e-15, 1e10

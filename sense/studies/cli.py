@@ -161,3 +161,11 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     recordings = [name for name in names if is_recording(name)]
     pads = [name for name in names if name not in recordings]
     return drift_study(load_pads(pads, seed), load_recordings(recordings), seed=seed)
+
+
+@_command("multicontact")
+def multicontact(names: tuple[str, ...], *, seed: int) -> "Study":
+    """Two contacts at once, whichever is named first, and how many there are (figure 9)."""
+    from .multicontact import multicontact_study
+
+    return multicontact_study(_pads(names, seed), seed=seed)

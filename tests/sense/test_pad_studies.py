@@ -7,14 +7,14 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from design import InputError, Morphology, signals
-from design.evaluation import LossError, evaluate
+from design.evaluation import evaluate
 from sense.studies import scaling, sensitivity
 from sense.studies.pads import load_pads
 from sense.studies.robustness import robustness_study
@@ -55,7 +55,8 @@ def test_robustness_agrees_with_evaluate(tmp_path: Path) -> None:
     found = evaluate(PADS["random"], lost=(2,), hidden=10, presses=144, test=300)
     (row,) = rows_of(document, pad="random", lost=2)
     # Each of the six sets is trained three times here, and once there.
-    assert found[0] == LossError(2, 6, *(pytest.approx(row[key], rel=0.25) for key in ("mean", "std", "max")))
+    for key in ("mean", "std", "max"):
+        assert getattr(found[0], key) == pytest.approx(row[key], rel=0.25)
 
 
 def test_published_errors_are_reproduced(published: Path, tmp_path: Path) -> None:
@@ -108,7 +109,9 @@ def test_other_settings_are_no_help_to_a_study_broken_off(tmp_path: Path) -> Non
         return {"a": np.ones(1)}
 
     def made(seed: int) -> Study:
-        return Study("x", "X", {"seed": seed}, [Task("a", task)] * 2, lambda states: Findings([], []), partial(print))
+        return Study(
+            "x", "X", {"seed": seed}, [Task("a", task)] * 2, lambda states: Findings([], []), lambda document: Figure()
+        )
 
     with pytest.raises(KeyboardInterrupt):
         run(made(0), tmp_path, jobs=1)
