@@ -4,6 +4,8 @@ from .contact import signals_sparse as signals_sparse
 from .curves import crossings as crossings
 from .curves import flatten as flatten
 from .errors import InputError as InputError
+from .indentation import Indenter as Indenter
+from .indentation import indented_signals as indented_signals
 from .morphology import Morphology as Morphology
 from .objective import published_objective as published_objective
 from .search import search as search

@@ -5,20 +5,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from design.palette import ALARM, FAINT, HORIZONTAL, INK, VERTICAL
 from design.plan import save_figure
 
-from .figures import canvas, explain
+from .figures import canvas, explain, tidy
 from .size_study import power_law
 
 _WIDTH = 0.36
 
 
 def draw_robustness(document: Mapping[str, Any], path: Path) -> None:
-    """Draw the error against the number of lost fibres, every way beside the others, and every set as a dot."""
-    figure, axes = canvas(6.4, 4.4)
+    """Draw the error against the number of lost fibres, every way beside the others, and every set as a dot; below,
+    each way's errors over the pad, with all fibres and without the worst set of each size."""
     ways = document["ways"]
+    columns = len(next(iter(ways.values()))["errors"])
+    figure = Figure(figsize=(max(6.4, 1.9 * columns), 4.4 + 1.9 * len(ways)), layout="constrained")
+    grid = figure.add_gridspec(1 + len(ways), columns, height_ratios=[4.4] + [1.9] * len(ways))
+    axes = figure.add_subplot(grid[0, :])
+    tidy(axes)
     for place, (way, colour) in enumerate(zip(ways, (VERTICAL, HORIZONTAL), strict=False)):
         sideways = _WIDTH * (place - (len(ways) - 1) / 2)
         for at, row in enumerate(ways[way]["errors"]):
@@ -39,7 +45,27 @@ def draw_robustness(document: Mapping[str, Any], path: Path) -> None:
         f"Lost fibres, {document['test_presses']} presses never trained on\n", loc="left", color=INK, fontsize=11
     )
     explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
+    means = [cell["mean_mm"] for way in ways.values() for each in way["maps"] for cell in each["by_place"]]
+    for row, (way, found) in enumerate(ways.items()):
+        panels = [figure.add_subplot(grid[1 + row, column], aspect="equal") for column in range(len(found["maps"]))]
+        pictures = [_draw_map(panel, each, max(means)) for panel, each in zip(panels, found["maps"], strict=True)]
+        panels[0].set_ylabel(way, fontsize=8, color=INK)
+        figure.colorbar(pictures[0], ax=panels[-1], label="mm", shrink=0.9)
     save_figure(figure, path)
+
+
+def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
+    """Draw mean errors by cell of the pad, without the fibres that its title names."""
+    cells = found["by_place"]
+    x_mm, y_mm = (sorted({cell[name] for cell in cells}) for name in ("x_mm", "y_mm"))
+    errors = np.full((len(y_mm), len(x_mm)), np.nan)
+    for cell in cells:
+        errors[y_mm.index(cell["y_mm"]), x_mm.index(cell["x_mm"])] = cell["mean_mm"]
+    axes.set_xticks([])
+    axes.set_yticks([])
+    lost = "+".join(str(fibre + 1) for fibre in found["lost"])
+    axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
+    return axes.imshow(errors, origin="lower", cmap="magma_r", vmin=0, vmax=highest_mm)
 
 
 def draw_size_curve(document: Mapping[str, Any], path: Path) -> None:

@@ -23,7 +23,7 @@ from design.losses import lost_subsets
 
 from . import settings
 from .calibration import learn, split_presses
-from .evaluation import errors_by_loss
+from .evaluation import by_place, errors_by_loss
 from .localizer import Found, Localizer
 from .recording import Recording
 
@@ -58,7 +58,8 @@ def robustness(
         progress: called with (networks done, networks in all).
 
     Returns:
-        A document with "ways": for each, "errors" and "by_subset" as `evaluate` gives them; and "test_presses".
+        A document with "ways": for each, "errors" and "by_subset" as `evaluate` gives them, and "maps", errors by place
+        without the worst set of each size; and "test_presses".
 
     Raises:
         InputError: neither way wanted, too few presses, a recording seen in a recalibration or that does not suit the
@@ -95,7 +96,12 @@ def robustness(
 
 def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm: NDArray[np.float64]) -> dict[str, Any]:
     rows, by_subset = errors_by_loss(fibres, levels, locate, places_mm)
-    return {"errors": rows, "by_subset": by_subset}
+    worst = [
+        max((each for each in by_subset if len(each["lost"]) == level), key=lambda each: each["mean_mm"])["lost"]
+        for level in levels
+    ]
+    maps = [{"lost": lost, "by_place": by_place(locate(tuple(lost)).places_mm, places_mm)} for lost in worst]
+    return {"errors": rows, "by_subset": by_subset, "maps": maps}
 
 
 def _presses(recording: Recording, localizer: Localizer | None, options: settings.Localizer) -> tuple[Indices, Indices]:

@@ -28,7 +28,18 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
     document, expected = robustness(recording, localizer, lost=2), evaluate(localizer, recording, (0, 1, 2))
-    assert document["ways"] == {ONE: {name: expected[name] for name in ("errors", "by_subset")}}
+    (way,) = document["ways"].items()
+    assert way[0] == ONE
+    assert {name: way[1][name] for name in ("errors", "by_subset")} == {
+        name: expected[name] for name in ("errors", "by_subset")
+    }
+    assert way[1]["maps"][0] == {"lost": [], "by_place": expected["by_place"]}
+    worst = max((each for each in expected["by_subset"] if len(each["lost"]) == 2), key=lambda each: each["mean_mm"])
+    assert way[1]["maps"][2]["lost"] == worst["lost"]
+    cells = way[1]["maps"][2]["by_place"]
+    assert np.average(
+        [cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells]
+    ) == pytest.approx(worst["mean_mm"])
     assert document["test_presses"] == expected["test_presses"]
 
 
