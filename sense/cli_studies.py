@@ -77,8 +77,8 @@ def robustness(
 ) -> None:
     """Errors on RECORDING for every set of lost fibres, of one network or of networks retrained for each, or both.
 
-    Writes robustness.json and robustness.png (figures 13 and 14 of the paper). Retrained networks that are done are kept when it is broken off, and the
-    same command goes on from them.
+    Writes robustness.json and robustness.png (figures 13 and 14 of the paper). Retrained networks that are done are
+    kept when it is broken off, and the same command goes on from them.
     """
     from design.files import write_json
 
