@@ -3,6 +3,7 @@
 import json
 import shutil
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,9 @@ class Checkpoints:
         if not (resume and about.exists()):
             self.clear()
             return {}
-        before = read_json(about, FORMAT)["settings"]
+        before = read_json(about, FORMAT).get("settings")
+        if not isinstance(before, dict) or not all(isinstance(section, dict) for section in before.values()):
+            raise InputError(f"{about}: settings are not as padforge writes them; start anew without --resume")
         for section in self.settings:
             for key, value in self.settings[section].items():
                 if before.get(section, {}).get(key) != value:
@@ -67,5 +70,5 @@ def _read(path: Path) -> State:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error

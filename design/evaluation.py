@@ -81,7 +81,6 @@ def evaluate(
     levels = [number for number in lost if number < fibres]
     losses = [lost_subsets(fibres, number, subsets or math.comb(fibres, number)) for number in levels]
     trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
-    trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
 
     def means(batch: list[Loss]) -> Array:
         networks = trial.learn(batch, hidden)

@@ -1,9 +1,10 @@
 """The published localizer: one hidden layer of tanh neurons, trained by Levenberg-Marquardt (paper, evaluation).
 
-The training follows what the authors ran: damped Gauss-Newton steps (Hagan & Menhaj 1994, Training feedforward networks
-with the Marquardt algorithm) from spread-out neurons (Nguyen & Widrow 1990, Improving the learning speed of 2-layer
-neural networks), ended by presses held back for validation. Networks of one shape are trained as one batch
-(`marquardt_batch`), each on its own inputs, split and weights, and each ending when it has learnt.
+The protocol is the authors': damped Gauss-Newton steps (Hagan & Menhaj 1994, Training feedforward networks with the
+Marquardt algorithm) from spread-out neurons (Nguyen & Widrow 1990, Improving the learning speed of 2-layer neural
+networks), ended by presses held back for validation. Networks of one shape are trained as one batch, each on its own
+inputs, split and weights, and each ending when it has learnt; how steps are found, and how long a training waits for
+validation to gain, is our own (`marquardt_batch`).
 
 Torch does the algebra on as many threads as it is set to. Set it to one: the matrices are too small to gain from more,
 and where another program has a core, threads that wait for each other take many times as long.
@@ -120,10 +121,17 @@ def fit_many(
         samples, beyond rounding on no other one of the batch.
 
     Raises:
-        InputError: fewer than 3 samples, or not as many targets as inputs.
+        InputError: fewer than 3 samples, not as many targets as inputs, nothing to learn from or with, or numbers that
+            are not finite.
     """
     from .marquardt_batch import train
 
+    if min(len(rngs), hidden, inputs.shape[-1]) < 1:
+        raise InputError(
+            f"{len(rngs)} networks of {hidden} neurons for {inputs.shape[-1]} inputs, allowed is at least 1 of each"
+        )
+    if not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
+        raise InputError("inputs or targets hold NaN or infinity, expected finite numbers")
     inputs = np.broadcast_to(inputs, (len(rngs), *inputs.shape[-2:]))
     samples = inputs.shape[1]
     if samples != len(targets) or samples < 3:
@@ -178,6 +186,7 @@ def first_weights(varies: NDArray[np.bool_], hidden: int, rng: np.random.Generat
     """
     weights = rng.uniform(-1, 1, (hidden, len(varies))) * varies
     length = 0.7 * hidden ** (1 / max(1, varies.sum()))
-    weights *= length / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), np.finfo(float).tiny)
+    norm = np.linalg.norm(weights, axis=1, keepdims=True)
+    weights *= np.divide(length, norm, out=np.zeros_like(norm), where=norm > 0)
     bias = length * np.linspace(-1, 1, hidden) * rng.choice([-1, 1], hidden)
     return np.column_stack([weights, bias])

@@ -20,11 +20,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
-FAILURES = 5
+FAILURES = 4
 """Steps in a row without a new best on validation that end the training."""
-RIDGE = 1e-6
+RIDGE = 1e-5
 """Penalty of squared output weights per sample: keeps them finite where neurons are alike."""
-FIRST_DAMPING = 1.0
+FIRST_DAMPING = 3.0
 """In units of the mean curvature: high, since small first steps lead to smoother networks."""
 EASE = 0.2
 """Least factor by which a step that was taken lowers the damping."""
@@ -172,8 +172,8 @@ class _Batch(_Rows):
         better = gained & (checked < self.least)
         self.least = torch.where(better, checked, self.least)
         self.failures = torch.where(better, 0, self.failures + gained)
-        flat = slope.norm(dim=1) < LEAST_SLOPE
-        return better, flat | (self.damping > MOST_DAMPING) | (self.failures == FAILURES)
+        going = (slope.norm(dim=1) >= LEAST_SLOPE) & (self.damping <= MOST_DAMPING) & (self.failures < FAILURES)
+        return better, ~going
 
     def _change(self, slope: Tensor) -> Tensor:
         """(L, P) by which hidden weights are to be lowered; NaN where a damped matrix is singular to rounding."""

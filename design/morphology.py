@@ -16,6 +16,8 @@ from .errors import InputError
 from .files import read_json, write_json
 
 FORMAT = "padforge-morphology/1"
+MOST_GRID = 1024
+"""Most fibres of a family of a pad that is made of tiles."""
 MARGIN = 1e-3
 """Least distance of a free knot to the pad's edge, grid units, as in the published optimiser."""
 
@@ -85,8 +87,10 @@ class Morphology:
     @classmethod
     def from_parameters(cls, parameters: ArrayLike, pitch_mm: float = 11.25) -> "Morphology":
         """From the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals, their y."""
+        if np.iscomplexobj(parameters):
+            raise InputError("parameters are complex, expected real numbers")
         para = np.asarray(parameters, dtype=np.float64)
-        if para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
+        if para.size == 0 or para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
             raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
         columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
         inner = columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2)
@@ -96,8 +100,12 @@ class Morphology:
         """A pad of M `times` fibres a family, this one's course repeated over its surface, times x times.
 
         A tile of M + 1 grid units along a fibre is compressed to M, so that fibre ends stay one unit apart throughout.
+
+        Raises:
+            InputError: not a whole number of times, or more fibres than MOST_GRID.
         """
-        _require_counts(times, 0)
+        if not (isinstance(times, int) and 1 <= times <= MOST_GRID // self.grid):
+            raise InputError(f"times is {times!r}, allowed is 1 to {MOST_GRID // self.grid} for a grid of {self.grid}")
         grid, size = self.grid, self.grid * times
         out = np.empty((2 * size, times * (self.knots.shape[1] - 1) + 3, 2))
         for family in (0, 1):

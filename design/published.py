@@ -47,7 +47,11 @@ def load_morphology(path: Path) -> Morphology:
     except (InputError, ValueError, TypeError) as error:
         raise InputError(f"{path}: {error}") from error
     straight = Morphology.straight(pad.grid, PITCH_MM)
-    return straight if _misfit(straight, content) < 1e-9 < _misfit(pad, content) else pad
+    try:
+        return straight if _misfit(straight, content) < 1e-9 < _misfit(pad, content) else pad
+    except (InputError, ValueError, TypeError, IndexError, KeyError, AttributeError) as error:
+        said = str(error).splitlines()[0]
+        raise InputError(f"{path}: K, loc_all and sens_raw_all are not as published ({said})") from error
 
 
 def _misfit(pad: Morphology, content: dict[str, Any], presses: int = 32) -> float:

@@ -1,12 +1,18 @@
-"""Where results go: an output that cannot be written is one clear line, and several files appear together."""
+"""Where results go: what cannot be written is one clear line, files appear together, and one writes at a time."""
 
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from design.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system
+    fcntl = None
 
 
 @contextmanager
@@ -49,3 +55,17 @@ def staged(folder: Path) -> Iterator[Path]:
                 raise InputError(f"{folder / in_the_way[0]}: is a folder, expected a file or nothing")
             for file in files:
                 file.replace(folder / file.name)
+
+
+def lock(file: TextIO, busy: str) -> None:
+    """Keep others off until `file` is closed, where the system has such locks.
+
+    Raises:
+        InputError: saying `busy`, where somebody has locked it.
+    """
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise InputError(busy) from error

@@ -22,14 +22,9 @@ from design.files import read_json, write_json
 
 from .journal import cut_torn_line, read_journal
 from .limits import MAX_FIBRES
-from .output import refuse_unwritable, writing
+from .output import lock, refuse_unwritable, writing
 from .rig.devices import STATE_COLUMNS
 from .stream import BlockWriter
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 FORMAT = "padforge-recording/1"
 START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
@@ -61,7 +56,7 @@ class Recorder:
                 raise
             write_json(path / START, document)
             self._journal: TextIO = (path / JOURNAL).open("x", encoding="utf-8")
-            _lock(self._journal, path)
+            lock(self._journal, _busy(path))
         self._begin_with(path, BlockWriter(self._stream, fibres))
 
     def _begin_with(self, path: Path, blocks: BlockWriter) -> None:
@@ -88,7 +83,7 @@ class Recorder:
         with writing(path):
             self._journal = (path / JOURNAL).open("a", encoding="utf-8")
             try:
-                _lock(self._journal, path)
+                lock(self._journal, _busy(path))
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
@@ -182,14 +177,8 @@ class Recorder:
                 self.sync()
 
 
-def _lock(file: TextIO, path: Path) -> None:
-    """Keep other recorders off a run directory until the file is closed, where the system has such locks."""
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise InputError(f"{path}: another program is recording into it") from error
+def _busy(path: Path) -> str:
+    return f"{path}: another program is recording into it"
 
 
 def fibres_of(path: Path) -> int:

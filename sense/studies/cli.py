@@ -45,8 +45,10 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
         def command(
             names: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
         ) -> None:
+            from ..output import refuse_unwritable
             from .study import lines, run
 
+            refuse_unwritable(out)
             with progress() as bar:
                 task = bar.add_task(name, total=None, note="pads")
                 made = make(names, seed=seed, **options)

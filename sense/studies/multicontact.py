@@ -209,7 +209,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     from matplotlib.figure import Figure
 
     labels = list(document["settings"]["pads"])
-    figure = Figure(figsize=(max(6.4, 1.2 + 2.9 * len(labels)), 9.6), layout="constrained")
+    figure = Figure(figsize=(max(8.0, 1.2 + 2.9 * len(labels)), 9.6), layout="constrained")
     grid = figure.add_gridspec(3, len(labels), height_ratios=[1, 1, 1.1])
     colours = dict(zip(WAYS, CURVES, strict=False))
     _draw_bars(figure.add_subplot(grid[0, :]), document["rows"], labels, colours)

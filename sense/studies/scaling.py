@@ -203,11 +203,12 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
                 f"of the side; {reach}. The largest took {last['seconds']:.0f} s."
             )
     grid = max(settings["grids"])
-    largest = sorted((row for row in rows if row["grid"] == grid), key=lambda row: row["mean"])
+    judged_alike = (row for row in rows if row["grid"] == grid and row["way"] != PUBLISHED)
+    largest = sorted(judged_alike, key=lambda row: row["mean"])
     best, worst = largest[0], largest[-1]
     text.append(
-        f"At {grid} x {grid} the best is {best['pad']}, {best['way']}, {best['mean']:.3f} grid units or "
-        f"{best['percent_of_side']:.3f} % of the side off; {worst['pad']}, {worst['way']} is "
+        f"On fresh presses at {grid} x {grid} the best is {best['pad']}, {best['way']}, {best['mean']:.3f} grid units "
+        f"or {best['percent_of_side']:.3f} % of the side off; {worst['pad']}, {worst['way']} is "
         f"{worst['mean'] / best['mean']:.1f} times as far off."
     )
     return text
@@ -238,7 +239,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
             axes.axhline(0.5, color=INK, linewidth=0.8, linestyle="--")
             axes.legend(frameon=False, fontsize=7)
         axes.set_xticks(grids, [str(grid) for grid in grids])
-        axes.minorticks_off()
+        axes.xaxis.minorticks_off()
         axes.set_xlabel("grid")
         axes.set_ylabel(name)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)

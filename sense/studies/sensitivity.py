@@ -121,8 +121,8 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
         own = [row["mean"] for row in rows if row["pad"] == label and _trained(row)]
         met = [row["mean"] for row in rows if row["pad"] == label and not _trained(row)]
         text.append(
-            f"{label}: {small:.3f} with K {radii[0]:g}, {large:.3f} with K {radii[-1]:g} ({small / large:.1f} times "
-            f"less); shapes differ by {100 * (max(shapes) / min(shapes) - 1):.0f} %. An object the networks were not "
+            f"{label}: {small:.3f} with K {radii[0]:g}, {large:.3f} with K {radii[-1]:g}; "
+            f"shapes differ by {100 * (max(shapes) / min(shapes) - 1):.0f} %. An object the networks were not "
             f"trained with is located {np.mean(met):.3f} off on average, at worst {max(met):.3f}, instead of "
             f"{np.mean(own):.3f}."
         )

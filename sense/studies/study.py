@@ -1,10 +1,11 @@
 """What every study shares: work in tasks that survive being broken off, and results as table, figure and text."""
 
 import csv
+import hashlib
 import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -87,13 +88,46 @@ def run(
         The document: "format", "rows", "text", "settings", "provenance" and the findings' maps.
 
     Raises:
-        InputError: tasks to go on from that belong to other settings.
+        InputError: tasks to go on from that belong to other settings, a folder that cannot be written, or in which the
+            same study is at work.
     """
     from design.plan import save_figure
 
-    kept = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings})
-    findings = study.conclude(_done(study.tasks, kept, jobs or os.cpu_count() or 1, resume, progress))
-    document = {
+    from ..output import refuse_unwritable, staged
+
+    refuse_unwritable(out)
+    # What is kept goes by the number of a task, so the tasks and their order count as much as the settings.
+    order = hashlib.sha256("\n".join(task.name for task in study.tasks).encode()).hexdigest()[:16]
+    with _alone(out, study.name):
+        kept = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
+        findings = study.conclude(_done(study.tasks, kept, jobs or os.cpu_count() or 1, resume, progress))
+        document = _document(study, findings)
+        with staged(out) as folder:
+            save_figure(study.draw(document), folder / f"{study.name}.png")
+            write_text(folder / f"{study.name}.csv", _csv(findings.rows))
+            write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
+            write_json(folder / f"{study.name}.json", document)
+        kept.clear()
+    return document
+
+
+@contextmanager
+def _alone(out: Path, name: str) -> Iterator[None]:
+    """Keep other runs of a study out of its folder; InputError where one is there."""
+    from ..output import lock
+
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f".{name}.lock"
+    with path.open("a") as file:
+        lock(file, f"{out}: a {name} study is at work there; wait for it or choose another --out")
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _document(study: Study, findings: Findings) -> dict[str, Any]:
+    return {
         "format": f"padforge-study-{study.name}/1",
         "title": study.title,
         "text": findings.text,
@@ -102,12 +136,6 @@ def run(
         "settings": study.settings,
         "provenance": provenance(f"padforge study {study.name}", study.settings.get("seed"), packages=("torch",)),
     }
-    write_text(out / f"{study.name}.csv", _csv(findings.rows))
-    write_text(out / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
-    save_figure(study.draw(document), out / f"{study.name}.png")
-    write_json(out / f"{study.name}.json", document)
-    kept.clear()
-    return document
 
 
 def _done(
@@ -187,7 +215,10 @@ def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _markdown(document: Mapping[str, Any], figure: str) -> str:
-    head, *body = (f"| {' | '.join(row)} |" for row in table(document["rows"]))
+    def line(row: list[str]) -> str:
+        return f"| {' | '.join(cell.replace('|', chr(92) + '|').replace('<', '&lt;') for cell in row)} |"
+
+    head, *body = map(line, table(document["rows"]))
     rule = f"|{' --- |' * len(document['rows'][0])}"
     parts = [f"# {document['title']}", *document["text"], f"![{document['title']}]({figure})"]
     return "\n\n".join([*parts, "\n".join([head, rule, *body])]) + "\n"

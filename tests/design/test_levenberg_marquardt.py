@@ -160,3 +160,26 @@ def test_fewer_samples_than_weights_still_give_a_network(count):
 def test_samples_that_do_not_fit_are_refused(inputs, targets):
     with pytest.raises(InputError, match="at least 3"):
         fit(np.zeros((inputs, 2)), np.zeros((targets, 2)), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_inputs_that_never_vary_end_the_training(value):
+    rng = np.random.default_rng(10)
+    targets = rng.normal(3, 1, (200, 2))
+    found = fit(np.full((200, 3), value), targets, rng, 20)(np.full((1, 3), value))
+    np.testing.assert_allclose(found[0], targets.mean(axis=0), atol=0.3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_refused(bad):
+    inputs, targets = np.ones((10, 2)), np.ones((10, 1))
+    with pytest.raises(InputError, match="NaN or infinity"):
+        fit(inputs, targets * bad, np.random.default_rng(0))
+    with pytest.raises(InputError, match="NaN or infinity"):
+        fit(inputs * bad, targets, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("inputs", "networks", "hidden"), [(0, 1, 5), (2, 0, 5), (2, 1, 0)])
+def test_networks_of_nothing_are_refused(inputs, networks, hidden):
+    with pytest.raises(InputError, match="at least 1 of each"):
+        fit_many(np.ones((10, inputs)), np.ones((10, 1)), [np.random.default_rng(0)] * networks, hidden)

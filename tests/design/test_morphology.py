@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -133,3 +134,40 @@ def test_straight_fibres_repeated_are_straight_fibres():
     places = np.random.default_rng(1).uniform(1, 8, (40, 2))
     tiled, straight = Morphology.straight(2).tiled(4), Morphology.straight(8)
     np.testing.assert_allclose(signals(tiled, places), signals(straight, places), atol=1e-12)
+
+
+@pytest.mark.parametrize("times", [0, 1.5, 10**4])
+def test_tiles_beyond_reason_are_refused(times):
+    with pytest.raises(InputError, match="allowed is 1 to 256 for a grid of 4"):
+        Morphology.straight(4).tiled(times)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"K": {"str_shp": 30, "fineness": 100}},
+        {"K": {"object_size": -1, "str_shp": 30, "fineness": 100}},
+        {"sens_raw_all": np.ones((5, 7))},
+        {"K": 3},
+    ],
+)
+def test_published_samples_that_are_not_as_published_are_one_line(settings, tmp_path):
+    content = {
+        "para": np.random.default_rng(0).uniform(0.5, 2.5, (3, 8)),
+        "K": {"object_size": 0.6, "str_shp": 30, "fineness": 100},
+        "loc_all": np.ones((5, 2)),
+        "sens_raw_all": np.ones((5, 4)),
+    }
+    path = tmp_path / "pad.mat"
+    scipy.io.savemat(path, content)
+    assert Morphology.load(path).grid == 2
+    scipy.io.savemat(path, content | settings)
+    with pytest.raises(InputError, match="not as published") as refused:
+        Morphology.load(path)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("para", [np.empty((0, 0)), np.ones((2, 8)) * 1j])
+def test_parameters_of_another_kind_are_refused(para):
+    with pytest.raises(InputError, match="parameters"):
+        Morphology.from_parameters(para)

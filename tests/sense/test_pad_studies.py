@@ -7,13 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from design import InputError, Morphology, signals
+from design import Contact, InputError, Morphology, signals
 from design.evaluation import evaluate
 from sense.studies import scaling, sensitivity
 from sense.studies.pads import load_pads
@@ -119,6 +120,59 @@ def test_other_settings_are_no_help_to_a_study_broken_off(tmp_path: Path) -> Non
         run(made(1), tmp_path, resume=True)
 
 
+def test_pads_in_another_order_are_another_study(tmp_path: Path) -> None:
+    def stop(done: int, total: int, name: str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(small(), tmp_path, jobs=1, progress=stop)
+    turned = robustness_study(dict(reversed(PADS.items())), lost=2, hidden=10, presses=144, test=300)
+    with pytest.raises(InputError, match="begun with robustness tasks"):
+        run(turned, tmp_path, resume=True)
+
+
+def test_a_folder_in_which_the_same_study_is_at_work_is_refused(tmp_path: Path) -> None:
+    def made(make: Callable[[], dict]) -> Study:
+        return Study("x", "X", {}, [Task("a", make)], lambda states: Findings([{"a": 1}], []), lambda _: Figure())
+
+    def meet() -> dict:
+        with pytest.raises(InputError, match="a x study is at work there"):
+            run(made(lambda: {}), tmp_path)
+        return {}
+
+    run(made(meet), tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
+
+
+def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> None:
+    def draw(document: object) -> Figure:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(Study("x", "X", {}, [], lambda states: Findings([{"a": 1}], []), draw), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a$\\frac$", "_under", "pi|pe <b>", b"\xff".decode(errors="surrogateescape")])
+def test_any_name_of_a_file_will_do(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name / "morphology.json"
+    PADS["random"].save(path)
+    pads = load_pads((str(path),), 0)
+    document = run(robustness_study(pads, lost=0, hidden=5, presses=16, test=20), tmp_path / "out")
+    (label,) = pads
+    assert document["rows"][0]["pad"] == label
+    table = (tmp_path / "out" / "robustness.md").read_text().splitlines()[-1]
+    assert table.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
+    assert "<b>" not in table
+
+
+def test_a_pad_that_no_press_touches_is_studied_all_the_same(tmp_path: Path) -> None:
+    document = run(small(contact=Contact(radius=1e-6)), tmp_path)
+    # Nothing is told, so the middle of the pad is the best guess: half a grid unit off each way at most.
+    assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
+
+
 def test_a_larger_object_is_located_better_and_a_strange_one_worse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,7 +186,7 @@ def test_a_larger_object_is_located_better_and_a_strange_one_worse(
         return rows_of(document, **wanted)[0]["mean"]
 
     assert mean((1.0, 30), (1.0, 30)) < 0.5 * mean((0.6, 30), (0.6, 30))
-    assert mean((1.0, 30), (0.6, 30)) > 2 * mean((0.6, 30), (0.6, 30))
+    assert mean((1.0, 30), (0.6, 30)) > 1.5 * mean((0.6, 30), (0.6, 30))
 
 
 def test_one_network_for_all_tiles_keeps_its_error_as_the_surface_grows(
