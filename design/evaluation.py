@@ -23,7 +23,7 @@ Loss = tuple[int, ...]
 
 JITTER = 5 / 49
 """Greatest shift of a press off its serpentine, grid units, as published."""
-BATCH = 7
+BATCH = 14
 """Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
 
 

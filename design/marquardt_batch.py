@@ -20,7 +20,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-FAILURES = 4
+FAILURES = 3
 """Steps in a row without a new best on validation that end the training."""
 RIDGE = 1e-5
 """Penalty of squared output weights per sample: keeps them finite where neurons are alike."""
