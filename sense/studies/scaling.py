@@ -237,7 +237,10 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
                 axes.loglog(grids, values, style, color=colour, marker="o", markersize=3.5, label=f"{label}, {way}")
         if key == "mean":
             axes.axhline(0.5, color=INK, linewidth=0.8, linestyle="--")
-            axes.legend(frameon=False, fontsize=7)
+            curves = axes.get_legend_handles_labels()
+            upper.legend(
+                *curves, frameon=False, fontsize=7, handlelength=3.5, loc="outside upper left", ncols=len(WAYS)
+            )
         axes.set_xticks(grids, [str(grid) for grid in grids])
         axes.xaxis.minorticks_off()
         axes.set_xlabel("grid")
