@@ -144,8 +144,9 @@ def fit_many(
     for own, scale, rng in zip(inputs, into, rngs, strict=True):
         order = rng.permutation(samples)
         learn.append((scale.there(own[order[:learnt]]), onto.there(right[:, order[:learnt]])))
-        rows = order[learnt : learnt + held]
-        validate.append((scale.there(own[rows]), onto.there(right[:, rows])))
+        if check is None:
+            rows = order[learnt : learnt + held]
+            validate.append((scale.there(own[rows]), onto.there(right[:, rows])))
         starts.append(first_weights(scale.half > 0, hidden, rng).T)
     if check is not None:
         places = onto.there(check[1][None])

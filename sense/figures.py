@@ -1,6 +1,6 @@
 """Figures of a calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,21 @@ def tidy(axes: Any) -> None:
     axes.tick_params(color=FAINT, labelcolor=INK)
     axes.xaxis.label.set_color(INK)
     axes.yaxis.label.set_color(INK)
+
+
+def head(figure: Figure, text: str) -> None:
+    """Say over a whole figure what it shows."""
+    figure.suptitle(text, x=0.01, ha="left", color=INK, fontsize=11)
+
+
+def draw_confusions(axes: Any, counts: Sequence[Sequence[int]]) -> None:
+    """Draw how often what is true, by row, was taken for what, in per cent of each row."""
+    percent = 100 * np.array(counts) / np.maximum(np.sum(counts, axis=1, keepdims=True), 1)
+    axes.imshow(percent, cmap="Blues", vmin=0, vmax=100)
+    for (i, j), value in np.ndenumerate(percent):
+        axes.text(j, i, f"{value:.0f}", ha="center", va="center", color="white" if value > 60 else INK, fontsize=9)
+    axes.tick_params(length=0, labelcolor=INK)
+    axes.spines[:].set_visible(False)
 
 
 def explain(axes: Any, text: str) -> None:

@@ -63,15 +63,12 @@ class Chromium:
         self._out.close()
         os.close(self._in)
 
-    def open(self, page: Path, width: int = 800, height: int = 600) -> None:
-        """Open a file in a window of so many pixels, and wait until it is there and drawn."""
+    def open(self, url: str, width: int = 800, height: int = 600) -> None:
+        """Open an address in a window of so many pixels, and wait until the page is there and drawn."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.call("Page.navigate", url=page.as_uri())
-        end_s = time.monotonic() + 30
-        while self.ask("document.readyState") != "complete" or self.ask("location.href") != page.as_uri():
-            assert time.monotonic() < end_s, "the page never came"
-            time.sleep(0.02)
+        self.call("Page.navigate", url=url)
+        self.wait_for(f"document.readyState == 'complete' && location.href == {json.dumps(url)}")
         self.wait_for_frames()
 
     def ask(self, expression: str) -> Any:
@@ -79,6 +76,13 @@ class Chromium:
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
+
+    def wait_for(self, expression: str, wait_s: float = 30) -> None:
+        """Wait until a JavaScript expression in the page is true."""
+        end_s = time.monotonic() + wait_s
+        while self.ask(expression) is not True:
+            assert time.monotonic() < end_s, f"{expression} never came true"
+            time.sleep(0.02)
 
     def wait_for_frames(self) -> None:
         """Wait until what was asked of the page can be seen."""

@@ -305,7 +305,7 @@ def changed(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) -> None:
-    chromium.open(page)
+    chromium.open(page.as_uri())
     assert chromium.ask("document.getElementById('mould-view').hidden") is False
     first = chromium.picture("canvas")
     blue = (first[..., 2] - first[..., 0] > 60).sum()
@@ -327,7 +327,7 @@ def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) 
     chromium.wait_for_frames()
     assert changed(chromium.picture("canvas"), first) > 0.02
 
-    chromium.open(page, width=360, height=740)
+    chromium.open(page.as_uri(), width=360, height=740)
     assert chromium.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
     assert chromium.ask("document.querySelectorAll('details').forEach(each => each.open = true)") is None
     assert chromium.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
@@ -365,7 +365,7 @@ def test_without_webgl_the_picture_stands_there(tmp_path: Path, page: Path) -> N
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed")
     with Chromium(tmp_path / "profile", "--disable-gpu", "--disable-3d-apis") as chromium:
-        chromium.open(page)
+        chromium.open(page.as_uri())
         assert chromium.ask("document.getElementById('mould-view').hidden") is True
         assert chromium.ask("document.querySelector('canvas').getClientRects().length") == 0
         picture = "document.querySelector('img[alt*=\"from above\"]')"

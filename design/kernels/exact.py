@@ -24,7 +24,7 @@ _CLEAR = 1e6  # tolerances a value must be away from zero to be believed without
 
 
 @njit(cache=True, error_model="numpy")
-def _circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: int, work: Any, p: Any) -> int:
+def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: int, work: Any, p: Any) -> int:
     """Append to out[count:] where the span crosses the circle of `radius` in (a, b), as parameters s."""
     w = b - a
     t0, t1 = span[0] + span[1] * a, span[1] * w
@@ -73,7 +73,7 @@ def _keep(stretches: Any, count: int, begin: float, end: float) -> int:
 def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> int:
     """`stretches_inside` of a circle."""
     roots, work, p, _, stretches = scratch
-    count = _circle_roots(span, a, b, radius, roots, 0, work, p)
+    count = circle_roots(span, a, b, radius, roots, 0, work, p)
     found, begin = 0, a
     for i in range(count + 1):
         end = b if i == count else roots[i]
@@ -160,7 +160,7 @@ def _stretch_signal(span: Any, a: float, b: float, radius: float, weight: int, l
     roots, work, p, stack, _ = scratch
     if weight != INVERSE:
         return measure(span, a, b, radius, weight, length, stack)
-    count = _circle_roots(span, a, b, radius / 100, roots, 0, work, p)
+    count = circle_roots(span, a, b, radius / 100, roots, 0, work, p)
     total, begin = 0.0, a
     for i in range(count):
         total += measure(span, begin, roots[i], radius, weight, length, stack)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .exact import _circle_roots, local_cubic, make_scratch
-from .quadrature import _GAUSS, _KRONROD, _NODES, HALVINGS, across
+from .exact import circle_roots, local_cubic, make_scratch
+from .quadrature import GAUSS, HALVINGS, KRONROD, NODES, across
 
 SPHERE, CONE, FLAT = 0, 1, 2
 PRECISION = 1e-6
@@ -106,12 +106,12 @@ def _integral(
             fine, coarse = 0.0, 0.0
             for i in range(15):
                 k = i if i < 8 else 14 - i
-                u = middle + half * (_NODES[k] if i >= 8 else -_NODES[k])
+                u = middle + half * (NODES[k] if i >= 8 else -NODES[k])
                 value = _density(span, start + width * (u * u if bent else u), a, steepness, shape)
                 value *= 2 * u if bent else 1.0
-                fine += _KRONROD[k] * value
+                fine += KRONROD[k] * value
                 if k % 2 == 1:
-                    coarse += _GAUSS[k // 2] * value
+                    coarse += GAUSS[k // 2] * value
             error = (200 * abs(fine - coarse) / fine) ** 1.5 if fine > 0 else 0.0
             fine *= half * abs(width)
             taken = top >= HALVINGS or error <= PRECISION or min(error, 1.0) * fine <= floor
@@ -137,7 +137,7 @@ def _span_lengthening(
     far_t, far_v = max(abs(t0), abs(t1)), max(abs(v0), abs(v1))
     count = 0
     if near_t**2 + near_v**2 < a * a < far_t**2 + far_v**2:
-        count = _circle_roots(span, low, high, a, roots, 0, work, p)
+        count = circle_roots(span, low, high, a, roots, 0, work, p)
     total, begin = 0.0, low
     for i in range(count + 1):
         end = high if i == count else roots[i]

@@ -12,7 +12,7 @@ from numba import njit
 from .press import MANHATTAN, UNIFORM, weigh
 
 # G7-K15 nodes and weights on [-1, 1], positive half, the centre last; Gauss weights for every second node
-_NODES = np.array(
+NODES = np.array(
     [
         0.991455371120812639206854697526329,
         0.949107912342758524526189684047851,
@@ -24,7 +24,7 @@ _NODES = np.array(
         0.0,
     ]
 )
-_KRONROD = np.array(
+KRONROD = np.array(
     [
         0.022935322010529224963732008058970,
         0.063092092629978553290700663189204,
@@ -36,7 +36,7 @@ _KRONROD = np.array(
         0.209482141084727828012999174891714,
     ]
 )
-_GAUSS = np.array(
+GAUSS = np.array(
     [
         0.129484966168869693270611432679082,
         0.279705391489276667901467771423780,
@@ -70,13 +70,13 @@ def kronrod(span: Any, a: float, b: float, radius: float, weight: int, length: i
     """15-point Kronrod integral over [a, b] and its error estimate (difference to 7-point Gauss, sharpened)."""
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
     centre = _density(span, middle, radius, weight, length)
-    fine, coarse = _KRONROD[7] * centre, _GAUSS[3] * centre
+    fine, coarse = KRONROD[7] * centre, GAUSS[3] * centre
     for i in range(7):
-        x = half * _NODES[i]
+        x = half * NODES[i]
         pair = _density(span, middle - x, radius, weight, length) + _density(span, middle + x, radius, weight, length)
-        fine += _KRONROD[i] * pair
+        fine += KRONROD[i] * pair
         if i % 2 == 1:
-            coarse += _GAUSS[i // 2] * pair
+            coarse += GAUSS[i // 2] * pair
     gap = abs(fine - coarse) / fine if fine > 0 else 0.0
     return fine * half, min(1.0, (200 * gap) ** 1.5)
 

@@ -232,7 +232,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     """Depth found against depth pressed for every pad, and the error of the place by depth."""
     from matplotlib.figure import Figure
 
-    from ..figures import tidy
+    from ..figures import head, tidy
 
     curves, noises = document["curves"], document["settings"]["noise_counts"]
     labels = list(document["settings"]["pads"])
@@ -266,11 +266,8 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=columns)
     tidy(axes)
-    figure.suptitle(
+    head(
+        figure,
         f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits",
-        x=0.01,
-        ha="left",
-        color=INK,
-        fontsize=11,
     )
     return figure

@@ -13,7 +13,7 @@ from design.evaluation import fresh_presses
 from design.morphology import Morphology
 from design.palette import CURVES, INK
 
-from ..figures import tidy
+from ..figures import draw_confusions, head, tidy
 from .force import COUNTS, readings
 from .pads import described
 from .pairs import LABELLED, WAYS, Way, learnt, unordered_distances
@@ -229,13 +229,10 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         axes.legend(frameon=False, fontsize=8, loc="upper left")
         tidy(axes)
         _draw_confusions(figure.add_subplot(grid[2, at]), document["confusions"][at]["counts"], at == 0)
-    figure.suptitle(
+    head(
+        figure,
         f"Contacts at once on {document['settings']['test']} presses never trained on: places of two, number of up to "
         f"{document['settings']['most']}",
-        x=0.01,
-        ha="left",
-        color=INK,
-        fontsize=11,
     )
     return figure
 
@@ -254,15 +251,9 @@ def _draw_bars(axes: Any, rows: list[dict[str, Any]], labels: list[str], colours
 
 
 def _draw_confusions(axes: Any, counts: list[list[int]], first: bool) -> None:
-    total = np.sum(counts, axis=1, keepdims=True)
-    percent = 100 * np.array(counts) / np.maximum(total, 1)
-    axes.imshow(percent, cmap="Blues", vmin=0, vmax=100)
-    for (i, j), value in np.ndenumerate(percent):
-        axes.text(j, i, f"{value:.0f}", ha="center", va="center", color="white" if value > 60 else INK, fontsize=9)
-    axes.set_xticks(range(len(percent)))
-    axes.set_yticks(range(len(percent)))
-    axes.tick_params(length=0, labelcolor=INK)
-    axes.spines[:].set_visible(False)
+    draw_confusions(axes, counts)
+    axes.set_xticks(range(len(counts)))
+    axes.set_yticks(range(len(counts)))
     axes.set_title(f"number: {100 * np.trace(counts) / np.sum(counts):.0f} % right", loc="left", color=INK, fontsize=10)
     axes.set_xlabel("contacts found", color=INK)
     axes.set_ylabel("contacts pressed" if first else "", color=INK)

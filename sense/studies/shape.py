@@ -208,32 +208,24 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     """The confusion matrices: a column for every pad, a row for every set of shapes, in per cent of each true shape."""
     from matplotlib.figure import Figure
 
+    from ..figures import draw_confusions, head
+
     labels = list(document["settings"]["pads"])
     figure = Figure(figsize=(max(6.4, 1.2 + 2.7 * len(labels)), 6.2), layout="constrained")
     grid = figure.subplots(len(SETS), len(labels), squeeze=False)
     for each, row in zip(document["confusions"], document["rows"], strict=True):
         at, column = list(SETS).index(each["shapes"]), labels.index(each["pad"])
         axes, names = grid[at, column], each["names"]
-        counts = np.array(each["counts"])
-        percent = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-        axes.imshow(percent, cmap="Blues", vmin=0, vmax=100)
-        for (i, j), value in np.ndenumerate(percent):
-            colour = "white" if value > 60 else INK
-            axes.text(j, i, f"{value:.0f}", ha="center", va="center", color=colour, fontsize=10)
+        draw_confusions(axes, each["counts"])
         axes.set_xticks(range(len(names)), names, fontsize=8, color=INK)
         shown = names if column == 0 else [""] * len(names)
         axes.set_yticks(range(len(names)), shown, fontsize=8, color=INK, rotation=90, va="center")
-        axes.tick_params(length=0)
-        axes.spines[:].set_visible(False)
         axes.set_title(f"{each['pad']}: {row['accuracy_percent']:.0f} %", loc="left", color=INK, fontsize=10)
         if column == 0:
             axes.set_ylabel("pressed", color=INK)
         axes.set_xlabel("found" if at == len(SETS) - 1 else "", color=INK)
-    figure.suptitle(
+    head(
+        figure,
         f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on",
-        x=0.01,
-        ha="left",
-        color=INK,
-        fontsize=11,
     )
     return figure

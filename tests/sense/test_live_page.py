@@ -1,22 +1,19 @@
 """The page of `padforge sense live`: what its server says to whom, and what a browser makes of it."""
 
 import json
-import os
-import shutil
 import socket
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
-from typing import Any, Self
 
 import pytest
 
 from design.errors import InputError
 from sense.live_server import HOST, LivePage
+
+from ..chromium import CHROMIUM, Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
 VIEW = {
@@ -139,82 +136,15 @@ def test_a_port_that_is_taken_is_one_clear_line(page: LivePage) -> None:
         LivePage(port)
 
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
-class Browser:
-    """A headless Chromium, asked over pipes in the words of the DevTools protocol."""
-
-    def __init__(self, folder: Path) -> None:
-        quiet = ("background-networking", "component-update", "sync", "quic", "gpu")
-        flags = [*(f"--disable-{name}" for name in quiet), "--no-first-run", "--no-sandbox", "--headless"]
-        command = [str(CHROMIUM), *flags, f"--user-data-dir={folder}", "--remote-debugging-pipe", "about:blank"]
-        ours, theirs = os.pipe(), os.pipe()
-        # It listens at 3 and answers at 4.
-        script = "import os, sys; r, w, *c = sys.argv[1:]; os.dup2(int(r), 3); os.dup2(int(w), 4); os.execv(c[0], c)"
-        ends = (ours[0], theirs[1])
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", script, *map(str, ends), *command], pass_fds=ends, stderr=subprocess.DEVNULL
-        )
-        os.close(ours[0])
-        os.close(theirs[1])
-        self._out, self._in = os.fdopen(ours[1], "wb", buffering=0), os.fdopen(theirs[0], "rb")
-        self._number = 0
-        self._session: str | None = None
-        pages = self._call("Target.getTargets")["targetInfos"]
-        target = next(each["targetId"] for each in pages if each["type"] == "page")
-        self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._process.terminate()
-        self._process.wait()
-        self._out.close()
-        self._in.close()
-
-    def open(self, url: str) -> None:
-        self._call("Page.navigate", url=url)
-
-    def ask(self, expression: str) -> Any:
-        """The value of a JavaScript expression in the page."""
-        return self._call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
-
-    def wait_for(self, expression: str, wait_s: float = 30) -> None:
-        end_s = time.monotonic() + wait_s
-        while self.ask(expression) is not True:
-            assert time.monotonic() < end_s, f"{expression} never came true"
-            time.sleep(0.05)
-
-    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        self._number += 1
-        message = {"id": self._number, "method": method, "params": parameters}
-        if self._session is not None:
-            message["sessionId"] = self._session
-        self._out.write(json.dumps(message).encode() + b"\0")
-        while True:
-            answer = json.loads(self._message())
-            if answer.get("id") == self._number:
-                return answer["result"]
-
-    def _message(self) -> bytes:
-        message = bytearray()
-        while (byte := self._in.read(1)) != b"\0":
-            assert byte, "the browser has ended"
-            message += byte
-        return bytes(message)
-
-
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
+def browser(tmp_path: Path) -> Iterator[Chromium]:
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed")
-    with Browser(tmp_path) as browser:
+    with Chromium(tmp_path, "--disable-gpu") as browser:
         yield browser
 
 
-def test_a_browser_shows_the_pad(page: LivePage, browser: Browser) -> None:
+def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     page.show(VIEW)
     browser.open(page.url)
     browser.wait_for("document.querySelectorAll('.fibre').length == 3")
@@ -244,7 +174,7 @@ def test_a_browser_shows_the_pad(page: LivePage, browser: Browser) -> None:
     ]
 
 
-def test_a_browser_comes_back_to_a_page_that_was_away(browser: Browser) -> None:
+def test_a_browser_comes_back_to_a_page_that_was_away(browser: Chromium) -> None:
     with LivePage(0) as page:
         port = port_of(page)
         page.show(VIEW | {"title": "before"})
