@@ -6,6 +6,7 @@ import pytest
 from hypothesis import settings
 
 settings.register_profile("padforge", deadline=None, derandomize=True)
+settings.register_profile("stress", deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile("padforge")
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
