@@ -1,9 +1,12 @@
 """padforge: the front door. One command; `run` chains design, fabricate and sense, `report` shows what they made."""
 
+import os
 import shutil
+import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,34 +82,58 @@ def report(folder: Path) -> None:
 
 
 BENCHES = {
-    "contact": "design.bench:bench_contact",
-    "objective": "design.bench:bench_objective",
-    "search": "design.bench_search:bench_search",
-    "networks": "design.bench_networks:bench_networks",
-    "filter": "sense.bench_filter:bench_filter",
-    "localizer": "sense.bench_localizer:bench_localizer",
-    "mould": "fabricate.bench:bench_mould",
+    "contact": "design.bench.contact:BENCH",
+    "objective": "design.bench.objective:BENCH",
+    "search": "design.bench.search:BENCH",
+    "networks": "design.bench.networks:BENCH",
+    "filter": "sense.bench.filter:BENCH",
+    "localizer": "sense.bench.localizer:BENCH",
+    "mould": "fabricate.bench:BENCH",
 }
 """Where each bench is, imported when it is asked for."""
 
 
 @cli.command()
-@click.argument("name", type=click.Choice(list(BENCHES)))
+@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice(list(BENCHES)))
+@click.option(
+    "--against",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="bench.json or NAME.json of an earlier run: say what has become worse since, exit 1 if anything has.",
+)
 @out_option("out/bench")
 @json_option
-def bench(name: str, out: Path, as_json: bool) -> None:
+@click.pass_context
+def bench(context: click.Context, names: tuple[str, ...], against: Path | None, out: Path, as_json: bool) -> None:
     """Measure run time against error, beside plain ways of doing the same.
 
-    Writes NAME.json, NAME.csv and NAME.png.
+    \b
+    padforge bench                                   all of them, some minutes
+    padforge bench contact filter                    of contact, objective, search, networks, filter, localizer, mould
+    padforge bench --against before/bench.json       what has become slower or less accurate, by ratio
+
+    Writes NAME.json, NAME.csv and NAME.png for each, and bench.json and bench.csv with the summary.
     """
+    from dataclasses import asdict
     from pkgutil import resolve_name
 
-    from design.bench_table import lines
+    from design.bench.comparison import compared, lines, read_earlier
+    from design.bench.suite import run_benches
+    from design.bench.table import bench_lines, summary_lines
 
+    before = read_earlier(against) if against else {}
+    chosen = names or [name for name in BENCHES if not before or name in before]
+    if not chosen:
+        raise InputError(f"{against}: holds none of the benches {', '.join(BENCHES)}")
     with progress() as bar:
-        task = bar.add_task(name, total=None, note="")
-        document = resolve_name(BENCHES[name])(out, lambda step: bar.update(task, note=step))
-    show_result(document, lines(document), as_json)
+        task = bar.add_task("bench", total=None, note="")
+        benches = [resolve_name(BENCHES[name]) for name in dict.fromkeys(chosen)]
+        summary, changes = run_benches(benches, out, lambda step: bar.update(task, note=step), before)
+    tables = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
+    verdict = ["", *lines(changes, compared(before, summary["benches"]))] if against else []
+    document = summary | {"worse": [asdict(change) for change in changes]}
+    show_result(document, [*tables, *summary_lines(summary["summary"]), *verdict], as_json)
+    context.exit(int(bool(changes)))
 
 
 def _sections() -> "dict[str, type[Section]]":
@@ -231,7 +258,9 @@ def _as_written(path: Path) -> Iterator[None]:
 
 def main() -> None:
     """Run the command line; a user's own mistake is one line on stderr and exit 2."""
+    _prepare()
     try:
+        _require_words(sys.argv[1:])
         code = cli.main(standalone_mode=False, prog_name="padforge")
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
@@ -246,11 +275,36 @@ def main() -> None:
         code = _fail(str(fault), fault.exit_code)
     except OSError as error:
         code = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
+    except MemoryError as error:
+        code = _fail(f"this takes more memory than there is ({error or 'no more is given'})", 2)
     sys.exit(code)
 
 
+def _prepare() -> None:
+    """Let names that are no text be printed, and an end from outside clear up as Ctrl-C does."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    for ending in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
+        number = getattr(signal, ending)
+        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
+            signal.signal(number, signal.default_int_handler)
+
+
+def _require_words(words: list[str]) -> None:
+    """Refuse what no shell can hand over, but a caller from Python can: such names would trip whatever opens them."""
+    for word in words:
+        try:
+            odd = b"\0" in os.fsencode(word)
+        except UnicodeEncodeError:
+            odd = True
+        if odd:
+            raise InputError(f"{word!r}: holds characters that no argument can have")
+
+
 def _fail(message: str, code: int) -> int:
-    print(f"padforge: {' '.join(message.split())}", file=sys.stderr)
+    with suppress(OSError):  # of a disk that is full: the exit code says the same
+        print(f"padforge: {' '.join(message.split())}", file=sys.stderr)
     return code
 
 

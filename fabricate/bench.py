@@ -1,8 +1,8 @@
 """How near the mould's surface comes to the exact tracks, against the time and the size of the file it takes."""
 
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from design.bench_table import Row, write_bench
+from design.bench.harness import Bench, Trial
 from design.curves import flatten
 from design.morphology import Morphology
 
@@ -20,7 +20,7 @@ from .outlines import Plan
 from .settings import DEFAULTS, Mould
 
 KNOTS = (1, 5, 20)
-TOLERANCES_MM = (0.05, 0.02, 0.01, 0.002)
+TOLERANCES_MM = (0.05, 0.01, 0.002)
 FUSED_UP_TO = 5
 """Beyond so many knots a fibre, Boolean operations of the CAD kernel take minutes."""
 
@@ -28,98 +28,68 @@ SEED = 0
 _EXACT_MM = 1e-5
 """What exact curves are flattened to for comparison."""
 
-_QUICK_S = 1.0
-
 _CLEAR_MM = 1.0
 """Near the walls outlines belong to exits."""
 
 
-@dataclass(frozen=True)
-class MouldRow(Row):
-    """One mould; `error` is the greatest deviation, mm, and `size` the tolerance, micrometres.
+def trials() -> Iterator[Trial]:
+    """Every way at every tolerance for random pads of N in KNOTS, from the fibres to the solid.
 
-    Attributes:
-        faces: triangles of the mesh, or faces of the CAD solid.
-        file_bytes: size of its STL, or of its STEP.
+    The error is the greatest deviation, mm, and the size the tolerance, micrometres; "faces" are triangles of the mesh
+    or faces of the CAD solid, "file_bytes" the size of its STL or of its STEP.
     """
-
-    faces: int
-    file_bytes: int
-
-
-def bench_mould(out: Path, report: Callable[[str], None]) -> dict[str, Any]:
-    """Every way at every tolerance for random pads of N in KNOTS; files in `out`.
-
-    Times are from the fibres to the solid; imports and caches are warm wherever they could be told from it.
-    """
-    rows = []
     for knots in KNOTS:
         pad = Morphology.random(4, knots, SEED)
         for tolerance in TOLERANCES_MM:
-            mould = Mould(tolerance_mm=tolerance, number_mm=0)
-            settings = replace(DEFAULTS, mould=mould)
-            for way, measure in _ways(knots).items():
-                report(f"mould, N = {knots}, {way} at {1000 * tolerance:g} um")
-                rows.append(measure(f"N={knots}", 1000 * tolerance, lambda s=settings, p=pad: Plan(p, s)))
-    return write_bench("mould", rows, out, "deviation from the exact tracks (mm)", reference=("manifold3d", 10))
+            settings = replace(DEFAULTS, mould=Mould(tolerance_mm=tolerance, number_mm=0))
+            plan = partial(Plan, pad, settings)
+            for way, (work, judge) in (DIRECT if knots > FUSED_UP_TO else DIRECT | FUSED).items():
+                yield Trial(f"N={knots}", way, 1000 * tolerance, partial(work, plan), partial(judge, plan))
 
 
-Measure = Callable[[str, float, Callable[[], Plan]], MouldRow]
-
-
-def _ways(knots: int) -> dict[str, Measure]:
-    ways: dict[str, Measure] = {"manifold3d": _meshed, "direct CAD": _direct}
-    return ways | {"fused CAD": _fused} if knots <= FUSED_UP_TO else ways
-
-
-def _meshed(case: str, size: float, new_plan: Callable[[], Plan]) -> MouldRow:
+def _meshed(new_plan: Callable[[], Plan]) -> Any:
     from .mould import plan_mesh
 
-    solid, seconds = _timed(lambda: plan_mesh(new_plan()))
+    return plan_mesh(new_plan())
+
+
+def _mesh_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     plan = new_plan()
     outline = solid.slice(plan.settings.mould.floor_mm + plan.heights_mm[0] / 2).to_polygons()
     points = np.vstack([_with_middles(np.asarray(ring)) for ring in outline])
     faces = solid.num_tri()
-    return MouldRow(case, "manifold3d", size, _deviation(plan, points), seconds, None, faces, 84 + 50 * faces)
+    return {"error": _deviation(plan, points), "faces": faces, "file_bytes": 84 + 50 * faces}
 
 
-def _direct(case: str, size: float, new_plan: Callable[[], Plan]) -> MouldRow:
+def _direct(new_plan: Callable[[], Plan]) -> Any:
     from .facets import faceted_solid
-    from .mould import plan_mesh
 
-    solid, seconds = _timed(lambda: faceted_solid(plan_mesh(new_plan())))
-    return _cad_row(case, "direct CAD", size, new_plan(), solid, seconds)
+    return faceted_solid(_meshed(new_plan))
 
 
-def _fused(case: str, size: float, new_plan: Callable[[], Plan]) -> MouldRow:
+def _fused(new_plan: Callable[[], Plan]) -> Any:
     from .fused import fused_solid
 
-    solid, seconds = _timed(lambda: fused_solid(mould_body(new_plan())))
-    return _cad_row(case, "fused CAD", size, new_plan(), solid, seconds)
+    return fused_solid(mould_body(new_plan()))
 
 
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What `work` returns and how long it took; a quick one is done again, so that caches are warm."""
-    start = time.perf_counter()
-    result = work()
-    seconds = time.perf_counter() - start
-    if seconds < _QUICK_S:
-        start = time.perf_counter()
-        work()
-        seconds = time.perf_counter() - start
-    return result, seconds
-
-
-def _cad_row(case: str, way: str, size: float, plan: Plan, solid: Any, seconds: float) -> MouldRow:
+def _cad_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     from .writers import write_step
 
-    floor = plan.settings.mould.floor_mm
-    points = np.vstack([_with_middles(ends, closed=False) for ends in _level_edges(solid, floor)])
+    plan = new_plan()
+    points = np.vstack(
+        [_with_middles(ends, closed=False) for ends in _level_edges(solid, plan.settings.mould.floor_mm)]
+    )
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mould.step"
         write_step(path, solid)
         written = path.stat().st_size
-    return MouldRow(case, way, size, _deviation(plan, points), seconds, None, len(solid.faces()), written)
+    return {"error": _deviation(plan, points), "faces": len(solid.faces()), "file_bytes": written}
+
+
+Way = tuple[Callable[..., Any], Callable[..., Mapping[str, float]]]
+DIRECT: dict[str, Way] = {"manifold3d": (_meshed, _mesh_row), "direct CAD": (_direct, _cad_row)}
+FUSED: dict[str, Way] = {"fused CAD": (_fused, _cad_row)}
 
 
 def _level_edges(solid: Any, z: float) -> Iterator[NDArray[np.float64]]:
@@ -151,3 +121,13 @@ def _deviation(plan: Plan, points: NDArray[np.float64]) -> float:
 def _segments(line: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n - 1, 2, 2) ends of the segments of a polyline (n, 2)."""
     return np.stack([line[:-1], line[1:]], axis=1)
+
+
+BENCH = Bench(
+    "mould",
+    trials,
+    "deviation from the exact tracks (mm)",
+    ("fused CAD", 10),
+    ("manifold3d", 10),
+    plain=("fused CAD",),
+)

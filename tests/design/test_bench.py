@@ -1,100 +1,92 @@
-"""The benches: the ways they compare agree, and their files hold what they say. No times are asserted."""
-
-import csv
-import json
+"""The benches of design: the ways they compare agree, and what they find is what it is said to be."""
 
 import numpy as np
 import pytest
 
-from design import Contact, Morphology, bench, bench_search, published_objective, signals_quantized
-from design.bench_table import Row, lines, write_bench
+from design import Contact, Morphology, published_objective, signals_quantized
+from design.bench import contact, harness, networks, objective, search
 from design.evaluation import LossError
+from design.morphology import Morphology as Pad
 from design.search import SearchResult
-from design.settings import Rules, Search
 
 
-@pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setattr(bench, "SAMPLES", (250, 2000))
-    monkeypatch.setattr(bench, "KNOTS", (2,))
-    monkeypatch.setattr(bench, "GRIDS", (4,))
+@pytest.fixture(autouse=True)
+def _small(monkeypatch):
+    monkeypatch.setattr(harness, "BUDGET_S", 0)
+    for module, sizes in {
+        contact: {"SAMPLES": (250, 2000), "KNOTS": (2,), "GRIDS": (4,)},
+        objective: {"SAMPLES": (250, 2000), "KNOTS": (2,)},
+        search: {"KNOTS": (3,), "SEEDS": (0, 1), "GENERATIONS": (1,), "STEPS": (1, 2)},
+        networks: {"SETS": 2, "HIDDEN": 4, "EPOCHS": 3},
+    }.items():
+        for name, value in sizes.items():
+            monkeypatch.setattr(module, name, value)
+
+
+def taken(bench):
+    measured = harness.Measured()
+    harness.measure(bench, measured, lambda step: None, lambda key: False)
+    return measured.found
 
 
 def test_the_ways_compared_are_the_same_rule():
     pad = Morphology.random(3, 4, seed=1)
     presses = np.random.default_rng(0).uniform(0.5, 3.5, (10, 2))
     expected = signals_quantized(pad, presses, samples=700)
-    np.testing.assert_allclose(bench.plain_signals(pad, presses, Contact(), 700), expected, atol=1e-12)
-    np.testing.assert_allclose(bench.scanned_signals(pad.knots, presses, 0.6, 30, 700), expected, atol=1e-12)
-    assert bench.plain_objective(pad) == pytest.approx(published_objective(pad), abs=1e-12)
+    np.testing.assert_allclose(contact.plain_signals(pad, presses, Contact(), 700), expected, atol=1e-12)
+    np.testing.assert_allclose(contact.scanned_signals(pad.knots, presses, 0.6, 30, 700), expected, atol=1e-12)
+    assert objective.plain_objective(pad) == pytest.approx(published_objective(pad), abs=1e-12)
 
 
-@pytest.mark.parametrize("name", ["contact", "objective"])
-def test_a_bench_writes_its_table_and_figure(small, tmp_path, name):
-    heard = []
-    document = getattr(bench, f"bench_{name}")(tmp_path, heard.append)
-    assert heard
-    assert json.loads((tmp_path / f"{name}.json").read_text()) == document
-    with (tmp_path / f"{name}.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(document["rows"])
-    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    assert len(lines(document)) == len(document["rows"]) + 3
-    errors = {(row["way"], row["size"]): row["error"] for row in document["rows"] if row["error"] is not None}
-    assert errors.get(("exact", 0), 0) < 1e-9
-    assert errors["plain", 2000] < errors["plain", 250]
+def test_contact_errors_fall_with_the_samples_and_the_exact_signals_have_none():
+    found = taken(contact.BENCH)
+    for way in ("plain", "scanned", "culled"):
+        assert found["N=2", way, 2000, 0]["error"] < found["N=2", way, 250, 0]["error"]
+        assert found["N=2", way, 250, 0]["error"] == pytest.approx(found["N=2", "plain", 250, 0]["error"], rel=1e-9)
+    exact = found["N=2", "exact", 0, 0]
+    assert exact["error"] < 1e-9
+    assert 0 < exact["visited"] < 1
+    assert 0 < found["grid 4, a press", "exact", 0, 0]["visited"] < 1
 
 
-def test_speed_is_relative_to_the_reference_of_the_same_case(tmp_path):
-    rows = [Row("a", "slow", 1, 0.1, 2.0, 1.0), Row("a", "fast", 1, 0.1, 0.5, 0.1), Row("b", "fast", 1, None, 1.0, 0.1)]
-    document = write_bench("x", rows, tmp_path, "error", ("slow", 1))
-    assert [row["speed"] for row in document["rows"]] == [1.0, 4.0, None]
+def test_objectives_come_nearer_to_the_exact_one():
+    found = taken(objective.BENCH)
+    for way in ("plain", "compiled"):
+        assert 0 < found["N=2", way, 2000, 0]["error"] < found["N=2", way, 250, 0]["error"] < 0.1
 
 
-def test_a_table_shows_the_median_of_repetitions_and_the_file_all(tmp_path):
-    rows = [Row("a", "slow", 1, error, time, None) for error, time in ((0.1, 2.0), (0.3, 9.0), (0.2, 4.0))]
-    document = write_bench("x", rows, tmp_path, "error", ("slow", 1))
-    assert [row["speed"] for row in document["rows"]] == [2.0, pytest.approx(4 / 9), 1.0]
-    assert lines(document)[3:] == [f"{'a':<20} {'slow':<13} {1:>7} {'0.200':>9} {'4.00 s':>10} {'1.00x':>8} {'-':>8}"]
-
-
-def test_the_search_bench_holds_every_way_budget_and_seed(monkeypatch, tmp_path):
+def test_the_search_bench_has_every_way_budget_and_seed(monkeypatch):
     asked = []
 
-    def search(pad, contact, settings, rules):
-        asked.append((settings.method, settings.knots, settings.seed, rules.enforce))
-        return SearchResult(Morphology.straight(pad.grid), {}, [], seconds=settings.generations + settings.steps)
+    def searched(pad, contact, settings, rules, executor):
+        asked.append((settings.method, settings.generations + settings.steps, settings.seed, rules.enforce))
+        return SearchResult(Pad.straight(pad.grid), {}, [])
 
     levels = [LossError(k, 1, mean, 0, mean) for k, mean in enumerate([0.1, 0.2, 0.3, 0.8])]
-    small = {"KNOTS": (3,), "SEEDS": (0, 1), "GENERATIONS": (1,), "STEPS": (1, 2)}
-    for name, value in {**small, "search": search, "evaluate": lambda *_, **__: levels}.items():
-        monkeypatch.setattr(bench_search, name, value)
-    document = bench_search.bench_search(tmp_path, lambda step: None)
+    monkeypatch.setattr(search, "search", searched)
+    monkeypatch.setattr(search, "evaluate", lambda *_, **__: levels)
+    found = taken(search.BENCH)
 
-    assert json.loads((tmp_path / "search.json").read_text()) == document
     ways = [("genetic", 1), ("descent", 1), ("with rules", 1), ("descent", 2), ("with rules", 2)]
-    rows = [(row["way"], row["size"], row["seed"]) for row in document["rows"]]
-    assert rows == [(*way, seed) for way in ways for seed in (0, 1)]
-    measured = asked[3:]  # each way once before the clock
-    assert measured == [
-        (way.replace("with rules", "descent"), 3, seed, way == "with rules") for way, _ in ways for seed in (0, 1)
-    ]
-    for row in document["rows"]:
-        assert row["case"] == "N=3"
+    assert list(found) == [("N=3", *way, seed) for way in ways for seed in (0, 1)]
+    enforced = [(method, seed, rules) for method, _, seed, rules in asked[::2]]  # each is called twice
+    names = [way.replace("with rules", "descent") for way, _ in ways]
+    expected = [(n, seed, w == "with rules") for n, (w, _) in zip(names, ways, strict=True) for seed in (0, 1)]
+    assert enforced == expected
+    for row in found.values():
         assert row["error"] == pytest.approx(0.35)
         assert [row[f"lost_{k}"] for k in range(4)] == [0.1, 0.2, 0.3, 0.8]
-    with (tmp_path / "search.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(document["rows"])
-    assert (tmp_path / "search.png").read_bytes().startswith(b"\x89PNG")
-    assert len(lines(document)) == len(ways) + 3
+        assert row["violations"] == 0
 
 
-def test_a_search_is_measured_on_the_pad_it_found(monkeypatch):
-    monkeypatch.setattr(bench_search, "SUBSETS", 1)
-    settings = Search(method="genetic", knots=1, population=4, generations=1, seed=5)
-    row = bench_search._row("N=1", "genetic", 1, settings, Rules(enforce=False))
-    assert (row.seed, row.size) == (5, 1)
-    assert row.seconds > 0
-    assert row.violations > 0  # random fibres of one family cross
-    levels = [row.lost_0, row.lost_1, row.lost_2, row.lost_3]
-    assert row.error == pytest.approx(np.mean(levels))
-    assert 0.05 < levels[0] < levels[3] < 1.5
+def test_a_search_is_the_same_in_this_thread(monkeypatch):
+    monkeypatch.setattr(search, "GENERATIONS", (2,))
+    trial = next(iter(search.trials()))
+    again = search.search(search.Pad(), search.Contact(), *trial.work.args[2:])
+    np.testing.assert_array_equal(trial.work().morphology.knots, again.morphology.knots)
+
+
+def test_both_ways_train_networks_for_the_same_losses():
+    found = taken(networks.BENCH)
+    assert list(found) == [(case, way, 0, 0) for case in ("square", "random N=5") for way in ("batched", "plain numpy")]
+    assert all(0.01 < row["error"] < 2 for row in found.values())

@@ -1,63 +1,52 @@
 """The networks of a robustness study: trained as batches, beside one after another by plain Levenberg-Marquardt."""
 
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .bench_table import Row, write_bench
-from .evaluation import Loss, Trial, evaluate
-from .levenberg_marquardt import LEARN, VALIDATE, Network, Scale, first_weights
-from .losses import lost_subsets
-from .morphology import Morphology
+from ..contact import signals
+from ..evaluation import Loss, Trial
+from ..levenberg_marquardt import LEARN, VALIDATE, Network, Scale, first_weights
+from ..losses import lost_subsets
+from ..morphology import Morphology
+from ..threads import one_torch_thread
+from . import harness
 
 Array = NDArray[np.float64]
 
 HIDDEN = 50
 EPOCHS = 1000
 FAILURES = 6
-LEVELS = (0, 1, 2, 3)
-PLAIN, BATCHED = "plain numpy", "batched"
+LOST, SETS = 2, 14
+"""Fibres lost at once, and how many sets of them: as many networks as are trained as one batch."""
 
 
-def bench_networks(out: Path, report: Callable[[str], None]) -> dict[str, Any]:
-    """All 93 networks of a 4 x 4 pad that may lose up to three fibres, both ways; files in `out`.
+def trials() -> Iterator[harness.Trial]:
+    """Networks for SETS of lost fibres of two 4 x 4 pads, the square grid and a random one, both ways.
 
-    The pads are the square grid and a random one. The plain way makes the whole Jacobian and solves for all weights, as
-    textbooks have it, on as many threads as NumPy takes; both ways learn from the same samples, and are tested on the
-    same fresh presses.
+    The plain way makes the whole Jacobian and solves for all weights, as textbooks have it, on as many threads as NumPy
+    takes; both ways learn from the same samples, and are tested on the same fresh presses.
     """
-    rows = []
-    report("networks, before the clock")
-    evaluate(Morphology.straight(4), lost=(0,), presses=64, test=10, hidden=5)
-    for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
-        report(f"networks, {case}, {BATCHED}")
-        begin = time.perf_counter()
-        levels = evaluate(pad, lost=LEVELS, hidden=HIDDEN)
-        seconds = time.perf_counter() - begin
-        networks = sum(level.subsets for level in levels)
-        error = sum(level.mean * level.subsets for level in levels) / networks
-        rows.append(Row(case, BATCHED, networks, error, seconds, None))
-        rows.append(_plain(case, pad, report))
-    return write_bench("networks", rows, out, "mean error (grid units)", reference=(PLAIN, rows[0].size))
+    with one_torch_thread():
+        for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
+            trial = Trial.of(pad, 32, 2000, 0, partial(signals, pad))
+            losses = lost_subsets(2 * pad.grid, LOST, SETS)
+            judge = partial(_judge, trial, losses)
+            yield harness.Trial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)
+            yield harness.Trial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)
 
 
-def _plain(case: str, pad: Morphology, report: Callable[[str], None]) -> Row:
-    from .contact import signals
+def _judge(trial: Trial, losses: Sequence[Loss], networks: Sequence[Network]) -> Mapping[str, float]:
+    errors = [trial.errors(network, loss).mean() for network, loss in zip(networks, losses, strict=True)]
+    return {"error": float(np.mean(errors))}
 
-    losses: list[Loss] = [loss for level in LEVELS for loss in lost_subsets(2 * pad.grid, level)]
-    begin = time.perf_counter()
-    trial = Trial.of(pad, 32, 2000, 0, lambda places: signals(pad, places))
-    errors = []
-    for number, loss in enumerate(losses):
-        report(f"networks, {case}, {PLAIN} {number + 1} of {len(losses)}")
-        kept = np.setdiff1d(np.arange(2 * pad.grid), loss)
-        network = fit_plain(trial.recorded[:, kept], trial.learned, np.random.default_rng([2, 0, len(loss), *loss]))
-        errors.append(trial.errors(network, loss).mean())
-    return Row(case, PLAIN, len(losses), float(np.mean(errors)), time.perf_counter() - begin, None)
+
+def _learn_plain(trial: Trial, losses: Sequence[Loss]) -> list[Network]:
+    kept = [np.setdiff1d(np.arange(trial.recorded.shape[1]), loss) for loss in losses]
+    rngs = [np.random.default_rng([2, 0, len(loss), *loss]) for loss in losses]
+    return [fit_plain(trial.recorded[:, left], trial.learned, rng) for left, rng in zip(kept, rngs, strict=True)]
 
 
 def fit_plain(inputs: Array, targets: Array, rng: np.random.Generator) -> Network:
@@ -110,3 +99,8 @@ def _jacobian(x: Array, neurons: Array, output: Array) -> Array:
     inner = [((bent * own[:-1])[:, :, None] * x[:, None, :]).reshape(samples, -1) for own in output]
     outer = [np.kron(np.eye(outputs)[k], neurons) for k in range(outputs)]
     return np.stack([np.hstack(pair) for pair in zip(inner, outer, strict=True)], axis=1).reshape(samples * outputs, -1)
+
+
+BENCH = harness.Bench(
+    "networks", trials, "mean error (grid units)", ("plain numpy", 0), ("batched", 0), plain=("plain numpy",)
+)

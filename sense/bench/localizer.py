@@ -1,29 +1,27 @@
-"""Test error of localizers against the time they train, on a simulated recording, for three kinds of inputs.
+"""Test error of localizers against the time they train, on a simulated recording, for two kinds of inputs.
 
 The published network is trained three ways, by budgets: Levenberg-Marquardt, as published; L-BFGS; and Adam. The masked
 network, which bears lost fibres as well, is trained as in a calibration. All learn from the same presses.
 """
 
-import time
-from collections.abc import Callable, Iterator
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from design import Morphology
-from design.bench import seconds
-from design.bench_table import Row, write_bench
+from design.bench.harness import Bench, Trial
+from design.threads import one_torch_thread
 
-from . import settings
-from .classic import HIDDEN
-from .network import Floats, Weights, forward, masked, pooled
-from .presses import press_inputs
-from .recording import Recording
-from .rig.simulated import simulate
-from .scaling import Scaling
+from .. import settings
+from ..classic import HIDDEN
+from ..network import Floats, Weights, forward, masked, pooled
+from ..presses import press_inputs
+from ..recording import Recording
+from ..rig.simulated import simulate
+from ..scaling import Scaling
 
 PRESSES, TEST = 1500, 300
 EPOCHS = (3, 10, 30, 100)
@@ -32,9 +30,9 @@ ITERATIONS = (30, 100, 300)
 """Of L-BFGS, which does likewise."""
 PASSES = (30, 100, 300)
 """Of Adam, through batches of BATCH presses."""
-STEPS = (100, 400, 1600)
+STEPS = (50, 200, 800)
 """Of the masked network, one member of its usual size."""
-FEATURES = ("published", "causal", "full")
+FEATURES = ("published", "full")
 MARQUARDT = ("published",)
 """Inputs that Levenberg-Marquardt is tried on: with F times as many, each of its steps takes F^2 to F^3 as long."""
 BATCH, ADAM_RATE = 128, 3e-3
@@ -43,40 +41,40 @@ Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
 
 
-def bench_localizer(out: Path, report: Callable[[str], None]) -> dict[str, Any]:
-    """Train on PRESSES simulated presses less TEST, in every way, and write the table and figure to `out`."""
-    from design.threads import one_torch_thread
-
-    recording = simulate(Morphology.random(3, knots=5, seed=0), settings.Rig(presses=PRESSES, seed=0))
-    rows = []
+def trials() -> Iterator[Trial]:
+    """Trainings on PRESSES simulated presses less TEST, in every way, and the time to find one press."""
     with one_torch_thread():
         for features in FEATURES:
-            rows += _rows(recording, features, lambda step: report(f"localizer, {step}"))
-    rows += _prediction(recording)
-    return write_bench("localizer", rows, out, "mean error (mm)", ("LM", EPOCHS[-1]))
+            yield from _trainings(features)
+        yield from _predictions()
 
 
-def _rows(recording: Recording, features: str, report: Callable[[str], None]) -> Iterator[Row]:
+@cache
+def _recording() -> Recording:
+    return simulate(Morphology.random(3, knots=5, seed=0), settings.Rig(presses=PRESSES, seed=0))
+
+
+def _trainings(features: str) -> Iterator[Trial]:
+    recording = _recording()
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
     scaling, table = Scaling.fit(raw[:-TEST], recording.presses_mm[:-TEST])
     scaled, targets = scaling.inputs(raw), scaling.targets(recording.presses_mm)
     flat = scaled.inputs.reshape(len(scaled), -1).astype(np.float64)
     x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
-    ways: list[tuple[str, int, Callable[[], Predict]]] = [
-        *(("LM", size, partial(_marquardt, x, y, size)) for size in EPOCHS if features in MARQUARDT),
-        *(("L-BFGS", size, partial(_bfgs, x, y, size)) for size in ITERATIONS),
-        *(("Adam", size, partial(_adam, x, y, size)) for size in PASSES),
-        *(("masked", size, partial(_masked, scaled.inputs[:-TEST], targets[:-TEST], table, size)) for size in STEPS),
-    ]
-    for _, _, work in {way: (way, size, work) for way, size, work in reversed(ways)}.values():
-        work()  # the smallest of every way, once before the clock: it also pays for imports
-    for way, size, work in ways:
-        report(f"{features}, {way} {size}")
-        begin = time.perf_counter()
-        predict = work()
-        spent = time.perf_counter() - begin
+
+    def judge(predict: Predict) -> Mapping[str, float]:
         off = scaling.places_mm(predict(flat[-TEST:]).astype(np.float32)) - recording.presses_mm[-TEST:]
-        yield Row(features, way, size, float(np.hypot(*off.T).mean()), spent, None)
+        return {"error": float(np.hypot(*off.T).mean())}
+
+    ways: dict[str, tuple[tuple[int, ...], Callable[[int], Predict]]] = {
+        "LM": (EPOCHS if features in MARQUARDT else (), partial(_marquardt, x, y)),
+        "L-BFGS": (ITERATIONS, partial(_bfgs, x, y)),
+        "Adam": (PASSES, partial(_adam, x, y)),
+        "masked": (STEPS, partial(_masked, scaled.inputs[:-TEST], targets[:-TEST], table)),
+    }
+    for way, (sizes, train) in ways.items():
+        for size in sizes:
+            yield Trial(features, way, size, partial(train, size), judge)
 
 
 def _held(presses: int) -> NDArray[np.bool_]:
@@ -141,7 +139,7 @@ def _adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    from .training import Samples, train
+    from ..training import Samples, train
 
     alive = np.ones(inputs.shape[:2], dtype=bool)
     held = _held(len(inputs))
@@ -153,18 +151,19 @@ def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predi
     return lambda x: _places(weights, x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)).astype(np.float64)
 
 
-def _prediction(recording: Recording) -> Iterator[Row]:
-    """Time to find one press with networks of the usual size; what they were taught does not matter for it."""
+def _predictions() -> Iterator[Trial]:
+    """Finding one press with networks of the usual size; what they were taught does not matter for it."""
     rng = np.random.default_rng(0)
-    one = _scaled(recording, "published")[:1].reshape(1, -1).astype(np.float64)
+    one = _scaled("published")[:1].reshape(1, -1).astype(np.float64)
     published = _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
-    yield Row("one press", "published", 0, None, seconds(partial(published, one)), None)
-    inputs = _scaled(recording, "full")[:1]
+    yield Trial("one press", "published", 0, partial(published, one))
+    inputs = _scaled("full")[:1]
     weights = _untrained(inputs.size + inputs.shape[1])
-    yield Row("one press", "masked", 0, None, seconds(lambda: _places(weights, inputs)), None)
+    yield Trial("one press", "masked", 0, partial(_places, weights, inputs))
 
 
-def _scaled(recording: Recording, features: str) -> Floats:
+def _scaled(features: str) -> Floats:
+    recording = _recording()
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
     return Scaling.fit(raw, recording.presses_mm)[0].inputs(raw).inputs
 
@@ -177,9 +176,20 @@ def _untrained(entries: int) -> Weights:
     """A masked network of the usual size as training begins."""
     import torch
 
-    from .training import initial
+    from ..training import initial
 
     options, generator = settings.Localizer(), torch.Generator().manual_seed(0)
     members = [initial(entries, options, generator) for _ in range(options.members)]
     axis = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
     return {name: torch.cat([each[name] for each in members], dim=axis[name]).detach().numpy() for name in axis}
+
+
+BENCH = Bench(
+    "localizer",
+    trials,
+    "mean error (mm)",
+    ("LM", EPOCHS[-1]),
+    ("masked", STEPS[-1]),
+    plain=("published", "L-BFGS", "Adam"),
+    prepare=lambda: [train(np.zeros((4, 1)), np.zeros((4, 2)), 1) for train in (_bfgs, _adam)],
+)

@@ -1,13 +1,7 @@
-"""What filters make of a signal that is known, and how near to the minimum they come, against the time they take.
+"""What filters make of a signal that is known, and how near to the minimum they come, against the time they take."""
 
-All figures come from one run on one machine, so their ratios mean something and their seconds little.
-"""
-
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +9,9 @@ from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import linprog
 
-from design.bench import seconds
-from design.bench_table import Row, write_bench
+from design.bench.harness import Bench, Trial
 
-from .filters import running_median, total_variation
+from ..filters import running_median, total_variation
 
 Array = NDArray[np.float64]
 
@@ -35,48 +28,48 @@ _CYCLE = 40  # readings from press to press, half of them pressed
 _STEP_V = 3.3 / 1023  # of the converter
 
 
-@dataclass(frozen=True)
-class FilterRow(Row):
-    """One filter; `error` is the rms deviation from the clean signal as a share of that of the readings.
+def trials() -> Iterator[Trial]:
+    """Filters of a made-up fibre of READINGS, the published one by other means too, and of LONG.
 
-    Attributes:
-        excess: share by which the robust objective at the published lam exceeds the least found; None of other filters.
+    The error is the rms deviation from the clean signal as a share of that of the readings; "excess" is the share by
+    which the robust objective at the published lam exceeds its minimum.
     """
-
-    excess: float | None
-
-
-def bench_filter(out: Path, report: Callable[[str], None]) -> dict[str, Any]:
-    """Filters of a made-up fibre of READINGS, the published one by other means too, and of LONG; files in `out`."""
     clean, noisy = fibre(READINGS, np.random.default_rng(0))
-    ways: list[tuple[str, float, Callable[[], Array]]] = [
-        *(("robust", lam, partial(total_variation, noisy, lam)) for lam in LAMS),
-        *(("squares", lam, partial(total_variation, noisy, lam, "squares")) for lam in LAMS_V),
-        *(("median", width, partial(running_median, noisy, width)) for width in WIDTHS),
-        ("LP (HiGHS)", PUBLISHED, partial(linear_program, noisy, PUBLISHED)),
-        *(("iterative", steps, partial(iterated, noisy, PUBLISHED, steps)) for steps in STEPS),
-    ]
-    published = {way for way in ways if way[:2] == ("robust", PUBLISHED) or way[0] in ("LP (HiGHS)", "iterative")}
-    found = {way: way[2]() for way in ways}
-    least = min(objective(noisy, found[way], PUBLISHED) for way in published)
-    rows = []
-    for way in ways:
-        name, size, work = way
-        report(f"filter, {name} {size:g}")
-        error = float(np.sqrt(((found[way] - clean) ** 2).mean() / ((noisy - clean) ** 2).mean()))
-        excess = objective(noisy, found[way], PUBLISHED) / least - 1 if way in published else None
-        rows.append(FilterRow(f"{READINGS} readings", name, size, error, seconds(work, 3, 0.2), None, excess))
+
+    @cache
+    def least() -> float:
+        return objective(noisy, linear_program(noisy, PUBLISHED), PUBLISHED)
+
+    def error(found: Array) -> float:
+        return float(np.sqrt(((found - clean) ** 2).mean() / ((noisy - clean) ** 2).mean()))
+
+    def filtered(found: Array) -> Mapping[str, float | None]:
+        return {"error": error(found), "excess": None}
+
+    def minimised(found: Array) -> Mapping[str, float | None]:
+        return {"error": error(found), "excess": objective(noisy, found, PUBLISHED) / least() - 1}
+
+    case = f"{READINGS} readings"
+    for lam in LAMS:
+        judge = minimised if lam == PUBLISHED else filtered
+        yield Trial(case, "robust", lam, partial(total_variation, noisy, lam), judge)
+    for lam in LAMS_V:
+        yield Trial(case, "squares", lam, partial(total_variation, noisy, lam, "squares"), filtered)
+    for width in WIDTHS:
+        yield Trial(case, "median", width, partial(running_median, noisy, width), filtered)
+    yield Trial(case, "LP (HiGHS)", PUBLISHED, partial(linear_program, noisy, PUBLISHED), minimised)
+    for steps in STEPS:
+        yield Trial(case, "iterative", steps, partial(iterated, noisy, PUBLISHED, steps), minimised)
     for count in LONG:
-        report(f"filter, {count} readings")
-        _, noisy = fibre(count, np.random.default_rng(0))
-        for name, size, work in (
-            ("robust", PUBLISHED, partial(total_variation, noisy, PUBLISHED)),
-            ("robust", 1000, partial(total_variation, noisy, 1000)),
-            ("squares", LAMS_V[2], partial(total_variation, noisy, LAMS_V[2], "squares")),
-            ("median", WIDTHS[3], partial(running_median, noisy, WIDTHS[3])),
-        ):
-            rows.append(FilterRow(f"{count} readings", name, size, None, seconds(work), None, None))
-    return write_bench("filter", rows, out, "rms error (share of the noise)", ("LP (HiGHS)", PUBLISHED))
+        long = fibre(count, np.random.default_rng(0))[1]
+        ways: dict[tuple[str, float], Callable[[], Array]] = {
+            ("robust", PUBLISHED): partial(total_variation, long, PUBLISHED),
+            ("robust", 1000): partial(total_variation, long, 1000),
+            ("squares", LAMS_V[2]): partial(total_variation, long, LAMS_V[2], "squares"),
+            ("median", WIDTHS[3]): partial(running_median, long, WIDTHS[3]),
+        }
+        for (way, size), work in ways.items():
+            yield Trial(f"{count} readings", way, size, work, lambda found: {"excess": None})
 
 
 def fibre(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -145,3 +138,13 @@ def iterated(readings: Array, lam: float, steps: int) -> Array:
 
 def _shrunk(values: Array, threshold: float) -> Array:
     return np.sign(values) * np.maximum(np.abs(values) - threshold, 0)
+
+
+BENCH = Bench(
+    "filter",
+    trials,
+    "rms error (share of the noise)",
+    ("LP (HiGHS)", PUBLISHED),
+    ("robust", PUBLISHED),
+    plain=("LP (HiGHS)", "iterative"),
+)

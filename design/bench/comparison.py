@@ -1,0 +1,104 @@
+"""What has become slower, less accurate or less sparing since an earlier run of the same benchmarks."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..files import read_json
+from .harness import Key
+from .table import FORMAT, SUMMARY_FORMAT
+
+SLOWER, LESS_ACCURATE, LOOKS_AT_MORE = "slower", "less accurate", "looks at more"
+ALARM = {SLOWER: 1.15, LESS_ACCURATE: 1.25, LOOKS_AT_MORE: 1.1}
+"""Ratios beyond which a change is told of."""
+ROUNDING = 1e-15
+"""Errors below are all alike."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A measurement that has become worse.
+
+    Attributes:
+        bench: its name. key: of the trial.
+        what: SLOWER, LESS_ACCURATE or LOOKS_AT_MORE.
+        before, now: seconds an item, error or share visited. ratio: by which it is worse, above 1; times are divided by
+            the pace of their machine before.
+    """
+
+    bench: str
+    key: Key
+    what: str
+    before: float
+    now: float
+    ratio: float
+
+    def __str__(self) -> str:
+        case, way, size, repetition = self.key
+        trial = f"{self.bench}, {case}, {way}" + (f" {size:g}" if size else "") + (f" #{repetition}" * bool(repetition))
+        return f"{trial}: {self.what}, {self.ratio:.2f}x ({self.before:.3g} before, {self.now:.3g} now)"
+
+
+def read_earlier(path: Path) -> dict[str, Mapping[str, Any]]:
+    """Benchmarks by name from `bench.json`, or the one in `NAME.json`.
+
+    Raises:
+        InputError: the file cannot be read or is neither.
+    """
+    try:
+        documents = list(read_json(path, SUMMARY_FORMAT)["benches"].values())
+    except InputError:
+        documents = [read_json(path, FORMAT)]
+    except (KeyError, AttributeError) as error:
+        raise InputError(f"{path}: not as padforge bench writes it ({error!r})") from error
+    try:
+        for document in documents:
+            worse(document, document)
+        return {document["bench"]: document for document in documents}
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise InputError(f"{path}: not as padforge bench writes it ({error!r})") from error
+
+
+def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
+    """Changes for the worse of the package's own ways, in trials that both runs of a benchmark have, worst first."""
+    earlier, times, earlier_times = _rows(before), _times(now), _times(before)
+    changes = []
+    for key, row in _rows(now).items():
+        if key not in earlier or key[1] in now["plain"]:
+            continue
+        old = earlier[key]
+        ratios = {SLOWER: (old["seconds"], row["seconds"], times[key] / earlier_times[key])}
+        for what, column, least in ((LESS_ACCURATE, "error", ROUNDING), (LOOKS_AT_MORE, "visited", 1e-3)):
+            if old[column] is not None and row[column] is not None:
+                ratios[what] = (old[column], row[column], max(row[column], least) / max(old[column], least))
+        changes += [
+            Change(now["bench"], key, what, *each) for what, each in ratios.items() if not each[2] <= ALARM[what]
+        ]
+    return sorted(changes, key=lambda change: -change.ratio)
+
+
+def _rows(document: Mapping[str, Any]) -> dict[Key, Mapping[str, Any]]:
+    return {(row["case"], row["way"], row["size"], row["repetition"]): row for row in document["rows"]}
+
+
+def _times(document: Mapping[str, Any]) -> dict[Key, float]:
+    """Of every trial, by the pace of the machine."""
+    return {key: row["seconds"] / document["pace_s"] for key, row in _rows(document).items()}
+
+
+def compared(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]) -> int:
+    """How many trials of the package's own ways both runs have."""
+    return sum(
+        key[1] not in now[name]["plain"]
+        for name in before.keys() & now.keys()
+        for key in _rows(before[name]).keys() & _rows(now[name]).keys()
+    )
+
+
+def lines(changes: Sequence[Change], trials: int) -> list[str]:
+    """A comparison for people."""
+    if not changes:
+        return [f"{trials} trials compared: none slower, less accurate or looking at more"]
+    return [f"{trials} trials compared; worse than before:", *(f"  {change}" for change in changes)]

@@ -1,0 +1,1 @@
+"""Run time against error of filters and localizers, beside plain ways of doing the same."""
