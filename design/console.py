@@ -1,5 +1,6 @@
 """What every stage's command line shares: the settings file, progress on stderr, results on stdout."""
 
+import functools
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,6 +32,25 @@ def out_option(default: str) -> Callable[..., Any]:
         show_default=True,
         help="Folder for the results.",
     )
+
+
+def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--profile`: at the command's end, say on stderr where time went and what was skipped."""
+
+    @click.option("--profile", is_flag=True, help="Say on stderr where time went and what was skipped.")
+    @functools.wraps(command)
+    def noted(*arguments: Any, profile: bool, **options: Any) -> Any:
+        if not profile:
+            return command(*arguments, **options)
+        from .profiling import profiled
+
+        with profiled() as found:
+            try:
+                return command(*arguments, **options)
+            finally:
+                click.echo("\n".join(found.lines()), err=True)
+
+    return noted
 
 
 def load_spec(path: Path | None) -> "Spec":

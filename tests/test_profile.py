@@ -1,0 +1,157 @@
+"""What `--profile` tells: counters of what was skipped, held exactly; of times, only how they add up."""
+
+import json
+import subprocess
+import sys
+import threading
+from importlib.machinery import PathFinder
+
+import numpy as np
+import pytest
+
+from design import Contact, Morphology, profiling, search, signals, signals_sparse
+from design.settings import Pad, Rules, Search
+from fabricate import build
+from sense import Rig, calibrate, simulate
+from sense.settings import Localizer
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that goes only when a test says so."""
+    now = [0.0]
+    monkeypatch.setattr(profiling.time, "perf_counter", lambda: now[0])
+
+    def passes(seconds):
+        now[0] += seconds
+
+    return passes
+
+
+def test_a_stage_has_the_time_that_no_stage_within_it_has(clock):
+    with profiling.profiled() as profile:
+        clock(1)
+        with profiling.stage("outer"):
+            clock(2)
+            with profiling.stage("inner"):
+                clock(4)
+            clock(8)
+        with profiling.stage("inner"):
+            clock(16)
+    assert profile.seconds == {"elsewhere": 1, "outer": 10, "inner": 20}
+    assert profile.lines()[:4] == [
+        "where 31.00 s went",
+        f"  {'inner':<24} {20:8.2f} s {20 / 31:6.1%}",
+        f"  {'outer':<24} {10:8.2f} s {10 / 31:6.1%}",
+        f"  {'elsewhere':<24} {1:8.2f} s {1 / 31:6.1%}",
+    ]
+
+
+def test_stages_of_other_threads_are_the_main_ones(clock):
+    def work():
+        with profiling.stage("aside"):
+            clock(3)
+
+    with profiling.profiled() as profile, profiling.stage("main"):
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert "aside" not in profile.seconds
+    assert profile.seconds["main"] == 3
+
+
+def test_a_failing_stage_ends_and_so_does_the_profile():
+    finders = list(sys.meta_path)
+    with pytest.raises(ValueError, match="on purpose"), profiling.profiled() as profile, profiling.stage("failing"):
+        raise ValueError("on purpose")
+    assert "failing" in profile.seconds
+    assert sys.meta_path == finders
+    assert not profiling.asked()
+    profiling.looked_at("nothing", 1, 2)  # no one listens
+    assert not profile.counts
+
+
+def test_the_import_of_a_heavy_library_is_a_stage(clock, monkeypatch, tmp_path):
+    (tmp_path / "weighty.py").write_text("import passing\npassing.passes(5)\n")
+    (tmp_path / "passing.py").write_text("passes = None\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(profiling, "HEAVY", ("weighty", "absent"))
+    monkeypatch.delitem(sys.modules, "weighty", raising=False)
+    import passing  # pyright: ignore[reportMissingImports]
+
+    passing.passes = clock
+    with profiling.profiled() as profile:
+        import weighty  # pyright: ignore[reportMissingImports]
+    assert profile.seconds["import weighty"] == 5
+    assert type(weighty.__loader__) is type(PathFinder.find_spec("passing").loader)  # pyright: ignore
+    assert profile.lines()[-1] == f"  {'imports':<24} 1 of 2: absent (not weighty)"
+    del sys.modules["weighty"], sys.modules["passing"]
+
+
+@pytest.mark.parametrize("of", [signals, signals_sparse])
+def test_of_a_straight_pad_a_press_looks_at_the_fibres_it_reaches(of):
+    presses = [[1, 1], [2.5, 3.0], [0.7, 2.5]]  # reaching 1 + 1, 2 + 1 and 1 + 2 of 4 + 4 fibres
+    with profiling.profiled() as profile:
+        of(Morphology.straight(4), presses, Contact())
+    assert profile.counts == {"fibres, press by press": [8, 24], "spans, press by press": [8, 24]}
+
+
+def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
+    knots = Morphology.straight(2).knots
+    line = np.linspace(0, 3, 7)
+    wavy = np.empty((4, 7, 2))
+    for fibre in range(4):
+        wavy[fibre, :, fibre // 2] = line
+        wavy[fibre, :, 1 - fibre // 2] = knots[fibre, 0, 1 - fibre // 2]
+    with profiling.profiled() as profile:
+        signals(Morphology(wavy), [[1.25, 1.0]], Contact())
+    # reach 0.6: along fibre 0 over 0.65..1.85, so 3 of 6 spans; across, 1.0 is within 0.4..1.6 of both vertical fibres'
+    # 1.25 only for the first one, along which 0.4..1.6 has 4
+    assert profile.counts["spans, press by press"] == [3 + 4, 4 * 6]
+    assert profile.counts["fibres, press by press"] == [2, 4]
+
+
+def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
+    settings = Search(knots=1, starts=2, steps=2, lost=0)
+    asked = (Pad(grid=1), Contact(), settings, Rules(enforce=False))
+    with profiling.profiled() as profile:
+        search(*asked, keep_in=tmp_path / "search")
+    assert profile.counts["starts"] == [2, 2]
+    monkeypatch.setattr("design.checkpoint.Checkpoints.clear", lambda self: None)
+    first = search(*asked, keep_in=tmp_path / "search")
+    with profiling.profiled() as profile:
+        again = search(*asked, keep_in=tmp_path / "search", resume=True)
+    assert profile.counts["starts"] == [0, 2]
+    np.testing.assert_array_equal(first.morphology.knots, again.morphology.knots)
+
+
+def test_formats_that_nobody_asked_for_are_not_written(tmp_path):
+    with profiling.profiled() as profile:
+        build(Morphology.straight(1), tmp_path, ("svg", "dxf"))
+    assert profile.counts["formats"] == [2, 6]
+    assert {"write tracks.svg", "write tracks.dxf"} <= set(profile.seconds)
+    assert not {"CAD solid", "write mould.stl"} & set(profile.seconds)
+
+
+def test_training_tells_of_the_steps_it_does_without():
+    recording = simulate(Morphology.straight(2), Rig(presses=80, seed=0))
+    options = Localizer(members=2, hidden=8, epochs=40, batch=16, lost=1)
+    with profiling.profiled() as profile:
+        calibrate(recording, options)
+    done, of = profile.counts["training steps"]
+    assert 0 < done <= of
+    assert of % options.members == 0
+    assert {"train", "evaluate"} <= set(profile.seconds)
+
+
+def test_the_command_line_profiles_on_stderr_and_loads_what_it_needs(tmp_path):
+    (tmp_path / "pad.toml").write_text("[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nlost = 0\n")
+    command = [sys.executable, "-m", "padforge", "design", "--profile", "--json"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode in (0, 1), result.stderr
+    assert json.loads(result.stdout)["format"] == "padforge-design/1"
+    told = dict(line.split(maxsplit=1) for line in result.stderr.splitlines() if line.startswith("  "))
+    assert told["starts"] == "0 of 1"
+    skipped = told["imports"].split(" (not ")[0]
+    assert all(name in skipped for name in ("build123d", "manifold3d", "pymoo", "h5py", "trimesh"))
+    assert "torch" not in skipped
