@@ -1,21 +1,25 @@
 """What a search has done so far, on disk: one small file of arrays per start, so that it survives being killed."""
 
+import hashlib
+import io
 import json
-import shutil
-import zipfile
-import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import shown
 from .errors import InputError
-from .files import atomic, read_json, write_json
+from .files import atomic, read_bytes, read_json, write_json
 
 FORMAT = "padforge-search/1"
 
 State = dict[str, NDArray[Any]]
+
+_SEAL = "seal"
+"""Name of the array that tells whether the others are as they were written."""
 
 
 class Checkpoints:
@@ -48,27 +52,41 @@ class Checkpoints:
                 if before.get(section, {}).get(key) != value:
                     was = before.get(section, {}).get(key)
                     raise InputError(
-                        f"{self.folder}: begun with {section} {key} {was!r}, now {value!r}; "
+                        f"{self.folder}: begun with {section} {key} {shown(was)}, now {shown(value)}; "
                         "allowed to resume are the same settings"
                     )
-        return {int(path.stem.split("_")[1]): _read(path) for path in sorted(self.folder.glob("start_*.npz"))}
+        named = {path.stem.removeprefix("start_"): path for path in sorted(self.folder.glob("start_*.npz"))}
+        return {int(number): self._read(path, int(number)) for number, path in named.items() if number.isdecimal()}
 
     def save(self, start: int, state: State) -> None:
         """Put the state of a start in the place of its last one, atomically."""
         if not (self.folder / "search.json").exists():
             write_json(self.folder / "search.json", {"format": FORMAT, "settings": self.settings})
         with atomic(self.folder / f"start_{start:04d}.npz") as temporary:
-            np.savez(temporary, allow_pickle=False, **state)
+            np.savez(temporary, allow_pickle=False, **state, **{_SEAL: np.array(self._seal(start, state))})
 
     def clear(self) -> None:
-        """Remove all states: the search is finished, or begins anew."""
+        """Remove all states, and nothing else that may lie there: the search is finished, or begins anew."""
         if (self.folder / "search.json").exists():
-            shutil.rmtree(self.folder)
+            for path in (*self.folder.glob("start_[0-9]*.npz"), self.folder / "search.json"):
+                path.unlink()
+            with suppress(OSError):  # where there is more in it than states
+                self.folder.rmdir()
 
+    def _read(self, path: Path, start: int) -> State:
+        content = io.BytesIO(read_bytes(path))
+        try:
+            with np.load(content, allow_pickle=False) as arrays:
+                state = {name: arrays[name] for name in arrays.files}
+            if str(state.pop(_SEAL, "")) != self._seal(start, state):
+                raise ValueError("it is not as it was written")
+        except Exception as error:  # the readers of NumPy and of zip files raise whatever a torn file leads them to
+            raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error
+        return state
 
-def _read(path: Path) -> State:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error
+    def _seal(self, start: int, state: State) -> str:
+        """Digest of a state and of what it belongs to: one that bears it needs no further check."""
+        digest = hashlib.sha256(json.dumps([self.settings, start], sort_keys=True).encode())
+        for name, array in sorted(state.items()):
+            digest.update(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes())
+        return digest.hexdigest()

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
+from .console import (
+    json_option,
+    load_spec,
+    out_option,
+    profile_option,
+    progress,
+    seed_option,
+    show_result,
+    spec_option,
+)
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -34,6 +43,7 @@ morphology_argument = click.argument("morphology", type=click.Path(path_type=Pat
 @seed_option
 @out_option("out/pad")
 @json_option
+@profile_option
 @click.pass_context
 def design(
     context: click.Context,
@@ -63,8 +73,10 @@ def design(
     """
     if context.invoked_subcommand is not None:
         return
+    from .output import claimed
+
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
-    with cluster(scheduler) as executor:
+    with claimed(out), cluster(scheduler) as executor:
         document, result = run_search(
             load_spec(spec), out, overrides, origin, time_budget=time_budget, resume=resume, executor=executor
         )
@@ -84,6 +96,7 @@ def run_search(
     from .files import provenance, write_json
     from .morphology import Morphology
     from .plan import draw_plan, save_figure
+    from .profiling import stage
     from .search import search
     from .settings import Contact, Pad, Rules, Search
 
@@ -119,9 +132,10 @@ def run_search(
         "stopped": result.stopped,
         "provenance": origin_of,
     }
-    figure = draw_plan(result.morphology, contact, result.violations)
-    save_figure(figure, out / "design.svg")
-    save_figure(figure, out / "design.png")
+    with stage("figures"):
+        figure = draw_plan(result.morphology, contact, result.violations)
+        save_figure(figure, out / "design.svg")
+        save_figure(figure, out / "design.png")
     write_json(out / "design.json", document)
     return document, result
 
@@ -170,7 +184,11 @@ def summary(result: "SearchResult", out: Path) -> list[str]:
 @spec_option
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="Picture to write, .svg or .png.")
 def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
-    """Draw the plan: fibres, crossings, broken rules and the contact to scale."""
+    """Draw the plan: fibres, crossings, broken rules and the contact to scale.
+
+    \b
+    padforge design show out/pad/morphology.json --out plan.png
+    """
     from .errors import InputError
     from .morphology import Morphology
     from .plan import draw_plan, save_figure
@@ -191,7 +209,11 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
 @json_option
 @click.pass_context
 def check(context: click.Context, morphology: Path, spec: Path | None, as_json: bool) -> None:
-    """Check every rule on the exact curves; exit 1 if one is broken."""
+    """Check every rule on the exact curves; exit 1 if one is broken.
+
+    \b
+    padforge design check out/pad/morphology.json
+    """
     from .morphology import Morphology
     from .rules import check as check_rules
     from .settings import Rules
@@ -206,7 +228,11 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
 @morphology_argument
 @spec_option
 def score(morphology: Path, spec: Path | None) -> None:
-    """Print every term of the objective as JSON."""
+    """Print every term of the objective as JSON.
+
+    \b
+    padforge design score out/pad/morphology.json
+    """
     from .morphology import Morphology
     from .rules import check as check_rules
     from .score import score as score_terms

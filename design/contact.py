@@ -9,20 +9,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from . import profiling
+from .arguments import MOST_VALUES, instance, reals, whole
 from .errors import InputError
 from .kernels.exact import exact_signals
 from .kernels.pchip import population_slopes
 from .kernels.press import EUCLIDEAN, INVERSE, INVERSE_SQUARE, MANHATTAN, UNIFORM
 from .kernels.quantized import quantized_signals
 from .kernels.reach import count_touched, family_strays
-from .morphology import Morphology
-from .settings import Contact
+from .morphology import FARTHEST, LEAST_SPAN, Morphology
+from .settings import Contact, section
 from .threads import in_chunks
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
+
+MOST_SAMPLES = 2**20
+"""Most points a fibre is sampled at."""
 
 _WEIGHTS = {"uniform": UNIFORM, "inverse_square": INVERSE_SQUARE, "inverse": INVERSE}
 _LENGTHS = {"manhattan": MANHATTAN, "euclidean": EUCLIDEAN}
@@ -46,7 +51,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     Raises:
         InputError: presses of the wrong shape or not finite.
     """
-    return exact(pad, presses, contact or Contact())[0]
+    return exact(pad, presses, section("contact", contact, Contact))[0]
 
 
 def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
@@ -54,9 +59,16 @@ def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tupl
     travel, cross, batch = fibre_axes(pad)
     flat, places = as_presses(presses, several=True)
     fibres = travel.shape[1]
+    require_room(len(travel) * len(flat) * fibres)
     out = np.zeros(len(travel) * len(flat) * fibres)
     visited = _run_exact(travel, cross, family_strays(cross), flat, contact, _NONE, _NONE, out)
     return _summed(out, (*batch, *places, fibres)), visited
+
+
+def require_room(values: int) -> None:
+    """Refuse more signals than fit into memory."""
+    if values > MOST_VALUES:
+        raise InputError(f"these are {values} signals, allowed at once are {MOST_VALUES}; signals_sparse takes less")
 
 
 def _summed(signals: Array, shape: tuple[int, ...]) -> Array:
@@ -73,10 +85,11 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     """
     from scipy.sparse import csr_array
 
-    contact = contact or Contact()
-    travel, cross, _ = fibre_axes(pad)
+    contact = section("contact", contact, Contact)
+    travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
     places, strays = as_presses(presses)[0], family_strays(cross)
     starts = count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
+    require_room(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
     _run_exact(travel, cross, strays, places, contact, starts, fibre, signal)
     found = csr_array((signal, fibre, starts), shape=(len(places), 2 * pad.grid))
@@ -103,25 +116,37 @@ def _run_exact(
     def work(begin: int, end: int) -> int:
         return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, signal)
 
-    return sum(in_chunks(work, len(travel) * len(places), grain=2000))
+    visited = sum(in_chunks(work, len(travel) * len(places), grain=2000))
+    if profiling.asked():
+        note_reach(travel, strays, places, shape[1], visited)
+    return visited
+
+
+def note_reach(travel: Array, strays: Array, places: Array, reach: Array, visited: int) -> None:
+    """Tell the profile how many fibres and spans were looked at, press by press."""
+    pads, fibres, knots = travel.shape
+    within = sum(int(count_touched(each, places, reach, fibres // 2)[-1]) for each in strays)
+    profiling.looked_at("fibres, press by press", within, pads * len(places) * fibres)
+    profiling.looked_at("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
 
 
 def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
     """Travel and cross coordinates (P, 2M, n) of a pad or a population, and the population's own shape.
 
     Raises:
-        InputError: knots that are no (..., 2M, N+2, 2) finite numbers ascending along the travel axis.
+        InputError: knots that are no (..., 2M, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
     """
-    knots = pad.knots if isinstance(pad, Morphology) else _numbers(pad, "knots")
+    knots = pad.knots if isinstance(pad, Morphology) else reals("knots", pad, FARTHEST)
     if knots.ndim < 3 or knots.shape[-1] != 2 or knots.shape[-2] < 2 or knots.shape[-3] % 2 or not knots.shape[-3]:
         raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
-    batch = knots.reshape(-1, *knots.shape[-3:])
+    # in C order, else the kernels would be compiled anew for the order of a caller's array, which takes many seconds
+    batch = np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:])
     grid = batch.shape[1] // 2
     travel, cross = (
         np.concatenate([batch[:, :grid, :, axis], batch[:, grid:, :, 1 - axis]], axis=1) for axis in (0, 1)
     )
-    if not isinstance(pad, Morphology) and not (np.isfinite(cross).all() and (np.diff(travel) > 0).all()):
-        raise InputError("knots hold NaN or infinity, or do not ascend along the travel axis")
+    if not isinstance(pad, Morphology) and not (np.diff(travel) >= LEAST_SPAN).all():
+        raise InputError(f"knots do not ascend by {LEAST_SPAN:g} or more along the travel axis")
     return travel, cross, knots.shape[:-3]
 
 
@@ -174,16 +199,16 @@ def signals_quantized(
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
-    return quantized(pad, presses, contact or Contact(), samples)[0]
+    return quantized(pad, presses, section("contact", contact, Contact), samples)[0]
 
 
 def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int) -> tuple[Array, int]:
     """`signals_quantized`, and the number of samples that were looked at for them."""
-    if not (isinstance(samples, int | np.integer) and samples >= 2):
-        raise InputError(f"samples is {samples}, allowed is a whole number from 2")
-    travel, cross, batch = fibre_axes(pad)
-    places, shape_of_presses = as_presses(presses, several=True)
     shape = press_shape(contact)
+    travel, cross, batch = fibre_axes(pad)
+    samples = as_samples(samples, travel.shape[1])
+    places, shape_of_presses = as_presses(presses, several=True)
+    require_room(len(travel) * len(places) * travel.shape[1])
     out = np.zeros((len(travel), len(places), travel.shape[1]))
 
     def work(begin: int, end: int) -> int:
@@ -193,30 +218,23 @@ def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, sam
     return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
 
 
+def as_samples(samples: int, fibres: int) -> int:
+    """Points a fibre is sampled at, as far as they may be so many."""
+    return whole("samples", samples, 2, min(MOST_SAMPLES, MOST_VALUES // max(fibres, 1)))
+
+
 def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
     """`presses` as contiguous, finite (Q C, 2) grid units, and (Q, C): C is 1 for (Q, 2).
 
     Raises:
         InputError: presses that are no (Q, 2), or (Q, C, 2) where `several` are allowed at once, or not finite.
     """
-    places = _numbers(presses, "presses")
+    places = reals("presses", presses, FARTHEST)
     if places.shape == (0,):
         places = places.reshape(0, 2)
     if places.ndim not in ((2, 3) if several else (2,)) or places.shape[-1] != 2:
         raise InputError(f"presses have shape {places.shape}, expected (Q, 2)" + (" or (Q, C, 2)" if several else ""))
-    if not np.isfinite(places).all():
-        raise InputError("presses hold NaN or infinity, expected finite grid units")
     return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
-
-
-def _numbers(values: ArrayLike, name: str) -> Array:
-    try:
-        found = np.asarray(values)
-    except ValueError as error:
-        raise InputError(f"{name} are not numbers in rows of one length") from error
-    if found.dtype.kind not in "fiub":
-        raise InputError(f"{name} are {found.dtype} values, expected real numbers")
-    return found.astype(np.float64)
 
 
 def boustrophedon(grid: int, side: int, jitter: float = 0.0, seed: int = 214) -> Array:

@@ -7,10 +7,15 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from .arguments import instance, real
+from .errors import InputError
 from .kernels.pchip import pchip_slopes
 from .morphology import Morphology, assemble
 
 Array = NDArray[np.float64]
+
+MOST_POINTS = 10**7
+"""Most points the curves of a pad are flattened to."""
 
 
 def slopes(pad: Morphology) -> Array:
@@ -62,12 +67,19 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
 
     A span is cut into n equal steps of its parameter with n = ceil(sqrt(3 L / (4 tolerance))), L the largest second
     difference of its control points; the chord error is then at most `tolerance` (Wang's bound for cubics).
+
+    Raises:
+        InputError: a tolerance out of range, or so small that there would be more than MOST_POINTS.
     """
+    tolerance = real("tolerance", tolerance, 1e-12, 1e6)
+    curves = beziers(instance("pad", pad, Morphology))
+    second = np.linalg.norm(np.diff(curves, 2, axis=2), axis=3).max(axis=2)
+    counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
+    if counts.sum() > MOST_POINTS:
+        raise InputError(f"tolerance is {tolerance:g}: that takes {counts.sum()} points, allowed are {MOST_POINTS}")
     lines = []
-    for spans in beziers(pad):
-        second = np.linalg.norm(np.diff(spans, 2, axis=1), axis=2).max(axis=1)
-        counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
-        pieces = [cubic(span, np.arange(n) / n) for span, n in zip(spans, counts, strict=True)]
+    for spans, steps in zip(curves, counts, strict=True):
+        pieces = [cubic(span, np.arange(n) / n) for span, n in zip(spans, steps, strict=True)]
         lines.append(np.vstack([*pieces, spans[-1, -1:]]))
     return lines
 

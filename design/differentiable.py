@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .contact import press_shape
+from . import profiling
+from .contact import note_reach, press_shape
 from .kernels.exact import exact_signals
 from .kernels.gradient import signals_gradient
 from .kernels.reach import family_strays
@@ -86,7 +87,9 @@ class ExactSignals(torch.autograd.Function):
         ctx.inputs = (t, v, d, strays[0], presses, shape)
         out = np.zeros(len(presses) * len(t))
         begin, end = 0, len(presses)
-        exact_signals(t[None], v[None], d[None], strays, presses, *shape, begin, end, none, none, out)
+        visited = exact_signals(t[None], v[None], d[None], strays, presses, *shape, begin, end, none, none, out)
+        if profiling.asked():
+            note_reach(t[None], strays, presses, shape[1], visited)
         return torch.from_numpy(out.reshape(-1, len(t)).T)
 
     @staticmethod

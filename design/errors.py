@@ -8,6 +8,9 @@ class InputError(ValueError):
     allowed. The command line prints it without a traceback and exits 2.
     """
 
+    def __init__(self, message: object = "") -> None:
+        super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may hold line ends
+
 
 class Fault(Exception):  # noqa: N818  of things outside the program, not an error of it
     """Something outside went wrong that the user has to look at, such as a robot that was stopped.

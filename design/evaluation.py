@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import instance, shown, whole
 from .contact import boustrophedon, signals
 from .errors import InputError
 from .levenberg_marquardt import Network, best_device, fit_many
 from .losses import lost_subsets
-from .morphology import Morphology
-from .settings import Contact
+from .morphology import MOST_GRID, Morphology
+from .settings import Contact, section
 from .threads import one_torch_thread
 
 Array = NDArray[np.float64]
@@ -23,6 +24,7 @@ Loss = tuple[int, ...]
 
 JITTER = 5 / 49
 """Greatest shift of a press off its serpentine, grid units, as published."""
+MOST_PRESSES, MOST_NETWORKS = 2**20, 2**20
 BATCH = 14
 """Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
 
@@ -68,18 +70,24 @@ def evaluate(
         subsets: at most so many sets of a number of lost fibres, always the same; all if None.
 
     Raises:
-        InputError: `presses` is no square of a number from 2, or there is nothing to test on or to lose.
+        InputError: `presses` is no square of a number from 2, there is nothing to test on, or too much to do.
     """
-    side = math.isqrt(max(presses, 0))
-    if side**2 != presses or side < 2:
+    presses = whole("presses", presses, 4, MOST_PRESSES)
+    side = math.isqrt(presses)
+    if side**2 != presses:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
-    if test < 1 or min(lost, default=0) < 0 or (subsets is not None and subsets < 1):
-        raise InputError(
-            f"test is {test}, lost {lost}, subsets {subsets}, allowed is test >= 1, lost >= 0, subsets >= 1"
-        )
-    fibres = 2 * pad.grid
-    levels = [number for number in lost if number < fibres]
-    losses = [lost_subsets(fibres, number, subsets or math.comb(fibres, number)) for number in levels]
+    test, hidden = whole("test", test, 1, MOST_PRESSES), whole("hidden", hidden, 1, 1000)
+    seed, contact = whole("seed", seed, 0, 2**64 - 1), section("contact", contact, Contact)
+    fibres = 2 * instance("pad", pad, Morphology).grid
+    if not isinstance(lost, Sequence) or isinstance(lost, str):
+        raise InputError(f"lost is {shown(lost)}, expected numbers of lost fibres")
+    levels = [number for number in lost if whole("lost", number, 0, 2 * MOST_GRID) < fibres]
+    sets = [math.comb(fibres, number) for number in levels]
+    if subsets is not None:
+        sets = [min(all_of_them, whole("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]
+    if sum(sets) > MOST_NETWORKS:
+        raise InputError(f"subsets is {subsets}: that takes {sum(sets)} networks, allowed are {MOST_NETWORKS}")
+    losses = [lost_subsets(fibres, number, most) for number, most in zip(levels, sets, strict=True)]
     trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
 
     def means(batch: list[Loss]) -> Array:

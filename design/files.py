@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import platform
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,9 +12,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from .arguments import shown
 from .errors import InputError
 
 _PACKAGES = ("padforge", "numpy", "scipy")
+
+_UNFINISHED = ".unfinished-"
+"""Names of files begin with this until they are whole."""
+
+MOST_BYTES = 2**28
+"""A file of more is none that padforge has written, but for recordings."""
 
 
 @contextmanager
@@ -22,17 +30,28 @@ def atomic(path: Path) -> Iterator[Path]:
 
     The temporary name keeps the suffix, because many writers choose their format by it.
     A reader never sees half a file, and an interrupted write leaves the old one as it was.
+
+    Raises:
+        InputError: what the system has against writing `path`, such as a full disk.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    if path.name.startswith(_UNFINISHED):  # it is another one's, who puts it in place
+        yield path
+        return
     try:
-        yield temporary
-        _widen_permissions(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: cannot be written (it is there and no file)")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_UNFINISHED, suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            _widen_permissions(temporary)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def _widen_permissions(path: Path) -> None:
@@ -53,21 +72,51 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
+def require_file(path: Path, most: int = MOST_BYTES) -> None:
+    """Refuse what may never end, such as pipes and devices, and what is too large to be looked at.
+
+    Raises:
+        InputError: nothing there, no file, or one of more than `most` bytes.
+    """
+    try:
+        about = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
+    if stat.S_ISDIR(about.st_mode):
+        raise InputError(f"{path}: cannot be read (Is a directory)")
+    if not stat.S_ISREG(about.st_mode):
+        raise InputError(f"{path}: cannot be read (a pipe or device, expected a file)")
+    if about.st_size > most:
+        raise InputError(f"{path}: cannot be read (it has {about.st_size} bytes, allowed are {most})")
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The content of a file.
+
+    Raises:
+        InputError: it cannot be read, or see `require_file`.
+    """
+    require_file(path, most)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
 def read_json(path: Path, kind: str) -> dict[str, Any]:
     """Read a JSON document whose `format` is `kind`, e.g. "padforge-morphology/1".
 
     Raises:
         InputError: the file is missing, is no JSON, or says another format.
     """
+    content = read_bytes(path)
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        document = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file ({error})") from error
     found = document.get("format") if isinstance(document, dict) else None
     if found != kind:
-        raise InputError(f"{path}: format is {found!r}, expected {kind!r}")
+        raise InputError(f"{path}: format is {shown(found)}, expected {kind!r}")
     return document
 
 

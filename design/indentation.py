@@ -22,11 +22,12 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .contact import as_presses, fibre_axes
+from .arguments import instance, real, reals, shown
+from .contact import as_presses, fibre_axes, require_room
 from .errors import InputError
 from .kernels.indentation import CONE, FLAT, SPHERE, lengthenings
 from .kernels.pchip import population_slopes
-from .morphology import Morphology
+from .morphology import FARTHEST, Morphology
 from .threads import in_chunks
 
 Array = NDArray[np.float64]
@@ -36,6 +37,8 @@ REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
 """E* of EcoFlex 00-20, kPa: 55 kPa is its modulus at 100 % strain (maker's data sheet), and it is incompressible."""
 NEGLIGIBLE = 1e-7
 """Error of a piece of fibre that does not matter, of the lengthening right at the press."""
+SHALLOWEST = 1e-9
+"""Depth below which a press lengthens nothing, grid units: its error could no longer be told from rounding."""
 
 _SHAPES = {"sphere": SPHERE, "cone": CONE, "flat": FLAT}
 
@@ -58,12 +61,10 @@ class Indenter:
     angle_deg: float = 45.0
 
     def __post_init__(self) -> None:
-        if self.shape not in _SHAPES:
-            raise InputError(f"shape is {self.shape!r}, allowed is {', '.join(get_args(Shape))}")
-        if not 1e-6 <= self.radius <= 1e4:
-            raise InputError(f"radius is {self.radius!r}, allowed is 1e-6 to 1e4 grid units")
-        if not 0.01 <= self.angle_deg <= 89.9:
-            raise InputError(f"angle_deg is {self.angle_deg!r}, allowed is 0.01 to 89.9 degrees")
+        if not isinstance(self.shape, str) or self.shape not in get_args(Shape):
+            raise InputError(f"shape is {shown(self.shape)}, allowed is {', '.join(get_args(Shape))}")
+        object.__setattr__(self, "radius", real("radius", self.radius, 1e-6, 1e4))
+        object.__setattr__(self, "angle_deg", real("angle_deg", self.angle_deg, 0.01, 89.9))
 
     def contact_radius(self, depths: ArrayLike) -> Array:
         """Radius of the contact, of the shape of `depths`; all in grid units."""
@@ -76,7 +77,8 @@ class Indenter:
 
     def deflection(self, r: ArrayLike, depth: float) -> Array:
         """How far down the surface goes at distances `r` from the axis, of the shape of `r`; all in grid units."""
-        r, a = np.asarray(r, dtype=np.float64), float(self.contact_radius(depth))
+        r, depth = reals("r", r, FARTHEST), real("depth", depth, 0, FARTHEST)
+        a = float(self.contact_radius(depth))
         if a == 0:
             return np.zeros(r.shape)
         angle = np.arcsin(a / np.maximum(r, a))
@@ -99,6 +101,8 @@ class Indenter:
 
     def force_n(self, depths: ArrayLike, pitch_mm: float, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> Array:
         """Force in newton, of the shape of `depths`, on a pad whose grid unit is `pitch_mm`."""
+        pitch_mm = real("pitch_mm", pitch_mm, 0.1, 1000)
+        reduced_modulus_kpa = real("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
         return self.force(depths) * pitch_mm**2 * reduced_modulus_kpa * 1e-3  # kPa mm^2 = 1e-3 N
 
     @property
@@ -111,11 +115,11 @@ class Indenter:
         Raises:
             InputError: a depth that is not finite, below 0, or deeper than the sphere's radius.
         """
-        d = np.asarray(depths, dtype=np.float64)
-        deepest = self.radius if self.shape == "sphere" else np.inf
-        wrong = d[~(np.isfinite(d) & (d >= 0) & (d <= deepest))]
+        d = reals("depths", depths)
+        deepest = self.radius if self.shape == "sphere" else FARTHEST
+        wrong = d[(d < 0) | (d > deepest)]
         if wrong.size:
-            allowed = f"0 to the sphere's radius, {deepest:g}" if self.shape == "sphere" else "a finite number from 0"
+            allowed = f"0 to the sphere's radius, {deepest:g}" if self.shape == "sphere" else f"0 to {deepest:g}"
             raise InputError(f"depth is {wrong.flat[0]:g}, allowed is {allowed} (grid units)")
         return d
 
@@ -137,13 +141,14 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
         InputError: presses or depths of the wrong shape, not finite, or deeper than the indenter allows.
     """
     places, _ = as_presses(presses)
-    deep = np.asarray(depths, dtype=np.float64)
+    deep = reals("depths", depths)
     if deep.shape not in ((), (len(places),)):
         raise InputError(f"depths have shape {deep.shape}, expected ({len(places)},), one for every press")
     deep = np.broadcast_to(deep, len(places))
-    a = indenter.contact_radius(deep)
+    a = np.where(deep < SHALLOWEST, 0, instance("indenter", indenter, Indenter).contact_radius(deep))
     steepness = _steepness(indenter, deep, a)
-    travel, cross, _ = fibre_axes(pad)
+    travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
+    require_room(len(places) * travel.shape[1])
     slope = population_slopes(travel, cross)[0]
     out = np.zeros((len(places), travel.shape[1]))
     floor = NEGLIGIBLE * deep * np.minimum(1, steepness)

@@ -4,6 +4,7 @@ A pad of M x M grid units carries 2M fibres in two families. Horizontal fibre i 
 (M+1, i), vertical fibre i a curve x(y) from (i, 0) to (i, M+1), i = 1..M; between knots both are PCHIP curves.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,12 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arguments import mapping, real, reals, shown, whole
+from .arguments import path as as_path
 from .errors import InputError
 from .files import read_json, write_json
 
 FORMAT = "padforge-morphology/1"
 MOST_GRID = 1024
 """Most fibres of a family of a pad that is made of tiles."""
+LEAST_SPAN = 1e-12
+"""Least distance of knots along a fibre's travel axis, grid units: slopes stay numbers that can be squared."""
+FARTHEST = 1e6
+"""Greatest coordinate of a place, by amount, in grid units or mm."""
+MOST_KNOTS = 2**22
+"""Most knots of a pad, over all its fibres."""
 MARGIN = 1e-3
 """Least distance of a free knot to the pad's edge, grid units, as in the published optimiser."""
 
@@ -43,13 +52,15 @@ class Morphology:
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
-        knots = np.array(self.knots, dtype=np.float64)
+        knots = reals("knots", self.knots)
         _validate(knots)
-        if not (np.isfinite(self.pitch_mm) and 0 < self.pitch_mm <= 1000):
-            raise InputError(f"pitch_mm is {self.pitch_mm!r}, allowed is 0 < pitch_mm <= 1000")
         knots.setflags(write=False)
         object.__setattr__(self, "knots", knots)
-        object.__setattr__(self, "pitch_mm", float(self.pitch_mm))
+        object.__setattr__(self, "pitch_mm", real("pitch_mm", self.pitch_mm, 0.1, 1000))
+        try:
+            json.dumps(dict(mapping("provenance", self.provenance)), allow_nan=False)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputError(f"provenance is {shown(self.provenance)}, expected JSON ({error})") from error
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Morphology):
@@ -71,7 +82,7 @@ class Morphology:
     @classmethod
     def straight(cls, grid: int, pitch_mm: float = 11.25) -> "Morphology":
         """The square grid: M straight fibres per family, N = 0."""
-        _require_counts(grid, 0)
+        grid, _ = _counts(grid, 0)
         return cls(assemble(np.empty((2 * grid, 0, 2))), pitch_mm)
 
     @classmethod
@@ -79,17 +90,16 @@ class Morphology:
         cls, grid: int, knots: int, seed: int | np.random.Generator = 0, pitch_mm: float = 11.25
     ) -> "Morphology":
         """Knots drawn uniformly over the pad, as the published search starts from."""
-        _require_counts(grid, knots)
-        rng = np.random.default_rng(seed)
+        grid, knots = _counts(grid, knots)
+        known = seed if isinstance(seed, np.random.Generator) else whole("seed", seed, 0, 2**64 - 1)
+        rng = np.random.default_rng(known)
         inner = rng.uniform(MARGIN, grid + 1 - MARGIN, (2 * grid, knots, 2))
         return cls(assemble(inner), pitch_mm)
 
     @classmethod
     def from_parameters(cls, parameters: ArrayLike, pitch_mm: float = 11.25) -> "Morphology":
         """From the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals, their y."""
-        if np.iscomplexobj(parameters):
-            raise InputError("parameters are complex, expected real numbers")
-        para = np.asarray(parameters, dtype=np.float64)
+        para = reals("parameters", parameters)
         if para.size == 0 or para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
             raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
         columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
@@ -104,8 +114,8 @@ class Morphology:
         Raises:
             InputError: not a whole number of times, or more fibres than MOST_GRID.
         """
-        if not (isinstance(times, int) and 1 <= times <= MOST_GRID // self.grid):
-            raise InputError(f"times is {times!r}, allowed is 1 to {MOST_GRID // self.grid} for a grid of {self.grid}")
+        times = whole("times", times, 1, MOST_GRID // self.grid)
+        _counts(self.grid * times, times * (self.knots.shape[1] - 1) + 1)
         grid, size = self.grid, self.grid * times
         out = np.empty((2 * size, times * (self.knots.shape[1] - 1) + 3, 2))
         for family in (0, 1):
@@ -129,7 +139,7 @@ class Morphology:
         Raises:
             InputError: the file is missing, torn, of another kind, or its knots break the rules of the class.
         """
-        path = Path(path)
+        path = as_path("path", path)
         if path.suffix.lower() == ".mat":
             from .published import load_morphology
 
@@ -155,15 +165,15 @@ class Morphology:
             "knots": self.knots.tolist(),
             "provenance": dict(self.provenance),
         }
-        write_json(Path(path), document)
+        write_json(as_path("path", path), document)
 
     def to_mm(self, places: ArrayLike) -> Array:
         """Grid units to mm with the origin at the pad's centre, the frame presses are recorded in."""
-        return (np.asarray(places, dtype=np.float64) - (self.grid + 1) / 2) * self.pitch_mm
+        return (reals("places", places, FARTHEST) - (self.grid + 1) / 2) * self.pitch_mm
 
     def to_grid(self, places_mm: ArrayLike) -> Array:
         """mm from the pad's centre to grid units."""
-        return np.asarray(places_mm, dtype=np.float64) / self.pitch_mm + (self.grid + 1) / 2
+        return reals("places_mm", places_mm, FARTHEST) / self.pitch_mm + (self.grid + 1) / 2
 
 
 def assemble(inner: Array) -> Array:
@@ -200,28 +210,29 @@ def _separate(travel: Array, step: float = 1e-9) -> None:
         travel[..., k] = np.minimum(travel[..., k], travel[..., k + 1] - step)
 
 
-def _require_counts(grid: int, knots: int) -> None:
-    if grid < 1:
-        raise InputError(f"grid is {grid}, allowed is at least 1")
-    if knots < 0:
-        raise InputError(f"knots is {knots}, allowed is at least 0")
+def _counts(grid: int, knots: int) -> tuple[int, int]:
+    """Fibres of a family and inner knots of a fibre, as far as there may be so many."""
+    grid = whole("grid", grid, 1, MOST_GRID)
+    return grid, whole("knots", knots, 0, MOST_KNOTS // (2 * grid) - 2)
 
 
 def _validate(knots: Array) -> None:
     if knots.ndim != 3 or knots.shape[2] != 2 or knots.shape[0] < 2 or knots.shape[0] % 2 or knots.shape[1] < 2:
         raise InputError(f"knots have shape {knots.shape}, expected (2 M, N + 2, 2)")
-    if not np.isfinite(knots).all():
-        raise InputError("knots hold NaN or infinity, expected finite grid units")
     grid = len(knots) // 2
+    _counts(grid, knots.shape[1] - 2)
     if knots.min() < 0 or knots.max() > grid + 1:
         worst = knots.min() if knots.min() < 0 else knots.max()
         raise InputError(f"a knot lies at {worst:g}, allowed is 0 to {grid + 1} grid units")
     for family, name in enumerate(("horizontal", "vertical")):
         fibres = knots[family * grid : (family + 1) * grid]
         travel, cross = fibres[..., family], fibres[..., 1 - family]
-        if (np.diff(travel, axis=1) <= 0).any():
-            fibre = int(np.argmax((np.diff(travel, axis=1) <= 0).any(axis=1))) + 1
-            raise InputError(f"{name} fibre {fibre}: knots do not ascend along its travel axis")
+        near = (np.diff(travel, axis=1) < LEAST_SPAN).any(axis=1)
+        if near.any():
+            fibre = int(np.argmax(near)) + 1
+            raise InputError(
+                f"{name} fibre {fibre}: knots do not ascend by {LEAST_SPAN:g} or more along its travel axis"
+            )
         ends = np.stack([travel[:, 0], travel[:, -1] - grid - 1])
         if ends.any() or (cross[:, [0, -1]] != np.arange(1, grid + 1)[:, None]).any():
             raise InputError(f"{name} fibres must run from (0, i) to ({grid + 1}, i) along their travel axis, i = 1..M")

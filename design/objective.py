@@ -6,11 +6,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .contact import as_presses, boustrophedon, fibre_axes, press_shape
+from .arguments import instance, reals
+from .contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
+from .errors import InputError
 from .information import LEVELS
 from .kernels.information import published_terms as terms_kernel
 from .morphology import Morphology
-from .settings import Contact
+from .settings import Contact, section
 from .threads import in_chunks
 
 
@@ -54,17 +56,18 @@ def published_terms(
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
     """
+    alpha, beta, gamma = _weights(weights)
     travel, cross, _ = fibre_axes(pads)
+    samples = as_samples(samples, travel.shape[1])
     grid = travel.shape[1] // 2
     places = as_presses(published_presses(grid) if presses is None else presses)[0]
-    shape = press_shape(contact or Contact())
+    shape = press_shape(section("contact", contact, Contact))
     found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:
         terms_kernel(travel, cross, places, *shape, samples, LEVELS, begin, end, found)
 
     in_chunks(work, len(travel), grain=8)
-    alpha, beta, gamma = weights
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
 
 
@@ -76,4 +79,11 @@ def published_objective(
     weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
 ) -> float:
     """Formula (5) for one pad: alpha / (1 + entropy) + beta Z + gamma C; arguments as in `published_terms`."""
-    return published_terms(pad, contact, presses, samples, weights)[0].objective
+    return published_terms(instance("pad", pad, Morphology), contact, presses, samples, weights)[0].objective
+
+
+def _weights(weights: tuple[float, float, float]) -> list[float]:
+    found = reals("weights", weights, 1e12)
+    if found.shape != (3,):
+        raise InputError(f"weights have shape {found.shape}, expected three numbers: alpha, beta, gamma")
+    return found.tolist()

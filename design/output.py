@@ -3,11 +3,11 @@
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import IO, Any
 
-from design.errors import InputError
+from .errors import InputError
 
 try:
     import fcntl
@@ -57,8 +57,32 @@ def staged(folder: Path) -> Iterator[Path]:
                 file.replace(folder / file.name)
 
 
-def lock(file: TextIO, busy: str) -> None:
-    """Keep others off until `file` is closed, where the system has such locks.
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Keep other runs off `folder` while results are made for it; one that was not there goes again if left empty.
+
+    Raises:
+        InputError: another run is at it, or it cannot be written.
+    """
+    refuse_unwritable(folder)
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        claim = os.open(folder, os.O_RDONLY) if fcntl else None
+    try:
+        if claim is not None:
+            lock(claim, f"{folder}: another run is writing there; wait for its end, or choose another folder")
+        yield
+    finally:
+        if claim is not None:
+            os.close(claim)
+        with suppress(OSError):  # where something is in it
+            for each in missing:
+                each.rmdir()
+
+
+def lock(file: IO[Any] | int, busy: str) -> None:
+    """Keep others off until `file`, or what this descriptor is of, is closed, where the system has such locks.
 
     Raises:
         InputError: saying `busy`, where somebody has locked it.

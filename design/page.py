@@ -11,8 +11,12 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from .errors import InputError
+from .files import read_bytes
 
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
+
+_MOST_PICTURE = 2**25
+"""Bytes of a picture at most: a page holds it as it is."""
 
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")
 """What stands flush right in a table."""
@@ -142,7 +146,7 @@ def _section(section: Section) -> str:
 
 
 def _figure(path: Path, caption: str) -> str:
-    content = path.read_bytes()
+    content = read_bytes(path, _MOST_PICTURE)
     try:
         size = _png_size(path) if path.suffix == ".png" else _svg_size(content)
     except Exception as error:  # readers of broken pictures raise whatever comes

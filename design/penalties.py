@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from .differentiable import pchip_sample, span_samples
+from .errors import InputError
 from .settings import Pad, Rules
 
 PER_SPAN = 12
 ORDER_PER_UNIT = 40
 BLUR = 0.1  # standard deviation of the mollified crossing count, grid units
+MOST_PAIRS = 10**8  # of samples that are compared at once: some GB
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,9 @@ def penalties(travel: Tensor, cross: Tensor, pad: Pad, rules: Rules, margin: flo
     Args:
         travel, cross: (2M, N+2) coordinates of the knots, grid units.
         margin: factor on the limits, so that a curve whose penalty is 0 also passes the exact check.
+
+    Raises:
+        InputError: so many fibres, of so many knots, that comparing their samples would not fit into memory.
     """
     pitch = pad.pitch_mm
     place, slope = span_samples(travel, cross, PER_SPAN)
@@ -89,6 +94,7 @@ def _bend(fibres: Samples, radius: float, window: float) -> Tensor:
 def _gap(fibres: Samples, gap: float) -> Tensor:
     """How much nearer than `gap` neighbours in a family come, as a share of it."""
     grid = len(fibres.place) // 2
+    _require_room(2 * grid, fibres.arc.shape[1])
     below = [f for f in range(2 * grid) if f % grid < grid - 1]
     lower, upper = fibres.take(below), fibres.take([f + 1 for f in below])
     distances = torch.cdist(lower.place.detach().float(), upper.place.detach().float())
@@ -98,6 +104,7 @@ def _gap(fibres: Samples, gap: float) -> Tensor:
 
 def _folds(fibres: Samples, gap: float) -> Tensor:
     """How much nearer than `gap` a fibre comes to a part of itself that is pi / 2 gaps or more away along it."""
+    _require_room(*fibres.arc.shape)
     arc = fibres.arc.detach().float()
     place = fibres.place.detach().float()
     alongside = (arc[:, :, None] - arc[:, None, :]).abs() < math.pi / 2 * gap
@@ -141,6 +148,7 @@ def _too_many(count: Tensor, limit: float) -> Tensor:
 def _family_crossings(fibres: Samples) -> Tensor:
     """Soft number of crossings within the families."""
     grid = len(fibres.place) // 2
+    _require_room(grid * (grid - 1), fibres.arc.shape[1])
     pairs = [(f, g) for f in range(2 * grid) for g in range(f + 1, grid * (f // grid + 1))]
     first, second = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
     return _mollified(first, second, 0.0)[0]
@@ -149,6 +157,7 @@ def _family_crossings(fibres: Samples) -> Tensor:
 def _crossings(fibres: Samples, limit: float) -> tuple[Tensor, Tensor]:
     """Soft number of horizontal x vertical crossings, and of those flatter than `limit` radians, by how much."""
     grid = len(fibres.place) // 2
+    _require_room(grid**2, fibres.arc.shape[1])
     pairs = [(f, g) for f in range(grid) for g in range(grid, 2 * grid)]
     horizontal, vertical = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
     return _mollified(horizontal, vertical.flip(-1), limit)
@@ -168,6 +177,15 @@ def _mollified(p: Tensor, q: Tensor, limit: float) -> tuple[Tensor, Tensor]:
         return here.sum(), here.new_zeros(())
     sine = area / (torch.linalg.vector_norm(dp, dim=-1) * torch.linalg.vector_norm(dq, dim=-1) + 1e-12)
     return here.sum(), (here * torch.relu(1 - torch.asin(sine.clamp(max=1 - 1e-9)) / limit)).sum()
+
+
+def _require_room(fibres: int, samples: int) -> None:
+    """Refuse to compare all `samples` of so many fibres, or pairs of them, where that takes too much memory."""
+    if fibres * samples**2 > MOST_PAIRS:
+        raise InputError(
+            f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are {MOST_PAIRS}; "
+            "take fewer, or no limit on crossings"
+        )
 
 
 def _hugging(fibres: Samples, zone: float) -> Tensor:

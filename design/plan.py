@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from PIL import Image
 
+from .arguments import instance, shown
 from .curves import crossings, flatten
+from .errors import InputError
 from .files import atomic
 from .morphology import Morphology
 from .palette import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
@@ -23,6 +25,9 @@ def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation]
 
     Same-family crossings are ringed, places of broken rules crossed out in red, the contact drawn at the centre.
     """
+    pad, contact = instance("pad", pad, Morphology), instance("contact", contact, Contact)
+    if not isinstance(violations, Sequence) or not all(isinstance(found, Violation) for found in violations):
+        raise InputError(f"violations is {shown(violations)}, expected what rules.check found")
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     half = pad.size_mm / 2

@@ -1,5 +1,8 @@
 """Files of the published study: MATLAB morphologies with the presses and signals they were sampled at."""
 
+import io
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +11,18 @@ import scipy.io
 
 from .contact import signals_quantized
 from .errors import InputError
+from .files import read_bytes
 from .morphology import Morphology
 from .settings import Contact
 
 PITCH_MM = 11.25
 """Pitch of the built pads."""
+
+MOST_BYTES = 2**29
+"""Unpacked; the longest published recording is far below."""
+
+_PACKED, _PIECE = 15, 2**20
+"""Kind of the elements of a MATLAB file that are packed, and how much of them is unpacked at a time, bytes."""
 
 
 def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
@@ -21,12 +31,10 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
     Raises:
         InputError: the file is missing, torn, no MATLAB file, or lacks a variable.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a MATLAB file")
+    stored = read_bytes(path)
     try:
-        content = scipy.io.loadmat(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        _refuse_swollen(stored)
+        content = scipy.io.loadmat(io.BytesIO(stored))
     except Exception as error:  # SciPy's reader raises whatever a torn stream leads it to
         raise InputError(f"{path}: not a readable MATLAB file, torn or of another kind ({error})") from error
     missing = [name for name in needed if name not in content]
@@ -34,6 +42,20 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
         found = ", ".join(sorted(name for name in content if not name.startswith("__"))) or "nothing"
         raise InputError(f"{path}: has no variable {', '.join(missing)} (found {found})")
     return content
+
+
+def _refuse_swollen(stored: bytes) -> None:
+    """Raise ValueError where the packed variables of a file unpack to more than MOST_BYTES together."""
+    order, at, size = "<" if stored[126:128] == b"IM" else ">", 128, 0
+    while at + 8 <= len(stored):
+        kind, length = struct.unpack_from(f"{order}II", stored, at)
+        packed, unpacker = stored[at + 8 : at + 8 + length], zlib.decompressobj()
+        while kind == _PACKED and packed and not unpacker.eof:
+            size += len(unpacker.decompress(packed, _PIECE))
+            packed = unpacker.unconsumed_tail
+            if size > MOST_BYTES:
+                raise ValueError(f"it unpacks to more than {MOST_BYTES} bytes")
+        at += 8 + length
 
 
 def load_morphology(path: Path) -> Morphology:

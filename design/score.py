@@ -4,14 +4,18 @@ from dataclasses import asdict
 
 import numpy as np
 
+from .arguments import instance
 from .contact import boustrophedon, signals
+from .errors import InputError
 from .information import idle_share, information
 from .losses import loss_shares, lost_subsets
 from .morphology import Morphology
 from .objective import published_terms
-from .settings import Contact, Pad, Rules
+from .settings import Contact, Pad, Rules, Search, section
 
 SIDE, MOST_LOSSES = 20, 64
+MOST_PAIRS = 2**29
+"""Most pairs of points of one fibre, over all fibres, that are looked at for folds: 2 GiB of distances."""
 
 
 def ambiguities(pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float) -> list[float]:
@@ -54,20 +58,28 @@ def score(
     far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
     (`objective`).
+
+    Raises:
+        InputError: arguments out of range, or a pad of too many fibres or knots.
     """
     import torch
 
     from .ambiguity import sharpness
     from .contact import fibre_axes
-    from .penalties import penalties
+    from .penalties import PER_SPAN, penalties
 
-    contact, rules = contact or Contact(), rules or Rules()
-    terms = {f"ambiguity_lost_{k}": value for k, value in enumerate(ambiguities(pad, contact, lost, noise))}
+    contact, rules = section("contact", contact, Contact), section("rules", rules, Rules)
+    size = Pad(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm)
+    asked = Search(lost=lost, noise=noise)
+    pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
+    if pairs > MOST_PAIRS:
+        raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
+    terms = {f"ambiguity_lost_{k}": value for k, value in enumerate(ambiguities(pad, contact, asked.lost, asked.noise))}
     serpentine = boustrophedon(pad.grid, 32, 5 / 49)
     found = signals(pad, serpentine, contact)
     terms |= {"information": information(pad, contact), "idle_share": idle_share(found)}
     terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
-    broken = penalties(travel, cross, Pad(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
+    broken = penalties(travel, cross, size, rules)
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
     return terms | {f"published_{name}": value for name, value in asdict(published_terms(pad, contact)[0]).items()}

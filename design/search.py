@@ -18,18 +18,24 @@ from typing import Any
 
 import numpy as np
 
+from . import profiling
+from .arguments import MOST_VALUES, instance, real, shown
+from .arguments import path as as_path
 from .checkpoint import Checkpoints, State
 from .errors import InputError
+from .losses import loss_shares
 from .morphology import Morphology
 from .problem import Problem
 from .rules import Violation, check
 from .score import ambiguities, score
-from .settings import Contact, Pad, Rules, Search
+from .settings import Contact, Pad, Rules, Search, section
 from .starts import Slice, advance, finish
 
 Report = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
 
+MOST_SECONDS = 1e9
+"""Longest time budget: some thirty years."""
 RESERVE = 0.15  # share of a time budget kept for repairing
 MENDING_S = 3.0  # of repair after Ctrl-C
 
@@ -87,17 +93,26 @@ def search(
         InputError: an origin that does not fit, a device that is not there, or states of other settings.
     """
     begin = time.perf_counter()
-    problem = _problem(pad or Pad(), contact or Contact(), settings or Search(), rules or Rules(), origin)
-    checkpoints = Checkpoints(keep_in, problem.settings()) if keep_in else None
+    sections = (section("pad", pad, Pad), section("contact", contact, Contact))
+    problem = _problem(*sections, section("settings", settings, Search), section("rules", rules, Rules), origin)
+    checkpoints = None if keep_in is None else Checkpoints(as_path("keep_in", keep_in), problem.settings())
+    time_budget = None if time_budget is None else real("time_budget", time_budget, 0, MOST_SECONDS)
+    if not callable(report):
+        raise InputError(f"report is {shown(report)}, expected a function")
+    if executor is not None:
+        instance("executor", executor, Executor)
     states = checkpoints.begin(resume) if checkpoints else {}
     stop = _Stop(begin, time_budget)
-    with _stopped_by_interrupt(stop), _threads(executor) as pool:
+    kept = sum(bool(state["done"]) for state in states.values())
+    profiling.looked_at("starts", len(problem.starts) - kept, len(problem.starts))
+    with profiling.stage("search"), _stopped_by_interrupt(stop), _threads(executor) as pool:
         _run(problem, states, pool, stop, report, checkpoints)
         found = _candidates(problem, states, pool, stop)
-    best, violations = _choose(found, problem)
+    with profiling.stage("check and score"):
+        best, violations = _choose(found, problem)
+        terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
     if checkpoints and not stop.reason:
         checkpoints.clear()
-    terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
     history, seconds = _history(problem, states), time.perf_counter() - begin
     return SearchResult(best, terms, violations, problem.rules.enforce, history, seconds, stop.reason)
 
@@ -108,7 +123,18 @@ def _problem(pad: Pad, contact: Contact, settings: Search, rules: Rules, origin:
 
         if not torch.cuda.is_available():
             raise InputError("device is 'cuda', but no such device is found; allowed here is 'cpu'")
+    if settings.method == "genetic":
+        # Offspring are compared with all pads of the generation, and all their knots are held several times over.
+        room = settings.population * max(settings.population, 4 * pad.grid * settings.knots)
+        if room > MOST_VALUES // 4:
+            raise InputError(
+                f"population is {settings.population}: that takes {room} numbers for {2 * pad.grid} fibres of "
+                f"{settings.knots} knots, allowed are {MOST_VALUES // 4}"
+            )
+    if not any(loss_shares(settings.lost)[: 2 * pad.grid]):
+        raise InputError(f"lost is {settings.lost}, allowed is what leaves some of the {2 * pad.grid} fibres")
     if origin is not None:
+        instance("origin", origin, Morphology)
         knots = origin.knots.shape[1] - 2
         if origin.grid != pad.grid:
             raise InputError(

@@ -10,7 +10,15 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError, field_validator
 
+from .arguments import instance, mapping, shown
+from .arguments import path as as_path
 from .errors import InputError
+from .files import read_bytes
+
+MOST_BYTES = 2**18
+"""Longer settings are none that anybody wrote, and would take long to be refused."""
+MOST_DOTS = 200
+"""In a line: keys of very many parts take the reader of TOML time that grows with their square."""
 
 SECTIONS = ("pad", "contact", "search", "rules", "mould", "printer", "rig", "localizer")
 """Every section a `pad.toml` may have, whichever package owns it."""
@@ -20,6 +28,14 @@ class Section(BaseModel):
     """One table of `pad.toml`: immutable, no unknown keys, no NaN; a field's description is its comment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise _finding(error, type(self), f"[{type(self).__name__.lower()}]") from error
+
+    __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]  else tables within go there too
 
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -37,7 +53,7 @@ class Pad(Section):
 
 
 def _circle(value: object) -> object:
-    return None if value == "circle" else value
+    return None if isinstance(value, str) and value == "circle" else value
 
 
 Sides = Annotated[
@@ -100,7 +116,9 @@ class Search(Section):
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
     lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
-    noise: float = Field(default=0.11, gt=0, le=10, description="standard deviation of a signal's noise, of full scale")
+    noise: float = Field(
+        default=0.11, ge=1e-9, le=10, description="standard deviation of a signal's noise, of full scale"
+    )
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
     contacts: Annotated[tuple[Contact, ...], BeforeValidator(_tuple)] = Field(
         default=(), description="further contacts to serve as well, each a table like [contact]"
@@ -116,7 +134,7 @@ class Search(Section):
 
 
 def _any(value: object) -> object:
-    return None if value == "any" else value
+    return None if isinstance(value, str) and value == "any" else value
 
 
 MaxCrossings = Annotated[
@@ -159,12 +177,14 @@ class Spec:
     """The content of a `pad.toml`: `spec.section(Pad)` is that section, validated, with defaults filled in."""
 
     def __init__(self, tables: Mapping[str, Mapping[str, Any]], source: str = "built-in defaults") -> None:
+        mapping("tables", tables)
         unknown = [name for name in tables if name not in SECTIONS]
         if unknown:
             raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(SECTIONS)}")
         for name, table in tables.items():
             if not isinstance(table, Mapping):
-                raise InputError(f"{source}: {name} is {table!r}, expected a section [{name}]")
+                raise InputError(f"{source}: {name} is {shown(table)}, expected a section [{name}]")
+            mapping(f"{source}: [{name}]", table)
         self.source = source
         self._tables = tables
 
@@ -177,11 +197,13 @@ class Spec:
         """
         if path is None:
             return cls({})
+        path = as_path("path", path)
+        content = read_bytes(path, MOST_BYTES)
+        if any(line.count(b".") > MOST_DOTS for line in content.splitlines()):
+            raise InputError(f"{path}: not a settings file (a line has more than {MOST_DOTS} dots)")
         try:
-            tables = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            tables = tomllib.loads(content.decode("utf-8-sig"))
+        except (ValueError, RecursionError) as error:  # tables within tables without end
             raise InputError(f"{path}: not a TOML file ({error})") from error
         return cls(tables, str(path))
 
@@ -191,9 +213,16 @@ class Spec:
         Raises:
             InputError: an unknown key or a value out of range, naming the key, the value and what is allowed.
         """
+        if not (isinstance(model, type) and issubclass(model, Section)):
+            raise InputError(f"model is {shown(model)}, expected a section such as Pad")
         name = model.__name__.lower()
         given = {key: value for key, value in overrides.items() if value is not None}
         return validated(model, {**self._tables.get(name, {}), **given}, f"{self.source}: [{name}]")
+
+
+def section(name: str, value: AnySection | None, model: type[AnySection]) -> AnySection:
+    """The argument `name` of a public function: a section, or its defaults for None."""
+    return model() if value is None else instance(name, value, model)
 
 
 def validated(model: type[AnySection], values: Mapping[str, Any], where: str) -> AnySection:
@@ -201,12 +230,17 @@ def validated(model: type[AnySection], values: Mapping[str, Any], where: str) ->
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
-        if first["type"] == "extra_forbidden":
-            allowed = ", ".join(model.model_fields)
-            raise InputError(f"{where} {first['loc'][0]}: no such key, allowed are {allowed}") from error
-        raise InputError(f"{where} {key}: got {first['input']!r}, {first['msg'].lower()}") from error
+        raise _finding(error, model, where) from error
+
+
+def _finding(error: ValidationError, model: type[Section], where: str) -> InputError:
+    """The first of pydantic's findings on a `model` as one line that begins with `where`."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
+    if first["type"] == "extra_forbidden":
+        allowed = f", allowed are {', '.join(model.model_fields)}" if len(first["loc"]) == 1 else ""
+        return InputError(f"{where} {'.'.join(map(str, first['loc']))}: no such key{allowed}")
+    return InputError(f"{where} {key}: got {shown(first['input'])}, {first['msg'].lower()}")
 
 
 def commented_toml(models: Mapping[str, type[Section]]) -> str:

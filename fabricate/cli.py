@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from design.console import json_option, load_spec, show_result, spec_option
+from design.console import json_option, load_spec, profile_option, show_result, spec_option
 
 MESHES = (".stl", ".3mf")
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
@@ -45,12 +45,18 @@ def fabricate() -> None:
     help="Folder for the files (default: beside a morphology.json, out/NAME for NAME.mat).",
 )
 @json_option
+@profile_option
 def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, as_json: bool) -> None:
     """Write the mould of MORPHOLOGY; `build` may be left out.
+
+    \b
+    padforge fabricate build out/pad/morphology.json --formats stl,3mf,dxf
+    padforge fabricate 5.mat --out out/published   a pad of the published study
 
     The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
     """
     from design.morphology import Morphology
+    from design.output import claimed
 
     from .export import build as build_files
     from .settings import Settings
@@ -59,7 +65,8 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     pad = Morphology.load(morphology)
     folder = out or (Path("out") / morphology.stem if morphology.suffix == ".mat" else morphology.parent)
     wanted = [name.strip() for name in formats.split(",") if name.strip()]
-    document = build_files(pad, folder, wanted, settings, [path for path in (morphology, spec) if path])
+    with claimed(folder):
+        document = build_files(pad, folder, wanted, settings, [path for path in (morphology, spec) if path])
     show_result(document, summary(document, folder), as_json)
 
 
@@ -86,7 +93,12 @@ def summary(document: dict[str, Any], out: Path) -> list[str]:
 @json_option
 @click.pass_context
 def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, picture: Path | None, as_json: bool) -> None:
-    """Check a mesh, or the mould of a morphology; exit 1 when a check fails."""
+    """Check a mesh, or the mould of a morphology; exit 1 when a check fails.
+
+    \b
+    padforge fabricate check out/pad/mould.stl
+    padforge fabricate check out/pad/morphology.json --picture found.png
+    """
     from design.files import atomic
     from design.morphology import Morphology
 

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from design import profiling
+from design.arguments import instance, path, shown
 from design.errors import InputError
-from design.files import atomic, provenance, write_json, write_text
+from design.files import atomic, provenance, require_file, write_json, write_text
 from design.morphology import Morphology
 
 from . import drawings, laying, printability, soundness, tracks, writers
@@ -66,27 +68,34 @@ def build(
         The fabrication document, as written to `fabrication.json`.
 
     Raises:
-        InputError: an unknown format, settings that contradict each other or refuse this pad, or a mould that is no
-            closed solid; nothing has been written then.
+        InputError: an unknown format, an input that is no file, settings that contradict each other or refuse this
+            pad, or a mould that is no closed solid; nothing has been written then.
     """
-    out = Path(out)
-    if unknown := [name for name in formats if name not in FORMATS]:
-        raise InputError(f"formats: got {unknown[0]!r}, allowed are {', '.join(FORMATS)}")
-    plan = Plan(pad, settings)
-    plan.require_levels()
-    printed = [_meshed(name, body) for name, body in _bodies(plan)]
-    findings = printability.inspect(plan, printed[0].vertices, printed[0].triangles)
-    _require_sound(printed[0], findings)
-    for body in printed[1:]:
-        holes = lid_holes(plan) if body.name == "lid" else 0
-        _require_sound(body, soundness.sound(body.vertices, body.triangles, genus=holes))
+    out = path("out", out)
+    for name in instance("formats", formats, Sequence):
+        if not isinstance(name, str) or name not in FORMATS:
+            raise InputError(f"formats: got {shown(name)}, allowed are {', '.join(FORMATS)}")
+    inputs = [path("inputs", given) for given in instance("inputs", inputs, Sequence)]
+    for given in inputs:
+        require_file(given)
+    profiling.looked_at("formats", len(set(formats)), len(FORMATS))
+    with profiling.stage("mesh"):
+        plan = Plan(pad, settings)
+        plan.require_levels()
+        printed = [_meshed(name, body) for name, body in _bodies(plan)]
+    with profiling.stage("checks"):
+        findings = printability.inspect(plan, printed[0].vertices, printed[0].triangles)
+        _require_sound(printed[0], findings)
+        for body in printed[1:]:
+            holes = lid_holes(plan) if body.name == "lid" else 0
+            _require_sound(body, soundness.sound(body.vertices, body.triangles, genus=holes))
     writes = [
         *(write for body in printed for write in _solids(body, formats)),
         *_drawings(plan, findings, formats),
     ]
     document = _document(plan, printed, findings, [name for name, _ in writes], formats, inputs)
     for name, write in writes:
-        with atomic(out / name) as temporary:
+        with profiling.stage(f"write {name}"), atomic(out / name) as temporary:
             write(temporary)
     write_text(out / "laying.md", laying.page(document))
     write_json(out / "fabrication.json", document)
@@ -123,7 +132,8 @@ def _solids(body: Printed, formats: Sequence[str]) -> Iterator[Write]:
     if "3mf" in formats:
         yield f"{body.name}.3mf", partial(writers.write_3mf, vertices=body.vertices, triangles=body.triangles)
     if "step" in formats:
-        solid, volume = valid_solid(body.mesh, body.name), body.mesh.volume()
+        with profiling.stage("CAD solid"):
+            solid, volume = valid_solid(body.mesh, body.name), body.mesh.volume()
         if abs(solid.volume - volume) > _VOLUME_RATIO * volume:
             raise InputError(f"{body.name}: solid {solid.volume:.1f} mm³, mesh {volume:.1f}; nothing was written")
         yield f"{body.name}.step", partial(writers.write_step, solid=solid)

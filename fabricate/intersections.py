@@ -105,7 +105,7 @@ def _boxes_penetrate(low: Any, high: Any, a: int, b: int, depth: float, level: f
 
 @njit(cache=True, error_model="numpy")
 def _sweep(corners: Any, normals: Any, low: Any, high: Any, depth: float, level: float, pairs: Any) -> int:
-    """Count the pairs that penetrate, the first of them into `pairs`; triangles sorted by `low[:, 0]`."""
+    """Count the pairs that penetrate, into `pairs` until that is full; triangles sorted by `low[:, 0]`."""
     count = 0
     for a in range(len(corners)):
         for b in range(a + 1, len(corners)):
@@ -114,21 +114,22 @@ def _sweep(corners: Any, normals: Any, low: Any, high: Any, depth: float, level:
             if low[b, 1] > high[a, 1] + level or high[b, 1] < low[a, 1] - level:
                 continue
             if _boxes_penetrate(low, high, a, b, depth, level) and _penetrate(corners, normals, a, b, depth, level):
-                if count < len(pairs):
-                    pairs[count, 0], pairs[count, 1] = a, b
+                pairs[count, 0], pairs[count, 1] = a, b
                 count += 1
+                if count == len(pairs):
+                    return count
     return count
 
 
-def penetrating(corners: Array, most: int = 1000) -> tuple[int, NDArray[np.int64]]:
+def penetrating(corners: Array, most: int = 1000) -> NDArray[np.int64]:
     """Pairs of triangles that reach more than `PENETRATION_MM` into each other; duplicates and folds in a plane too.
 
     Args:
         corners: (m, 3, 3) mm.
-        most: pairs that are wanted.
+        most: pairs that are looked for: in a heap of triangles there may be as many as can be.
 
     Returns:
-        How many pairs there are, and up to `most` of them as numbers of triangles, (k, 2).
+        Up to `most` pairs as numbers of triangles, (k, 2).
     """
     corners = np.asarray(corners, dtype=np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -136,7 +137,7 @@ def penetrating(corners: Array, most: int = 1000) -> tuple[int, NDArray[np.int64
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
     kept = np.flatnonzero(doubled > _NEEDLE_MM * longest)
     if not len(kept):
-        return 0, np.empty((0, 2), dtype=np.int64)
+        return np.empty((0, 2), dtype=np.int64)
     low, high = _boxes(corners)
     axes = _sweep_axes(low[kept], high[kept])
     kept = kept[np.argsort(low[kept, axes[0]], kind="stable")]
@@ -145,7 +146,7 @@ def penetrating(corners: Array, most: int = 1000) -> tuple[int, NDArray[np.int64
     pairs = np.empty((most, 2), dtype=np.int64)
     level = _PLANE_ULPS * float(np.finfo(np.float32).eps) * float(np.abs(turned).max())
     count = _sweep(turned, units, *_boxes(turned), PENETRATION_MM, level, pairs)
-    return count, kept[pairs[: min(count, most)]]
+    return kept[pairs[:count]]
 
 
 def _boxes(corners: Array) -> tuple[Array, Array]:
@@ -197,8 +198,11 @@ def _shared(triangles: Array, others: Array) -> Array:
     dropped = np.abs(normals).argmax(axis=1)
     axes = np.sort((dropped[:, None] + [1, 2]) % 3, axis=1)[:, None, :]
     flat, flat_others = (np.take_along_axis(t, np.repeat(axes, 3, axis=1), axis=2) for t in (triangles, others))
-    shared = shapely.intersection(shapely.polygons(flat), shapely.polygons(flat_others), grid_size=SNAP_MM)
-    middles = shapely.centroid(shared)
+    own = shapely.polygons(flat)
+    shared = shapely.intersection(own, shapely.polygons(flat_others), grid_size=SNAP_MM)
+    middles = shapely.centroid(
+        np.where(shapely.is_empty(shared), np.asarray(own), np.asarray(shared))
+    )  # what is thinner than the grid is lost
     away = np.stack([shapely.get_x(middles), shapely.get_y(middles)], axis=1) - flat[:, 0]
     edges = flat[:, 1:] - flat[:, :1]
     shares = np.linalg.solve(edges.transpose(0, 2, 1), away[:, :, None])

@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from design.arguments import instance
 from design.curves import Crossing, crossings, flatten
 from design.errors import InputError
 from design.morphology import Morphology
@@ -50,7 +51,8 @@ class Plan:
     settings: Settings = DEFAULTS
 
     def __post_init__(self) -> None:
-        self.settings.require_consistent(self.pad.pitch_mm)
+        instance("pad", self.pad, Morphology)
+        instance("settings", self.settings, Settings).require_consistent(self.pad.pitch_mm)
 
     @cached_property
     def lines(self) -> list[shapely.LineString]:

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from design.arguments import instance
 from design.errors import InputError
 from design.settings import Pad, Rules, Section, Spec
 
@@ -82,6 +83,10 @@ class Settings:
     printer: Printer = field(default_factory=Printer)
     pad: Pad = field(default_factory=Pad)
     rules: Rules = field(default_factory=Rules)
+
+    def __post_init__(self) -> None:
+        for name, model in (("mould", Mould), ("printer", Printer), ("pad", Pad), ("rules", Rules)):
+            instance(name, getattr(self, name), model)
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "Settings":

@@ -112,9 +112,12 @@ def section(solid: Any, z: float) -> BaseGeometry:
 
 def enclosed(area: BaseGeometry) -> BaseGeometry:
     """What the outer edges of an area surround, over slots in them."""
-    outer = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(shapely.get_parts(area))))
-    grown = outer.buffer(_SLOT_MM / 2, join_style="mitre")
+    grown = _filled(_filled(area).buffer(_SLOT_MM / 2, join_style="mitre"))
     return areas(grown.buffer(-_SLOT_MM / 2, join_style="mitre"))
+
+
+def _filled(area: BaseGeometry) -> BaseGeometry:
+    return shapely.union_all(shapely.polygons(shapely.get_exterior_ring(shapely.get_parts(area))))
 
 
 def tested_width(limit: float) -> float:

@@ -10,21 +10,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from design.arguments import instance, real, whole
+from design.arguments import path as as_path
 from design.errors import InputError
+from design.files import require_file
 
 from . import intersections
 from .findings import Finding, verdict
 from .overhangs import overhang, undercut
+from .packages import refuse_swollen
 from .settings import DEFAULTS, Printer
 from .slices import slabs
-from .surface import Array, Numbers, Surface, spread
+from .surface import LARGEST_MM, Array, Numbers, Surface, spread
 from .thickness import floor_thickness, ridge_width, silicone_wall, wall_thickness
 from .tightness import tight
 
 SOUND = ("manifold", "watertight", "self_intersection", "bodies", "volume", "genus")
 """The checks a mesh must pass to be a solid at all."""
 
-_LARGEST_MM = 1e6
+_MOST_PAIRS = 1000
+"""Pairs of triangles that cut through each other, after which no more are looked for."""
 
 _SHELLS = 100
 """Shells that are told apart into bodies and hollows; more are a heap of pieces, all counted as bodies."""
@@ -52,7 +57,10 @@ def inspect_mesh(
         The findings of `sound`, then bed; and, if that is a solid that can be cut, wall_thickness, floor_thickness,
         overhang, undercut; and what a plan knows, ridge_width, silicone_wall and tight.
     """
+    instance("printer", printer, Printer)
+    min_silicone_mm = real("min_silicone_mm", min_silicone_mm, 0, 10)
     surface = Surface.joined(vertices, triangles)
+    genus = None if genus is None else whole("genus", genus, 0, 10**6)
     findings = [*_sound(surface, genus), _bed(surface, printer)]
     if any(finding.name in ("manifold", "volume") and finding.status == "fail" for finding in findings):
         return findings
@@ -70,6 +78,7 @@ def inspect_mesh(
 
 def sound(vertices: ArrayLike, triangles: ArrayLike, genus: int | None = None) -> list[Finding]:
     """The checks of `SOUND` alone, which take a fraction of the time of all; arguments as for `inspect_mesh`."""
+    genus = None if genus is None else whole("genus", genus, 0, 10**6)
     return _sound(Surface.joined(vertices, triangles), genus)
 
 
@@ -91,10 +100,12 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     """
     import trimesh
 
-    if not path.is_file():
-        raise InputError(f"{path}: {'a folder, expected a mesh file' if path.is_dir() else 'no such file'}")
+    path = as_path("path", path)
+    require_file(path)
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it says on top of raising
     try:
+        if path.suffix.lower() == ".3mf":
+            refuse_swollen(path)
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(path, process=False)  # which would drop triangles with NaN
             if scene.units:
@@ -107,8 +118,8 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
         raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(f"{path}: holds no triangles that can be read, or is torn")
-    if not np.isfinite(vertices).all() or np.abs(vertices).max() > _LARGEST_MM:
-        raise InputError(f"{path}: vertices hold NaN, infinity or more than {_LARGEST_MM:g}")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max() > LARGEST_MM:
+        raise InputError(f"{path}: vertices hold NaN, infinity or more than {LARGEST_MM:g}")
     return vertices, triangles
 
 
@@ -142,9 +153,10 @@ def _watertight(surface: Surface) -> Finding:
 
 
 def _self_intersection(surface: Surface) -> Finding:
-    count, pairs = intersections.penetrating(surface.corners)
-    places = spread(intersections.places(surface.corners, pairs))
-    message = f"{count} pairs of triangles cut through each other" if count else "no triangles cut through each other"
+    pairs = intersections.penetrating(surface.corners, _MOST_PAIRS)
+    places, count = spread(intersections.places(surface.corners, pairs)), len(pairs)
+    many = f"{count} pairs of triangles" if count < _MOST_PAIRS else f"{count} pairs of triangles and more"
+    message = f"{many} cut through each other" if count else "no triangles cut through each other"
     return verdict("self_intersection", count == 0, count, 0, message, places)
 
 

@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from design.arguments import reals
+from design.errors import InputError
+
 from .findings import Place, as_places
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+
+LARGEST_MM = 1e6
+"""Greatest coordinate of a vertex, by amount."""
 
 _APART_MM = 1.0
 """Places less far apart than about this are one, for whoever looks for them."""
@@ -33,14 +39,20 @@ class Surface:
 
     @classmethod
     def joined(cls, vertices: ArrayLike, triangles: ArrayLike) -> "Surface":
-        """The surface of triangles (m, 3) over vertices (n, 3) mm that may repeat."""
-        places = np.asarray(vertices, dtype=np.float64).reshape(-1, 3) + 0.0  # turns -0 into 0
+        """The surface of triangles (m, 3) over vertices (n, 3) mm that may repeat.
+
+        Raises:
+            InputError: vertices beyond LARGEST_MM, or numbers of ones that are not there.
+        """
+        places = reals("vertices", vertices, LARGEST_MM) + 0.0  # turns -0 into 0
+        if places.ndim != 2 or places.shape[1] != 3:
+            raise InputError(f"vertices have shape {places.shape}, expected (n, 3)")
         order = np.lexsort(places.T)
         new = np.ones(len(places), dtype=bool)
         new[1:] = (places[order[1:]] != places[order[:-1]]).any(axis=1)
         number = np.empty(len(places), dtype=np.int64)
         number[order] = np.cumsum(new) - 1
-        corners = number[np.asarray(triangles, dtype=np.int64).reshape(-1, 3)]
+        corners = number[_numbers(triangles, len(places))]
         return cls(places[order[new]], corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)])
 
     @cached_property
@@ -128,6 +140,18 @@ class Surface:
         order = np.lexsort((-self.areas[kept], labels))
         _, first = np.unique(labels[order], return_index=True)
         return spread(self.middles[kept[order[first]], :2])
+
+
+def _numbers(triangles: ArrayLike, vertices: int) -> Numbers:
+    """Triangles as (m, 3) numbers of so many vertices."""
+    found = reals("triangles", triangles)
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise InputError(f"triangles have shape {found.shape}, expected (m, 3)")
+    if found.size and not (found.min() >= 0 and found.max() < vertices and (found == np.trunc(found)).all()):
+        raise InputError(
+            f"triangles hold {found.min():g} to {found.max():g}, allowed are numbers of {vertices} vertices"
+        )
+    return found.astype(np.int64)
 
 
 def spread(places: ArrayLike) -> tuple[Place, ...]:

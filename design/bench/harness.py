@@ -89,7 +89,7 @@ class Measured:
         pace_s: least time of the fixed piece of work, seconds.
     """
 
-    found: dict[Key, Mapping[str, float | None]] = field(default_factory=dict)
+    found: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
     times: dict[Key, list[float]] = field(default_factory=dict)
     pace_s: float = np.inf
 

@@ -6,8 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design.ambiguity import ambiguity, sharpness
-from design.losses import draw_losses, loss_shares
+from design import Contact, Morphology, signals
+from design.ambiguity import ambiguity, full_scale, sharpness
+from design.losses import draw_losses, loss_shares, lost_subsets
+from design.score import ambiguities
 
 PAIR = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
 ALL = torch.ones(1, 3), torch.ones(1)
@@ -68,3 +70,45 @@ def test_a_pad_is_never_left_without_a_fibre():
     kept, weights = draw_losses(2, loss_shares(5), np.random.default_rng(0))
     assert kept.sum(axis=1).min() == 1
     assert weights.sum() == pytest.approx(1)
+
+
+def test_losses_are_all_of_a_size_or_as_many_different_ones_as_wanted():
+    assert lost_subsets(4, 2) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert lost_subsets(4, 2, most=6) == lost_subsets(4, 2)
+    assert lost_subsets(3, 0) == [()]
+    some = lost_subsets(8, 3, most=20)
+    assert some == sorted(set(some)) == lost_subsets(8, 3, most=20)
+    assert len(some) == 20
+    assert all(0 <= a < b < c < 8 for a, b, c in some)
+    assert {a for loss in some for a in loss} == set(range(8))
+
+
+def test_shares_of_losses_are_equal_or_as_weighted():
+    assert loss_shares(3) == (0.25,) * 4
+    assert loss_shares(0) == (1.0,)
+    assert loss_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
+
+
+def test_the_full_scale_is_the_mean_largest_signal_of_what_is_touched():
+    signals = torch.tensor([[0.0, 2.0, 1.0], [0.0, 0.0, 0.0], [6.0, 3.0, 0.0]])
+    assert full_scale(signals) == pytest.approx(4.0)
+    assert full_scale(torch.zeros(2, 3)) == 1.0
+
+
+def test_sharpness_is_the_mean_second_difference():
+    assert sharpness(torch.tensor([[0.0, 1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]])).item() == pytest.approx((1 + 2) / 4)
+
+
+def test_the_score_holds_the_ambiguity_of_every_number_of_losses():
+    """On the module's own grid of presses, each mask of losses counted alike."""
+    pad, contact, noise = Morphology.random(2, 3, seed=0), Contact(), 0.07
+    line = np.linspace(1, 2, 20)
+    presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    found = torch.tensor(signals(pad, presses, contact).T)
+    sigma = noise * found.amax(dim=1).mean().item()
+    expected = []
+    for masks in (np.ones((1, 4)), 1 - np.eye(4)):
+        weight = torch.full((len(masks),), 1 / len(masks), dtype=torch.float64)
+        expected.append(ambiguity(found, torch.tensor(presses), torch.tensor(masks), weight, sigma).item())
+    assert ambiguities(pad, contact, 1, noise) == pytest.approx(expected, rel=1e-3)
+    assert len(ambiguities(pad, contact, 9, noise)) == 4

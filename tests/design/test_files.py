@@ -4,7 +4,8 @@ import os
 
 import pytest
 
-from design.files import atomic, read_json, sha256, write_json
+from design.errors import InputError
+from design.files import atomic, read_bytes, read_json, sha256, write_json
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
@@ -44,3 +45,36 @@ def test_a_folder_has_a_digest_that_follows_its_content(tmp_path):
     before = sha256(tmp_path)
     (tmp_path / "a").write_text("2")
     assert sha256(tmp_path) != before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
+def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
+    pipe = tmp_path / "pipe.json"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
+        read_json(pipe, "x/1")
+    with pytest.raises(InputError, match=r"pipe\.json: cannot be written"):
+        write_json(pipe, {})
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
+    path = tmp_path / "large.json"
+    path.write_text("123456")
+    assert read_bytes(path, 6) == b"123456"
+    with pytest.raises(InputError, match=r"it has 6 bytes, allowed are 5"):
+        read_bytes(path, 5)
+
+
+def test_what_the_system_has_against_writing_names_the_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"file/new\.json: cannot be written"):
+        write_json(tmp_path / "file" / "new.json", {})
+
+
+def test_a_file_within_another_one_is_put_in_place_once(tmp_path):
+    with atomic(tmp_path / "a.txt") as outer, atomic(outer) as inner:
+        inner.write_text("whole")
+        assert list(tmp_path.iterdir()) == [outer]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]

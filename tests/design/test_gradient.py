@@ -64,3 +64,17 @@ def test_an_untouched_fibre_has_no_gradient_and_grazing_stays_finite():
     assert cross.grad is not None
     assert torch.isfinite(cross.grad).all()
     assert not cross.grad[[2, 3, 5]].any()
+
+
+def test_a_fibre_that_grazes_a_circle_changes_its_signal_by_no_more_than_it_would_at_the_least_angle():
+    """The length cut off at height y is 2 sqrt(r^2 - y^2): it changes by -2 y / sqrt(r^2 - y^2), at most 2 / 0.02."""
+    radius, contact = 0.5, Contact(radius=0.5, sides=None)
+    for height, expected in (
+        (0.3, -2 * 0.3 / 0.4),
+        (radius * np.sqrt(1 - 0.021**2), -2 * np.sqrt(1 - 0.021**2) / 0.021),
+        (radius * (1 - 1e-9), -2 / 0.02),
+    ):
+        travel, cross = (torch.tensor(axis[0], requires_grad=True) for axis in fibre_axes(Morphology.straight(2))[:2])
+        torch_signals(travel, cross, np.array([[1.5, 1 - height]]), contact)[0, 0].backward()
+        assert cross.grad is not None
+        assert cross.grad[0].sum().item() == pytest.approx(expected, rel=1e-4)

@@ -223,10 +223,23 @@ def test_impossible_indenters_are_refused(settings, named):
     [
         ([0.1, -0.1], "depth is -0.1, allowed is 0 to the sphere's radius, 0.7"),
         ([0.1, 0.8], "depth is 0.8, allowed"),
-        ([0.1, np.nan], "depth is nan, allowed"),
+        ([0.1, np.nan], "depths hold NaN"),
         ([0.1], r"depths have shape \(1,\), expected \(2,\)"),
     ],
 )
 def test_impossible_depths_are_refused(depths, named):
     with pytest.raises(InputError, match=named):
         indented_signals(Morphology.straight(2), [[1, 1], [2, 2]], depths, Indenter())
+
+
+@pytest.mark.parametrize("share", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("shape", ["cone", "flat"])
+def test_a_fibre_close_to_a_tip_or_beside_an_edge_misses_nothing(shape, share):
+    """Its slope turns round within a length that quadrature could step over."""
+    depth, pad = 0.3, Morphology.straight(2)
+    indenter = Indenter(shape, radius=0.45, angle_deg=50)
+    a = float(indenter.contact_radius(depth))
+    away = a * share if shape == "cone" else a * (1 + share)
+    found = indented_signals(pad, [[1.3, 1 + away], [1.8, 1 - away]], depth, indenter)[:, 0]
+    expected = [oracle(pad, press, depth, indenter, 0) for press in ((1.3, 1 + away), (1.8, 1 - away))]
+    np.testing.assert_allclose(found, expected, rtol=3e-5)

@@ -124,3 +124,50 @@ def test_information_falls_with_noise_to_nothing():
     assert information(Morphology.straight(4), Contact(radius=1e-9, sides=None), noise=1e6) == pytest.approx(
         0, abs=0.01
     )
+
+
+@pytest.mark.parametrize(("grid", "noise"), [(2, 40.0), (1, 300.0)])
+def test_information_is_the_bound_of_its_formula_with_whole_covariances(grid, noise):
+    """The formula of the docstring written out plainly on a few cells, without the small matrices."""
+    pad, side, step = Morphology.random(grid, 3, seed=2), 4, 1e-4
+    line = np.linspace(0, grid - 1, 2 * side + 1)[1::2] + 1 if grid > 1 else np.linspace(0.5, 1.5, 2 * side + 1)[1::2]
+    cells = np.array([(x, y) for y in line for x in line])
+    mean = signals(pad, cells)
+    slopes = [(signals(pad, cells + d) - signals(pad, cells - d)) / (2 * step) for d in step * np.eye(2)]
+    largest = max(signals(pad, cells + d).max() for d in step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]))
+    sigma, fibres = noise * largest / 4096, 2 * grid
+    jacobian = np.stack(slopes, axis=2)
+    spread = (line[1] - line[0]) ** 2 / 12
+    covariance = sigma**2 * np.eye(fibres) + spread * jacobian @ jacobian.transpose(0, 2, 1)
+    own = np.linalg.slogdet(covariance)[1]
+
+    def overlap(a, b):
+        middle, gap = (covariance[a] + covariance[b]) / 2, mean[a] - mean[b]
+        determinants = np.linalg.slogdet(middle)[1] - (own[a] + own[b]) / 2
+        return np.exp(-gap @ np.linalg.solve(middle, gap) / 8 - determinants / 2)
+
+    confused = np.array([[overlap(a, b) for b in range(len(cells))] for a in range(len(cells))]).mean(axis=1)
+    expected = (own - fibres * np.log(sigma**2)).mean() / 2 - np.log(confused).mean()
+    assert information(pad, noise=noise, side=side) == pytest.approx(expected / np.log(2), rel=1e-6)
+
+
+def test_levels_round_up_within_each_columns_own_range():
+    found = quantize(np.array([[0.0, 5.0, 2.0], [1.0, 7.0, 2.0], [4.0, 5.5, 2.0]]), levels=10)
+    np.testing.assert_array_equal(found, [[0, 0, 0], [3, 10, 0], [10, 3, 0]])
+
+
+def test_disorder_counts_both_families_and_only_what_is_in_the_wrong_order():
+    """Verticals 1 and 3 of three change places: three pairs are wrong, by 1, 1 and 2 grid units."""
+    knots = Morphology.straight(3).knots.copy()
+    knots[[3, 5]] = knots[[5, 3]]
+    assert disorder(knots, samples=100) == pytest.approx(400)
+
+
+def test_the_sharpness_of_columns_adds():
+    levels = np.array([[0.0, 3.0], [1.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
+    assert sharpness(levels) == (2 + 1) + (3 + 3)
+
+
+def test_joint_entropy_looks_at_every_column():
+    rows = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+    assert joint_entropy(rows) == pytest.approx(3 * np.log2(5) / 5 + 2 * np.log2(2.5) / 5)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from design.errors import InputError
-from design.levenberg_marquardt import first_weights, fit, fit_many
+from design.levenberg_marquardt import Network, Scale, first_weights, fit, fit_many
 from design.marquardt_batch import RIDGE, Fit, curvature, dual_curvature, neurons_of, pull_back, with_ones
 
 
@@ -183,3 +183,35 @@ def test_numbers_that_are_not_finite_are_refused(bad):
 def test_networks_of_nothing_are_refused(inputs, networks, hidden):
     with pytest.raises(InputError, match="at least 1 of each"):
         fit_many(np.ones((10, inputs)), np.ones((10, 1)), [np.random.default_rng(0)] * networks, hidden)
+
+
+@pytest.mark.parametrize(("varying", "hidden"), [(1, 9), (2, 16), (3, 50)])
+def test_first_neurons_are_spread_as_nguyen_and_widrow_have_it(varying, hidden):
+    """Slopes of one length, 0.7 H^(1 / D) by the inputs that vary, and biases evenly over it, of either sign."""
+    varies = np.array([True] * varying + [False])
+    weights = first_weights(varies, hidden, np.random.default_rng(0))
+    length = 0.7 * hidden ** (1 / varying)
+    assert not weights[:, varying].any()
+    np.testing.assert_allclose(np.linalg.norm(weights[:, :-1], axis=1), length)
+    np.testing.assert_allclose(np.abs(weights[:, -1]), np.abs(length * np.linspace(-1, 1, hidden)))
+    assert 0 < (weights[:, -1] * np.linspace(-1, 1, hidden) < 0).sum() < hidden
+    assert (weights[:, 0] > 0).any()
+    assert (weights[:, 0] < 0).any()
+
+
+def test_a_scale_fills_minus_one_to_one_and_comes_back():
+    values = np.array([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0], [2.0, 5.0, 4.0]])
+    scale = Scale.of(values)
+    np.testing.assert_allclose(scale.there(values), [[-1, 0, -1], [1, 0, 1 / 3], [0, 0, 1]])
+    np.testing.assert_allclose(scale.back(scale.there(values)), values)
+    np.testing.assert_allclose(scale.back(np.array([[0.5, 9.0, -2.0]])), [[2.5, 5.0, -5.0]])
+
+
+def test_a_network_is_its_formula():
+    rng = np.random.default_rng(1)
+    inputs, targets = (Scale(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
+    hidden, output = rng.normal(size=(4, 4)), rng.normal(size=(2, 5))
+    x = rng.normal(size=(6, 3))
+    neurons = np.tanh((x - inputs.middle) / inputs.half @ hidden[:, :3].T + hidden[:, 3])
+    expected = targets.middle + targets.half * (neurons @ output[:, :4].T + output[:, 4])
+    np.testing.assert_allclose(Network(hidden, output, inputs, targets, 1)(x), expected)

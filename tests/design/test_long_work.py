@@ -13,6 +13,7 @@ from typing import cast
 import pytest
 
 from design import search
+from design.checkpoint import Checkpoints
 from design.settings import Search
 
 SETTINGS = """
@@ -102,3 +103,11 @@ def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
             os.kill(victim, 0)
     assert there.morphology == here.morphology
     assert there.history == here.history
+
+
+def test_a_folder_that_holds_more_than_states_keeps_it(tmp_path):
+    (tmp_path / "search.json").write_text("{}")
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "start_of_mine.npz").write_text("mine as well")
+    Checkpoints(tmp_path, {}).begin(resume=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "start_of_mine.npz"]

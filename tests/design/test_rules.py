@@ -165,3 +165,78 @@ def test_a_finding_reads_as_one_line():
     text = str(check(bent(1.95), only(min_gap_mm=0.8))[0])
     assert text.startswith("min_gap_mm: fibre 1 and fibre 2 at (0.0, -5.9) mm: 0.56")
     assert "\n" not in text
+
+
+@pytest.mark.parametrize(("fibre", "fibres"), [(0, (1, 2)), (2, (3, 4)), (4, (5, 6)), (6, (7, 8))])
+def test_fibres_too_close_are_counted_through_both_families(fibre, fibres):
+    pad = bent(fibre % 4 + 1.95, fibre=fibre)
+    (found,) = check(pad, only(min_gap_mm=0.8))
+    assert found.fibres == fibres
+    between = ((0, (fibre % 4 + 1.975 - 2.5) * 11.25), ((fibre % 4 + 1.975 - 2.5) * 11.25, 0))[fibre // 4]
+    assert found.place_mm == pytest.approx(between, abs=0.3)
+
+
+def test_a_limit_that_is_just_kept_is_kept():
+    """A straight grid: gaps and borders of one pitch, fibres of five, 16 crossings at right angles."""
+    grid, hair = Morphology.straight(4, 10.0), 1e-6
+    for kept, broken, count in (
+        ({"min_gap_mm": 10.0}, {"min_gap_mm": 10.0 + hair}, 6),
+        ({"border_mm": 10.0 - hair}, {"border_mm": 10.0 + hair}, 4),
+        ({"max_length_mm": 50.0 + hair}, {"max_length_mm": 50.0 - hair}, 8),
+        ({"max_crossings": 16}, {"max_crossings": 15}, 1),
+    ):
+        assert check(grid, only(**kept)) == []
+        assert len(check(grid, only(**broken))) == count
+
+
+@pytest.mark.parametrize(("fibre", "cross"), [(0, 0.1), (3, 4.9), (4, 0.1), (7, 4.9)])
+def test_every_side_of_the_pad_has_a_border(fibre, cross):
+    (found,) = check(bent(cross, fibre=fibre), only(border_mm=2.0))
+    assert found.fibres == (fibre + 1,)
+    assert found.measured == pytest.approx(0.1 * 11.25, abs=1e-3)
+    at = ((0, (cross - 2.5) * 11.25), ((cross - 2.5) * 11.25, 0))[fibre // 4]
+    assert found.place_mm == pytest.approx(at, abs=0.05)
+
+
+def test_the_length_found_is_that_of_the_curve():
+    pad = bent(3.0, fibre=5)
+    (found,) = check(pad, only(max_length_mm=5 * 11.25 + 0.1))
+    at = np.linspace(0, 5, 200_001)
+    curve = PchipInterpolator(pad.knots[5, :, 1], pad.knots[5, :, 0])(at)
+    assert found.fibres == (6,)
+    assert found.measured == pytest.approx(11.25 * np.hypot(np.diff(at), np.diff(curve)).sum(), rel=1e-5)
+    assert found.limit == 5 * 11.25 + 0.1
+
+
+def test_the_gap_of_two_bent_fibres_is_that_of_their_curves():
+    """Against SciPy's curves, sampled every micrometre or so."""
+    knots = np.repeat(Morphology.straight(2).knots[:, :1], 4, axis=1)
+    knots[:2, :, 0] = knots[2:, :, 1] = [0, 0.9, 2.1, 3]
+    knots[0, 1:3, 1], knots[1, 1:3, 1] = (1.75, 0.6), (2.3, 0.9)
+    at = np.linspace(0, 3, 6001)
+    first, second = (np.column_stack([at, PchipInterpolator(*knots[f].T)(at)]) * 11.25 for f in (0, 1))
+    least = min(np.linalg.norm(second - place, axis=1).min() for place in first)
+    (found,) = check(Morphology(knots), only(min_gap_mm=6.0))
+    assert found.measured == pytest.approx(least, abs=3e-3)
+
+
+def test_findings_come_rule_by_rule():
+    """A fibre that swings far over breaks most rules at once."""
+    rules = Rules(min_bend_radius_mm=20, min_gap_mm=3, min_crossing_angle_deg=80, max_length_mm=60, max_crossings=15)
+    order = [v.rule for v in check(bent(4.9), rules)]
+    assert sorted(set(order), key=order.index) == [
+        "min_bend_radius_mm",
+        "min_gap_mm",
+        "same_family_crossings",
+        "max_crossings",
+        "min_crossing_angle_deg",
+        "border_mm",
+        "max_length_mm",
+    ]
+
+
+def test_flat_crossings_are_told_in_the_order_of_the_fibres():
+    found = check(Morphology.random(3, 8, seed=1), only(min_crossing_angle_deg=60))
+    pairs = [v.fibres for v in found]
+    assert pairs == sorted(pairs)
+    assert [v.measured for v in found] != sorted(v.measured for v in found)

@@ -125,6 +125,23 @@ def test_a_damaged_state_is_named(tmp_path):
         search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
 
 
+def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
+    problem = Problem(Pad(), (Contact(),), SMALL, QUICK)
+    path = tmp_path / "search" / "start_0000.npz"
+    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance(problem, 0, None).state)
+    with np.load(path) as arrays:
+        state = {name: arrays[name] for name in arrays.files}
+    np.savez(path, allow_pickle=False, **state | {"done": np.array([1, 2])})
+    with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read \(it is not as it was written\)"):
+        search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
+
+
+def test_a_generation_that_fits_no_memory_is_refused():
+    settings = Search(method="genetic", population=100_000)
+    with pytest.raises(InputError, match="population is 100000: that takes"):
+        search(settings=settings)
+
+
 def test_the_executor_does_not_matter():
     with ThreadPoolExecutor(1) as one:
         assert search(settings=SMALL, executor=one).morphology == search(settings=SMALL).morphology
@@ -195,3 +212,8 @@ def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists):
 def test_each_further_rule_is_kept(rules):
     found = search(settings=Search(starts=1, steps=150, lost=1, knots=9), rules=Rules(**rules))
     assert found.violations == []
+
+
+def test_a_loss_of_every_fibre_is_refused():
+    with pytest.raises(InputError, match="leaves some of the 2 fibres"):
+        search(Pad(grid=1), settings=Search(lost=(0.0, 0.0, 1.0)))

@@ -61,3 +61,58 @@ def test_files_that_are_no_toml_are_refused(tmp_path, content):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         Spec.load(tmp_path / "none.toml")
+
+
+def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
+    assert Pad().model_dump() == {
+        "grid": 4,
+        "pitch_mm": 11.25,
+        "fibre_diameter_mm": 0.3,
+        "deep_family": "horizontal",
+    }
+    assert Contact().model_dump() == {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan"}
+    assert Rules().model_dump() == {
+        "enforce": True,
+        "min_bend_radius_mm": 1.0,
+        "min_gap_mm": 0.8,
+        "same_family_crossings": 0,
+        "max_crossings": "any",
+        "min_crossing_angle_deg": 0.0,
+        "border_mm": 2.0,
+        "max_length_mm": 500.0,
+    }
+    search = Search().model_dump()
+    assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
+    assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
+    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.11, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "key", "kept", "refused"),
+    [
+        (Pad, "grid", (1, 64), (0,)),
+        (Contact, "sides", (3,), (2,)),
+        (Search, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
+        (Search, "noise", (1e-9, 10.0), (0.0, 10.1)),
+        (Search, "seed", (0, 2**32 - 1), (-1, 2**32)),
+        (Rules, "min_crossing_angle_deg", (0.0, 90.0), (-0.1, 90.1)),
+        (Rules, "min_gap_mm", (0.0, 1000.0), (-0.1, 1000.1)),
+        (Rules, "max_length_mm", (1e-6, 1e6), (0.0, 1.1e6)),
+        (Rules, "same_family_crossings", (0, 10**6), (-1,)),
+        (Rules, "max_crossings", (0, "any"), (-1, "all")),
+    ],
+)
+def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):
+    name = model.__name__.lower()
+    for value in kept:
+        Spec({name: {key: value}}).section(model)
+    for value in refused:
+        with pytest.raises(InputError, match=rf"\[{name}\] {key}"):
+            Spec({name: {key: value}}).section(model)
+
+
+def test_keys_of_very_many_parts_are_refused_at_once(tmp_path):
+    path = tmp_path / "pad.toml"
+    path.write_text("a" + ".a" * 100_000 + " = 1")
+    with pytest.raises(InputError, match="a line has more than 200 dots"):
+        Spec.load(path)

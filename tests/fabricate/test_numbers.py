@@ -68,3 +68,27 @@ def test_numbers_can_be_left_out_and_crowded_out():
     assert Plan(Morphology.straight(2), with_settings({"number_mm": 0.0})).numbers == []
     crowded = Plan(Morphology.straight(2, pitch_mm=4.0), with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
     assert crowded.numbers == [None] * 4
+
+
+DIGITS = """
+### ..# ### ### #.# ### ### ### ### ###
+#.# ..# ..# ..# #.# #.. #.. ..# #.# #.#
+#.# ..# ### ### ### ### ### ..# ### ###
+#.# ..# #.. ..# ..# ..# #.# ..# #.# ..#
+### ..# ### ### ..# ### ### ..# ### ###
+"""
+
+
+@pytest.mark.parametrize("digit", range(10))
+def test_every_digit_reads_as_it_should(digit):
+    """After an 8, turned over: corners, ends and middles of strokes are there or not."""
+    height, width = 2.5, 0.4
+    outline = affinity.scale(number_strokes(80 + digit, height, width), xfact=-1, origin=(0, 0))
+    left, low, right, _ = outline.bounds
+    assert right - left == pytest.approx(width + height * 0.5 * 2 + width + 0.25 * height)
+    place = np.array([right - width / 2 - 0.5 * height, low + width / 2])
+    rows = [row.split()[digit] for row in DIGITS.split("\n") if row]
+    for down, row in enumerate(rows):
+        for across, cell in enumerate(row):
+            point = shapely.Point(place + height * np.array([across / 4, 1 - down / 4]))
+            assert outline.covers(point) == (cell == "#")

@@ -49,13 +49,49 @@ class TestPrinter:
         assert finding.status == "warn"
         assert "floor_mm" in finding.message
 
+    @pytest.mark.parametrize(
+        ("key", "height"), [("floor_mm", 2.05), ("shallow_ridge_height_mm", 0.45), ("deep_ridge_height_mm", 1.25)]
+    )
+    def test_every_height_is_to_be_a_whole_number_of_layers(self, key, height):
+        finding = found(self.straight, "layers", with_settings({key: height}))
+        assert finding.status == "warn"
+        assert finding.message == f"{key}: not a whole number of 0.1 mm layers"
+
+    @pytest.mark.parametrize(
+        ("width", "printer", "status", "limit"),
+        [
+            (0.4, {}, "pass", 0.4),
+            (0.39, {}, "fail", 0.4),
+            (0.4, {"nozzle_mm": 0.2, "resin": True}, "pass", 0.4),
+            (0.4, {"nozzle_mm": 0.21, "resin": True}, "fail", 0.42),
+            (0.4, {"nozzle_mm": 0.21}, "pass", 0.21),
+        ],
+    )
+    def test_ridges_as_wide_as_what_is_printed(self, width, printer, status, limit):
+        finding = found(self.straight, "ridge_width", with_settings({"ridge_width_mm": width}, printer))
+        assert (finding.status, finding.measured) == (status, width)
+        assert finding.limit == pytest.approx(limit)
+        assert len(finding.places_mm) == (0 if status == "pass" else 2)
+
 
 class TestFibres:
     def test_a_fibre_thicker_than_its_track(self):
         finding = found(Morphology.straight(1), "track_size", with_settings(pad={"fibre_diameter_mm": 0.5}))
         assert (finding.status, finding.measured, finding.limit) == ("fail", 0.4, 0.5)
 
-    @pytest.mark.parametrize(("deep", "status", "gap"), [(1.2, "pass", 0.5), (0.9, "warn", 0.2), (0.7, "fail", 0.0)])
+    @pytest.mark.parametrize(
+        ("width", "height", "fibre", "status"),
+        [(0.4, 0.4, 0.4, "pass"), (0.5, 0.4, 0.41, "fail"), (0.4, 0.6, 0.41, "fail"), (0.5, 0.6, 0.41, "pass")],
+    )
+    def test_a_track_is_as_wide_and_as_deep_as_its_fibre(self, width, height, fibre, status):
+        mould = {"ridge_width_mm": width, "shallow_ridge_height_mm": height}
+        finding = found(Morphology.straight(1), "track_size", with_settings(mould, pad={"fibre_diameter_mm": fibre}))
+        assert (finding.status, finding.measured) == (status, min(width, height))
+
+    @pytest.mark.parametrize(
+        ("deep", "status", "gap"),
+        [(1.1, "pass", 0.4), (1.09, "warn", 0.39), (1.2, "pass", 0.5), (0.9, "warn", 0.2), (0.7, "fail", 0.0)],
+    )
     def test_gap_where_families_cross(self, deep, status, gap):
         finding = found(Morphology.straight(1), "crossing_gap", with_settings({"deep_ridge_height_mm": deep}))
         assert finding.status == status
@@ -80,7 +116,7 @@ class TestFibres:
         assert x == pytest.approx((0.915 - 1) * 11.25, abs=0.4)
         assert y == pytest.approx(0.025 * 11.25, abs=0.4)
 
-    @pytest.mark.parametrize(("deep", "status"), [(2.0, "pass"), (2.4, "warn"), (4.4, "fail")])
+    @pytest.mark.parametrize(("deep", "status"), [(2.0, "pass"), (2.04, "warn"), (4.0, "warn"), (4.04, "fail")])
     def test_slender_ridges(self, deep, status):
         finding = found(Morphology.straight(1), "slenderness", with_settings({"deep_ridge_height_mm": deep}))
         assert (finding.status, finding.measured) == (status, pytest.approx(deep / 0.4))
@@ -90,14 +126,25 @@ class TestFibres:
         finding = found(Morphology.straight(2, 4.0), "numbers", with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
         assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 0, 4)
 
-    @pytest.mark.parametrize(("silicone", "status"), [(6.0, "pass"), (2.0, "warn")])
+    @pytest.mark.parametrize(("silicone", "status"), [(6.0, "pass"), (2.2, "pass"), (2.19, "warn"), (2.0, "warn")])
     def test_silicone_beyond_the_tracks(self, silicone, status):
         finding = found(Morphology.straight(1), "cover", with_settings({"silicone_mm": silicone}))
         assert (finding.status, finding.measured) == (status, pytest.approx(silicone - 1.2))
 
+    def test_many_depths_make_a_thicker_pad(self):
+        """Three depths of 0.4, 1.2 and 2.0 mm need 3 mm of silicone."""
+        for silicone, status, cover in ((3.2, "pass", 1.2), (2.5, "warn", 1.0)):
+            finding = found(level_pad(1.8, 1.2), "cover", with_settings({"silicone_mm": silicone}))
+            assert (finding.status, finding.measured) == (status, pytest.approx(cover))
+
+    @pytest.mark.parametrize(("grid", "named"), [(4, "numbers 1, 2, 3, 4, 5, 6, 7, 8"), (5, "10 numbers")])
+    def test_more_than_eight_are_counted_instead_of_named(self, grid, named):
+        finding = found(Morphology.straight(grid, 4.0), "numbers", with_settings({"number_mm": 9.0, "exit_mm": 0.0}))
+        assert finding.message == f"no room beside the fibre's start for {named}"
+
 
 class TestSilicone:
-    @pytest.mark.parametrize(("gap_mm", "status"), [(2.0, "pass"), (0.45, "pass"), (0.35, "warn"), (0.1, "warn")])
+    @pytest.mark.parametrize(("gap_mm", "status"), [(2.0, "pass"), (0.42, "pass"), (0.38, "warn"), (0.1, "warn")])
     def test_wall_between_two_tracks(self, gap_mm, status):
         away = (gap_mm + 0.4) / 20
         finding = found(level_pad(1.5 - away, 1.5 + away), "silicone_wall")
@@ -115,7 +162,10 @@ class TestSilicone:
         pad = Morphology(np.stack([turns, np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=1)]), 11.25)
         assert found(pad, "silicone_wall").status != "pass"
 
-    @pytest.mark.parametrize(("from_wall_mm", "status"), [(0.7, "pass"), (0.4, "warn"), (0.1, "fail")])
+    @pytest.mark.parametrize(
+        ("from_wall_mm", "status"),
+        [(0.7, "pass"), (0.62, "pass"), (0.58, "warn"), (0.4, "warn"), (0.22, "warn"), (0.1, "fail")],
+    )
     def test_a_track_beside_the_tray_wall(self, from_wall_mm, status):
         finding = found(level_pad(from_wall_mm / 10, 2.0), "tray_wall")
         assert finding.status == status

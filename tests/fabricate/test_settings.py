@@ -73,3 +73,34 @@ def test_default_ridges_are_whole_layers_of_common_printers():
         for height in (Mould().deep_ridge_height_mm, Mould().shallow_ridge_height_mm, Mould().floor_mm):
             assert height / layer_mm == pytest.approx(round(height / layer_mm))
     assert Printer().layer_mm == 0.1
+
+
+def test_the_defaults_are_those_the_pads_were_made_with():
+    assert Mould().model_dump() == {
+        "floor_mm": 2.0,
+        "wall_mm": 2.0,
+        "wall_draft_deg": 2.0,
+        "silicone_mm": 6.0,
+        "border_mm": 0.0,
+        "ridge_width_mm": 0.4,
+        "ridge_draft_deg": 0.0,
+        "deep_ridge_height_mm": 1.2,
+        "shallow_ridge_height_mm": 0.4,
+        "levels": "as_needed",
+        "min_silicone_mm": 0.4,
+        "exit_mm": 2.0,
+        "exit_width_mm": 3.0,
+        "number_mm": 2.5,
+        "pins": False,
+        "lid": False,
+        "spout": False,
+        "conductive": False,
+        "lead_mm": 30.0,
+        "tolerance_mm": 0.01,
+    }
+    assert Printer().model_dump() == {
+        "nozzle_mm": 0.4,
+        "layer_mm": 0.1,
+        "bed_mm": [220.0, 220.0, 250.0],
+        "resin": False,
+    }

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+import shapely
 import trimesh
 import trimesh.exchange.stl
-from manifold3d import Manifold
+from manifold3d import Manifold, OpType
 
 from design.errors import InputError
 from fabricate.settings import Printer
@@ -75,10 +76,40 @@ class TestSound:
             ([20.0, 10.0, 5.0], "pass"),
             ([19.0, 19.0, 5.0], "fail"),
             ([20.0, 20.0, 4.0], "fail"),
+            ([20.0, 10.0, 4.99], "fail"),
+            ([9.99, 30.0, 5.0], "fail"),
+            ([30.0, 10.0, 5.0], "pass"),
         ],
     )
     def test_bed(self, bed, status):
         assert inspected(self.box, printer=Printer(bed_mm=bed))["bed"].status == status
+
+    def test_what_a_box_measures(self):
+        found = inspected(self.box, genus=0)
+        assert found["volume"].measured == pytest.approx(1000)
+        assert found["bed"].measured == pytest.approx([10, 20, 5])
+        assert found["bed"].message == "10 x 20 x 5 mm to print on a bed of 220 x 220 x 250 mm"
+        assert found["genus"].measured == 0
+
+    @pytest.mark.parametrize("genus", [0, 1, 2])
+    def test_holes_that_lead_through_are_counted(self, genus):
+        plate = prism(shapely.box(-12, -5, 12, 5), 0, 3)
+        for x in (-6, 6)[:genus]:
+            plate -= Manifold.cylinder(9, 2.0, 2.0, 24).translate((x, 0, -1))
+        mesh = plate.to_mesh()
+        for expected in (0, 1, 2):
+            found = {f.name: f for f in sound(mesh.vert_properties, mesh.tri_verts, genus=expected)}["genus"]
+            assert (found.measured, found.limit) == (genus, expected)
+            assert found.status == ("pass" if genus == expected else "fail")
+
+    @pytest.mark.parametrize(("count", "bodies"), [(99, 1), (100, 101)])
+    def test_of_more_than_a_hundred_shells_all_are_bodies(self, count, bodies):
+        """Hollows in a row within a long box."""
+        hollows = [block(0.5, 0.5, 0.5, at=(n - count / 2, 0, 0)) for n in range(count)]
+        for hollow in hollows:
+            hollow.invert()
+        found = {f.name: f for f in sound(*_together(block(120, 2, 2), *hollows))}["bodies"]
+        assert found.measured == bodies
 
 
 def _together(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
@@ -116,9 +147,9 @@ class TestFiles:
         assert "\n" not in str(refusal.value)
 
     def test_no_file(self, tmp_path):
-        with pytest.raises(InputError, match="no such file"):
+        with pytest.raises(InputError, match="cannot be read"):
             check_mesh(tmp_path / "absent.stl")
-        with pytest.raises(InputError, match="a folder"):
+        with pytest.raises(InputError, match="Is a directory"):
             check_mesh(tmp_path)
 
 
@@ -148,6 +179,30 @@ class TestTight:
     def test_an_opening_below_the_rim(self):
         bore = Manifold.cylinder(8, 0.6).rotate((0, 90, 0)).translate((8, 0, 5))
         assert inspected(tray(*CROSS) - bore)["tight"].status == "fail"
+
+    @pytest.mark.parametrize(("width", "status"), [(9.5, "fail"), (10.5, "pass")])
+    def test_openings_wider_than_a_centimetre_are_the_shape_of_the_part(self, width, status):
+        cut = prism(line((9, 2), (14, 2), width=width), 2.0, 9.0)
+        assert inspected(tray() - cut)["tight"].status == status
+
+    @pytest.mark.parametrize(("side", "status"), [(0.09, "pass"), (0.12, "fail")])
+    def test_holes_as_small_as_roundings(self, side, status):
+        hole = Manifold.cube((side, side, 5)).translate((-6, 6, -1))
+        assert inspected(tray() - hole)["tight"].status == status
+
+    @pytest.mark.parametrize(("side", "status"), [(13.5, "fail"), (14.8, "pass")])
+    def test_what_has_less_than_half_a_floor_is_no_tray(self, side, status):
+        """Half of 20 mm squared is 14.1 mm squared."""
+        hole = Manifold.cube((side, side, 5), True)
+        assert inspected(tray(draft_deg=0) - hole)["tight"].status == status
+
+    @pytest.mark.parametrize(("outer", "status"), [(38.0, "fail"), (42.0, "pass")])
+    def test_a_hollow_of_less_than_a_quarter_of_the_outline_is_a_hole(self, outer, status):
+        """A pot of 20 mm squared with a leak in its floor, on a plate."""
+        plate = Manifold.cube((outer, outer, 2.0), True).translate((0, 0, 1))
+        leak = Manifold.cylinder(9, 1.0).translate((3, 3, -1))
+        solid = Manifold.batch_boolean([tray(draft_deg=0), plate], OpType.Add) - leak
+        assert inspected(solid)["tight"].status == status
 
     def test_pockets_that_lead_nowhere(self):
         slot = prism(line((9, 2), (11, 2), width=3.0), 2.0, 9.0)

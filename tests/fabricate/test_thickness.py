@@ -7,10 +7,12 @@ import trimesh
 from hypothesis import assume, given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
-from manifold3d import Manifold
+from manifold3d import Manifold, Mesh, OpType
 
+from fabricate import slices
 from fabricate.settings import Printer
 from fabricate.soundness import SOUND
+from fabricate.thickness import least_line_mm
 
 from .trays import CROSS, DEPTH, FLOOR, SIZE, WALL, block, faults, inspected, line, near, prism, ridge, spanning, tray
 
@@ -124,6 +126,16 @@ class TestWidth:
     def test_tracks_of_two_depths_may_come_close(self):
         assert not faults(inspected(tray(*CROSS, ridge(spanning(3.7)))))
 
+    @pytest.mark.parametrize(("height", "status"), [(0.55, "pass"), (0.65, "warn")])
+    def test_tracks_whose_depths_differ_by_less_than_one_and_a_half_walls_are_of_one_depth(self, height, status):
+        found = inspected(tray(*CROSS, ridge(spanning(3.7), height)))
+        assert found["silicone_wall"].status == status
+
+    @pytest.mark.parametrize(("gap", "status"), [(0.09, "fail"), (0.12, "warn")])
+    def test_silicone_that_does_not_come_out_in_one_piece(self, gap, status):
+        found = inspected(tray(*CROSS, ridge(spanning(3.4 + gap), 1.2)))
+        assert found["silicone_wall"].status == status
+
     def test_less_silicone_may_be_allowed(self):
         assert not faults(inspected(tray(*CROSS, ridge(spanning(3.6), 1.2)), min_silicone_mm=0.2))
 
@@ -141,6 +153,14 @@ class TestWidth:
         found = inspected(tray(floor=floor))
         assert found["floor_thickness"].status == status
         assert found["floor_thickness"].measured == pytest.approx(floor)
+
+    @pytest.mark.parametrize(
+        ("floor", "layer", "status"),
+        [(0.37, 0.1, "fail"), (0.39, 0.1, "pass"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
+    )
+    def test_a_floor_is_two_layers_and_at_least_four_tenths_thick(self, floor, layer, status):
+        found = inspected(tray(floor=floor), printer=Printer(layer_mm=layer))["floor_thickness"]
+        assert (found.status, found.limit) == (status, pytest.approx(max(0.4, 2 * layer)))
 
     def test_less_than_a_layer(self):
         assert faults(inspected(block(10, 10, 0.03))) == {"floor_thickness": "fail"}
@@ -161,6 +181,27 @@ class TestLean:
             assert found[name].measured == pytest.approx(90)
             assert near(found[name], 4.5, -6, 2.6)
 
+    @pytest.mark.parametrize(("lean_deg", "status"), [(0.05, "pass"), (0.2, "fail")])
+    def test_a_wall_that_is_upright_but_for_rounding(self, lean_deg, status):
+        assert inspected(tray(draft_deg=-lean_deg))["undercut"].status == status
+
+    def test_a_slot_through_the_wall_does_not_hide_that_it_leans(self):
+        slot = Manifold.cube((10, 1.5, DEPTH + 1)).translate((5, -0.75, FLOOR))
+        assert faults(inspected(tray(draft_deg=-3) - slot)) == {"undercut": "fail", "tight": "fail"}
+
+    @pytest.mark.parametrize(("side", "status"), [(0.08, "pass"), (0.13, "fail")])
+    def test_specks_need_no_support(self, side, status):
+        bracket = Manifold.cube((1.0, 1.0, 4.0)).translate((-9.5, 0, FLOOR - 0.2))
+        speck = Manifold.cube((side, side, 0.5)).translate((-8.5, 0.2, FLOOR + 2))
+        assert inspected(tray(bracket, speck), printer=Printer(layer_mm=0.1))["overhang"].status == status
+
+    def test_the_first_layer_lies_on_the_bed(self):
+        """A foot that is set back by a millimetre, for half a layer and for two."""
+        for foot, status in ((0.05, "pass"), (0.2, "fail")):
+            top, low = block(10, 10, 4, at=(0, 0, 2 + foot)), block(8, 8, foot + 0.5, at=(0, 0, (foot + 0.5) / 2))
+            solid = Manifold.batch_boolean([_manifold(top), _manifold(low)], OpType.Add)
+            assert inspected(solid, printer=Printer(layer_mm=0.1))["overhang"].status == status
+
     @pytest.mark.parametrize("lean_deg", [0.5, 3, 10])
     def test_a_wall_that_leans_inwards(self, lean_deg):
         undercut = inspected(tray(*CROSS, draft_deg=-lean_deg))["undercut"]
@@ -169,7 +210,9 @@ class TestLean:
         assert undercut.places_mm
         assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.places_mm)
 
-    @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45, "pass"), (50, "fail")])
+    @pytest.mark.parametrize(
+        ("lean_deg", "status"), [(30, "pass"), (45, "pass"), (45.8, "pass"), (46.3, "fail"), (50, "fail")]
+    )
     def test_a_funnel_on_a_plate_is_no_cavity(self, lean_deg, status):
         top = 4 + 4 * math.tan(math.radians(lean_deg))
         cup = Manifold.cylinder(4, 4, top, 64) - Manifold.cylinder(5, 2, 2, 64).translate((0, 0, -0.5))
@@ -179,3 +222,55 @@ class TestLean:
         found = inspected(plate + cup, genus=1)
         assert faults(found) == ({} if status == "pass" else {"overhang": "fail"})
         assert found["overhang"].measured == pytest.approx(lean_deg, abs=0.1)
+
+
+def _manifold(mesh: trimesh.Trimesh) -> Manifold:
+    return Manifold(Mesh(np.float32(mesh.vertices), np.uint32(mesh.faces)))
+
+
+class TestAreas:
+    """Widths of areas whose widths are known."""
+
+    bar = shapely.box(0, 0, 10, 0.3)
+    block = shapely.box(0, 0, 10, 5)
+
+    @pytest.mark.parametrize(
+        ("limit", "tested"), [(2.0, 1.9), (1.0, 0.95), (0.4, 0.38), (0.3, 0.28), (0.08, 0.06), (0.04, 0.03)]
+    )
+    def test_what_is_rough_is_allowed_for(self, limit, tested):
+        assert slices.tested_width(limit) == pytest.approx(tested)
+
+    @pytest.mark.parametrize(("resin", "least"), [(False, 0.3), (True, 0.6)])
+    def test_the_narrowest_line(self, resin, least):
+        assert least_line_mm(Printer(nozzle_mm=0.3, resin=resin)) == least
+
+    def test_a_bar_is_as_wide_as_it_is(self):
+        (patch,) = slices.too_narrow(self.bar, 0.4)
+        assert patch.area == pytest.approx(self.bar.area, rel=1e-3)
+        assert slices.least_width(self.bar, slices.too_narrow(self.bar, 0.4), 0.4) == pytest.approx(0.3, abs=0.011)
+        assert len(slices.too_narrow(self.bar, 0.31)) == 0
+        assert len(slices.too_narrow(self.block, 4.9)) == 0
+        assert slices.spare_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
+
+    def test_only_what_lies_within_counts(self):
+        both = shapely.union(self.bar, shapely.box(0, 5, 10, 5.35))
+        assert len(slices.too_narrow(both, 0.4)) == 2
+        (patch,) = slices.too_narrow(both, 0.4, within=shapely.box(-1, 4, 20, 6))
+        assert patch.bounds == pytest.approx((0, 5, 10, 5.35), abs=1e-3)
+        assert slices.least_width(both, slices.too_narrow(both, 0.4), 0.4) == pytest.approx(0.3, abs=0.011)
+
+    @pytest.mark.parametrize(("neck", "narrow"), [(0.7, False), (1.5, True)])
+    def test_what_leads_far_from_something_wider_is_no_tip(self, neck, narrow):
+        """A peg 0.3 wide on a block: the tip of it up to twice the least width long, a thin wall beyond."""
+        peg = shapely.union(self.block, shapely.box(4, 5, 4.3, 5 + neck))
+        assert bool(len(slices.too_narrow(peg, 0.4))) == narrow
+
+    def test_a_bridge_between_two_blocks_is_no_tip(self):
+        bridge = shapely.union_all([self.block, shapely.box(4, 5, 4.3, 5.5), shapely.box(0, 5.5, 10, 9)])
+        assert len(slices.too_narrow(bridge, 0.4)) == 1
+
+    @pytest.mark.parametrize(("slot", "closed"), [(1.9, True), (2.1, False)])
+    def test_slots_up_to_two_millimetres_do_not_open_a_ring(self, slot, closed):
+        ring = shapely.box(-10, -10, 10, 10).difference(shapely.box(-8, -8, 8, 8))
+        cut = ring.difference(shapely.box(5, -slot / 2, 20, slot / 2))
+        assert slices.enclosed(cut).contains(shapely.Point(0, 0)) == closed
