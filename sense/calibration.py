@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from design.arguments import instance, shown
 from design.errors import InputError
 from design.files import provenance
 from design.losses import lost_subsets
+from design.profiling import stage
 from design.settings import validated
 
 from . import settings
@@ -57,8 +59,10 @@ def calibrate(
     Raises:
         InputError: an option out of range, too few presses to hold a share back, or a training that diverged.
     """
+    instance("recording", recording, Recording)
+    options = settings.options_or_defaults(options)
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
-    options = validated(settings.Localizer, {**(options or settings.Localizer()).model_dump(), **given}, "[localizer]")
+    options = validated(settings.Localizer, {**options.model_dump(), **given}, "[localizer]")
     if options.method == "published":
         options = options.model_copy(update={"features": "published"})
     rng = np.random.default_rng(options.seed)
@@ -68,11 +72,12 @@ def calibrate(
     made_by["inputs"] = {"recording": recording.digest}
     from design.threads import one_torch_thread
 
-    with one_torch_thread():
+    with stage("train"), one_torch_thread():
         localizer = learn(recording, training, options, rng, progress)
     localizer = replace(localizer, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     levels = range(min(options.lost, recording.fibres - 1) + 1) if options.method == "masked" else (0,)
-    document = evaluate(localizer, recording, levels)
+    with stage("evaluate"):
+        document = evaluate(localizer, recording, levels)
     document |= {"training_presses": len(training), "settings": options.model_dump()}
     return replace(localizer, errors=document["errors"]), document
 
@@ -196,9 +201,17 @@ def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = (), fin
 
     Args:
         findings: of `monitor.examine`; a fibre found at fault is left out from the press on since which it is.
+
+    Raises:
+        InputError: as `Localizer.inputs` and `Localizer.locate`, or findings of a pad with more fibres.
     """
-    presses = localizer.inputs(recording)
+    presses = instance("localizer", localizer, Localizer).inputs(recording)
     alive = presses.alive.copy()
+    if not isinstance(findings, Sequence):
+        raise InputError(f"findings are {shown(findings)}, expected a sequence of them")
     for finding in findings:
-        alive[finding.since :, list(finding.fibres)] = False
+        fibres = list(instance("findings", finding, Finding).fibres)
+        if max(fibres, default=0) >= localizer.fibres:
+            raise InputError(f"findings name fibre {max(fibres)}, allowed are 0 to {localizer.fibres - 1}")
+        alive[finding.since :, fibres] = False
     return localizer.locate(replace(presses, alive=alive), lost)

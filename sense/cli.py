@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.console import json_option, load_spec, progress, seed_option, show_result, spec_option
+from design.console import json_option, load_spec, profile_option, progress, seed_option, show_result, spec_option
 from design.errors import InputError
 
 from .cli_live import live
@@ -54,7 +54,13 @@ class _Numbers(click.ParamType):
 
 @click.group()
 def sense() -> None:
-    """Record presses, learn places from them and find new ones."""
+    """Record presses, learn places from them and find new ones.
+
+    \b
+    padforge sense record --morphology out/pad/morphology.json
+    padforge sense calibrate out/pad/recording
+    padforge sense locate --model out/pad out/later/recording --out places.csv
+    """
 
 
 sense.add_command(record)
@@ -70,6 +76,9 @@ sense.add_command(size_curve)
 @recording_out_option("out/NAME/recording for NAME.mat")
 def import_(file: Path, out: Path | None) -> None:
     """Make a recording of FILE, a published .mat, a .csv or a .h5 that export wrote.
+
+    \b
+    padforge sense import readings.csv --out out/lab/recording
 
     \b
     The CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two hold
@@ -91,7 +100,11 @@ def import_(file: Path, out: Path | None) -> None:
 @recording_argument
 @click.argument("file", type=_FILE)
 def export(recording: Path, file: Path) -> None:
-    """Write RECORDING to FILE, as HDF5 (.h5) or CSV (.csv), for other programs."""
+    """Write RECORDING to FILE, as HDF5 (.h5) or CSV (.csv), for other programs.
+
+    \b
+    padforge sense export out/pad/recording recording.h5
+    """
     from .exchange import export_file
 
     export_file(_open(recording), file)
@@ -107,6 +120,7 @@ def export(recording: Path, file: Path) -> None:
 @spec_option
 @click.option("--out", type=_FOLDER, help="Folder for the results (default: the one RECORDING lies in).")
 @json_option
+@profile_option
 def calibrate(
     recording: Path,
     method: str | None,
@@ -119,11 +133,18 @@ def calibrate(
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
 
+    \b
+    padforge sense calibrate out/pad/recording --test-split chronological
+
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
     error_map.png and error_by_loss.png.
     """
+    from design.output import claimed
+
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
-    document = run_calibration(load_spec(spec), _open(recording), out or recording.absolute().parent, overrides)
+    folder = out or recording.absolute().parent
+    with claimed(folder):
+        document = run_calibration(load_spec(spec), _open(recording), folder, overrides)
     show_result(document, summary(document), as_json)
 
 
@@ -133,11 +154,12 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
     Nothing in `out` changes before the last result is there.
     """
     from design.files import write_json
+    from design.output import refuse_unwritable, staged
+    from design.profiling import stage
 
     from . import health as watch
     from .calibration import calibrate as learn
     from .figures import draw_error_by_loss, draw_error_map
-    from .output import refuse_unwritable, staged
     from .settings import Localizer
 
     refuse_unwritable(out)
@@ -150,14 +172,16 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
 
         localizer, document = learn(recording, options, progress=report)
         bar.update(task, total=None, note="the health of the fibres")
-        health = _health(recording, localizer)
+        with stage("health"):
+            health = _health(recording, localizer)
     with staged(out) as folder:
         localizer.save(folder)
         for name, model in health.items():
             model.save(folder, name)
         write_json(folder / "calibration.json", document)
-        draw_error_map(document, folder / "error_map.png")
-        draw_error_by_loss(document, folder / "error_by_loss.png")
+        with stage("figures"):
+            draw_error_map(document, folder / "error_map.png")
+            draw_error_by_loss(document, folder / "error_by_loss.png")
     if not health:
         for name in (watch.RECORDED, watch.FELT):  # of an earlier calibration, which must not speak for this one
             for file in watch.files_of(out, name):
@@ -181,8 +205,12 @@ def _health(recording: "Recording", localizer: "Localizer") -> "dict[str, Health
 @recording_argument
 @click.option("--lost", type=_Numbers(), help="How many fibres to lose (default: 0 to 3, as far as one is left).")
 @json_option
+@profile_option
 def evaluate(model: Path, recording: Path, lost: tuple[int, ...] | None, as_json: bool) -> None:
     """Errors on RECORDING for every set of lost fibres.
+
+    \b
+    padforge sense evaluate --model out/pad out/later/recording --lost 0,1
 
     Of the recording the model was trained on, only the presses that were held back count.
     """
@@ -200,8 +228,12 @@ def evaluate(model: Path, recording: Path, lost: tuple[int, ...] | None, as_json
 @recording_argument
 @click.option("--mask", type=_Numbers(), default=(), help="Fibres to leave out, counted from 0.")
 @click.option("--out", type=_FILE, required=True, help="CSV file for the places and their radii.")
+@profile_option
 def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path) -> None:
     """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
+
+    \b
+    padforge sense locate --model out/pad out/later/recording --out places.csv
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, sd_x_mm, sd_y_mm (standard
@@ -227,6 +259,9 @@ def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path) -> No
 @click.pass_context
 def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
     """Say which fibres of RECORDING are lost, damaged or drifting, from the readings alone.
+
+    \b
+    padforge sense health --model out/pad out/later/recording
 
     Exit 1 if one is.
     """

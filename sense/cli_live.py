@@ -51,6 +51,9 @@ def live(
     """Show where a pad is pressed, as it is pressed: here, and on a page for the browsers of this machine.
 
     \b
+    padforge sense live --model out/pad
+
+    \b
     --rig simulated      the simulated pad that the model was learnt from, pressed at random
     --rig ur5            the board, as [rig] says; the arm is not used
     --replay RECORDING   what was recorded

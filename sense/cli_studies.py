@@ -24,13 +24,16 @@ _recording = click.argument("recording", type=click.Path(path_type=Path))
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path, as_json: bool) -> None:
     """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
 
+    \b
+    padforge sense recalibrate --model out/pad out/later/recording --out out/later
+
     Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
     if it did not, places are found as before.
     """
     from design.files import write_json
+    from design.output import refuse_unwritable, staged
 
     from .localizer import Localizer
-    from .output import refuse_unwritable, staged
     from .recalibration import lines
     from .recalibration import recalibrate as follow
     from .recording import Recording
@@ -77,16 +80,19 @@ def robustness(
 ) -> None:
     """Errors on RECORDING for every set of lost fibres, of one network or of networks retrained for each, or both.
 
+    \b
+    padforge sense robustness out/pad/recording --model out/pad --out out/pad
+
     Writes robustness.json and robustness.png (figures 13 and 14 of the paper). Retrained networks that are done are
     kept when it is broken off, and the same command goes on from them.
     """
     from design.files import write_json
+    from design.output import refuse_unwritable, staged
 
     from .figures_studies import draw_robustness
     from .localizer import Localizer
     from .loss_study import lines
     from .loss_study import robustness as study
-    from .output import refuse_unwritable, staged
     from .recording import Recording
     from .settings import Localizer as Options
 
@@ -120,12 +126,15 @@ def robustness(
 def size_curve(recording: Path, seed: int | None, spec: Path | None, out: Path, as_json: bool) -> None:
     """Errors by number of presses learnt from, and what recording more of them would bring.
 
+    \b
+    padforge sense size-curve out/pad/recording --out out/pad
+
     Writes size_curve.json and size_curve.png.
     """
     from design.files import write_json
+    from design.output import refuse_unwritable, staged
 
     from .figures_studies import draw_size_curve
-    from .output import refuse_unwritable, staged
     from .recording import Recording
     from .settings import Localizer as Options
     from .size_study import lines

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import instance, shown, whole
 from design.errors import InputError
 from design.losses import lost_subsets
 
@@ -39,18 +40,20 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
         InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
             or was seen in its recalibration.
     """
-    levels, presses = tuple(levels), len(recording.presses_mm)
+    instance("localizer", localizer, Localizer)
+    instance("recording", recording, Recording)
+    presses = len(recording.presses_mm)
+    try:
+        levels = tuple(levels)
+    except TypeError as error:
+        raise InputError(f"lost is {shown(levels)}, expected numbers of lost fibres") from error
     if not levels:
         raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
     digest = recording.digest
     if digest in localizer.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     own = digest == localizer.learnt_from
-    if own and not max(localizer.test) < presses:
-        raise InputError(
-            f"test press {max(localizer.test)} of the localizer: no such press, allowed are 0 to {presses - 1}"
-        )
-    test = np.array(localizer.test, dtype=np.int64) if own else np.flatnonzero(recording.known)
+    test = held_back(localizer, recording) if own else np.flatnonzero(recording.known)
     if len(test) == 0:
         raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
     inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
@@ -74,6 +77,21 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     }
 
 
+def held_back(localizer: Localizer, recording: Recording) -> NDArray[np.int64]:
+    """Presses of the recording it was trained on that a localizer says were held back, by index.
+
+    Raises:
+        InputError: one of them is not there, or its place is not known, so that it was not.
+    """
+    presses = len(recording.presses_mm)
+    for press in localizer.test:
+        if not 0 <= press < presses or not recording.known[press]:
+            raise InputError(
+                f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known place"
+            )
+    return np.array(localizer.test, dtype=np.int64)
+
+
 def errors_by_loss(
     fibres: int, levels: Iterable[int], locate: Callable[[tuple[int, ...]], Found], places_mm: Array
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -88,8 +106,7 @@ def errors_by_loss(
     """
     rows, by_subset = [], []
     for level in levels:
-        if not 0 <= level < fibres:
-            raise InputError(f"lost is {level}, allowed is 0 to {fibres - 1}, so that a fibre is left")
+        level = whole("lost", level, 0, fibres - 1)
         subsets = lost_subsets(fibres, level)
         found = [locate(subset) for subset in subsets]
         rows.append(summary(level, found, places_mm))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from .document import LEAST_SPREAD_V
 from .residuals import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
 
 Array = NDArray[np.float64]
@@ -80,7 +81,7 @@ class Evidence:
         from them, and `size` (C, T), V, of a target of 1."""
         scale, extra = _calibrated(targets - mean, spread)
         usual = np.median(noise_of(traces), axis=0)
-        usual = np.where(usual > 0, usual, 1e-3 * size[:, 0])
+        usual = np.where(usual > LEAST_SPREAD_V, usual, 1e-3 * size[:, 0])
         logs = _log_noise(traces, usual)
         centre = np.median(logs, axis=0)
         honest = np.hypot(spread * scale, extra)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from design.errors import InputError
 from design.files import atomic
+from design.output import writing
 from design.published import load_mat
 
 from .limits import MAX_FIBRES
-from .output import writing
 from .recording import Recording
 from .tables import read_csv
 

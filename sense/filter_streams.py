@@ -4,12 +4,12 @@ A total variation is decided from the past on: each value is the next one clippe
 a constant no later reading matters any more. So a recording too long for memory is filtered exactly, a block at a time.
 """
 
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from design.arguments import whole
 from design.errors import InputError
 
 from .filters import KERNELS, NOBODY, Array, Fidelity, check_variation, checked_readings, median_of, window_reach
@@ -35,8 +35,7 @@ class TotalVariation:
             InputError: an argument out of range.
         """
         check_variation(lam, fidelity)
-        _check_count("channels", channels, MAX_FIBRES)
-        _check_count("most_held", most_held, 2**31)
+        channels, most_held = whole("channels", channels, 1, MAX_FIBRES), whole("most_held", most_held, 1, 2**31)
         self._channels = [_Channel(float(lam), fidelity, most_held) for _ in range(channels)]
 
     @property
@@ -114,7 +113,7 @@ class RunningMedian:
         Raises:
             InputError: an argument out of range.
         """
-        _check_count("channels", channels, MAX_FIBRES)
+        channels = whole("channels", channels, 1, MAX_FIBRES)
         self._before, self._after = window_reach(width, causal)
         self._held = np.empty((channels, 0))
         self._given = 0  # of the readings held, those whose median has been given
@@ -149,8 +148,3 @@ def _block(readings: ArrayLike, channels: int) -> Array:
     if array.ndim != 2 or array.shape[1] != channels:
         raise InputError(f"readings have shape {array.shape}, expected (n, {channels})")
     return np.ascontiguousarray(array.T)
-
-
-def _check_count(name: str, value: int, most: int) -> None:
-    if not isinstance(value, Integral) or not 1 <= value <= most:
-        raise InputError(f"{name} is {value!r}, allowed is a whole number from 1 to {most}")

@@ -9,18 +9,17 @@ IEEE Sensors J. 2020); the algorithms are those of `kernels.robust_variation` an
 
 from collections.abc import Callable
 from itertools import pairwise
-from numbers import Integral
-from reprlib import repr as shortened
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from design.arguments import instance, real, shown, whole
 from design.errors import InputError
 from design.threads import in_chunks
 
 from .kernels import clips, median, robust_variation, square_variation
-from .limits import numbers
+from .limits import MAX_S, numbers, refuse_beyond
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -29,6 +28,8 @@ Fidelity = Literal["robust", "squares"]
 KERNELS = {"robust": robust_variation, "squares": square_variation}
 GREATEST = 1e100
 """Greatest amount of a reading and of lam: beyond, sums may overflow."""
+WIDEST = 2**31 - 1
+"""Greatest width of a running median: no recording is longer."""
 NOBODY = np.empty(0)
 """In place of the causal values of a forward pass where nobody asks for them."""
 
@@ -45,16 +46,17 @@ def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
         (K,) ascending, for `starts` of the filters.
 
     Raises:
-        InputError: times that are not finite or do not ascend, or an interval that is not above 0.
+        InputError: times that are not finite, beyond 1e10 s or do not ascend, or an interval that is not above 0.
     """
     times = numbers(times_s, np.float64, "times_s")
     if times.ndim != 1:
         raise InputError(f"times_s have shape {times.shape}, expected (R,)")
-    if not np.isfinite(times).all() or (np.diff(times) < 0).any():
-        raise InputError(f"times_s are {shortened(times_s)}, expected finite numbers that ascend")
-    if not longest_s > 0:
+    refuse_beyond("times_s", times[:, None], MAX_S, "s")
+    if (np.diff(times) < 0).any():
+        raise InputError(f"times_s are {shown(times_s)}, expected finite numbers that ascend")
+    if not (longest := real("longest_s", longest_s, 0.0, 1e300)):
         raise InputError(f"longest_s is {longest_s!r}, allowed is a number above 0")
-    return np.flatnonzero(np.diff(times) > longest_s) + 1
+    return np.flatnonzero(np.diff(times) > longest) + 1
 
 
 def total_variation(
@@ -85,6 +87,7 @@ def total_variation(
             as above.
     """
     check_variation(lam, fidelity)
+    instance("causal", causal, bool)
     kernel = KERNELS[fidelity]
 
     def denoise(stretch: Array) -> Array:
@@ -120,7 +123,7 @@ def running_median(readings: ArrayLike, width: int, starts: ArrayLike = (), caus
 def median_of(stretch: Array, before: int, after: int) -> Array:
     """(R,) medians of the readings i - before .. i + after that there are in a stretch (R,)."""
     out = np.empty(len(stretch))
-    median.running_median(stretch, before, after, out)
+    median.running_median(stretch, min(before, len(stretch)), min(after, len(stretch)), out)
     return out
 
 
@@ -163,15 +166,15 @@ def checked_readings(readings: ArrayLike) -> Array:
 def _checked_starts(starts: ArrayLike, readings: int) -> list[int]:
     array = numbers(starts, np.int64, "starts")
     if array.ndim != 1 or (np.diff(array) <= 0).any() or (len(array) and not 0 <= array[0] <= array[-1] < readings):
-        raise InputError(f"starts are {shortened(starts)}, allowed are ascending indices of {readings} readings")
+        raise InputError(f"starts are {shown(starts)}, allowed are ascending indices of {readings} readings")
     return array.tolist()
 
 
 def check_variation(lam: float, fidelity: str) -> None:
     """Raise InputError unless `total_variation` takes these."""
-    if fidelity not in KERNELS:
-        raise InputError(f"fidelity is {fidelity!r}, allowed is {' or '.join(KERNELS)}")
-    if not 0 < lam <= GREATEST:
+    if not isinstance(fidelity, str) or fidelity not in KERNELS:
+        raise InputError(f"fidelity is {shown(fidelity)}, allowed is {' or '.join(KERNELS)}")
+    if not real("lam", lam, 0.0, GREATEST):
         raise InputError(f"lam is {lam!r}, allowed is a number above 0, up to {GREATEST:g}")
 
 
@@ -181,6 +184,6 @@ def window_reach(width: int, causal: bool) -> tuple[int, int]:
     Raises:
         InputError: a width that is no odd whole number above 0.
     """
-    if not isinstance(width, Integral) or width < 1 or width % 2 != 1:
+    if (width := whole("width", width, 1, WIDEST)) % 2 != 1:
         raise InputError(f"width is {width!r}, allowed is an odd whole number above 0")
-    return (width - 1, 0) if causal else (width // 2, width // 2)
+    return (width - 1, 0) if instance("causal", causal, bool) else (width // 2, width // 2)

@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.errors import InputError
-from design.files import atomic
+from design.files import atomic, require_file
+from design.output import writing
 
-from .limits import MAX_VALUES
-from .output import writing
+from .limits import MAX_BYTES, MAX_VALUES
 from .recording import Recording
 
 FORMAT = "padforge-hdf5/1"
+
+PACKED = 1040
+"""Bytes that a byte of a file may stand for, at most: gzip packs no closer than 1032 to 1."""
 
 _ARRAYS = {
     "times_s": "times_s",
@@ -56,8 +59,7 @@ def import_hdf5(path: str | Path) -> Recording:
     import h5py
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}, expected an HDF5 file")
+    require_file(path, MAX_BYTES)
     try:
         with h5py.File(path, "r") as file:
             kind = file.attrs.get("format")
@@ -65,9 +67,9 @@ def import_hdf5(path: str | Path) -> Recording:
                 raise InputError(f"{path}: format is {kind!r}, expected {FORMAT!r}")
             arrays: dict[str, Any] = {attribute: _values(file, name) for name, attribute in _ARRAYS.items()}
             source = json.loads(str(file.attrs["source"]))
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except Exception as error:  # h5py raises whatever a torn file leads it to
         raise InputError(f"{path}: not a recording that can be read ({' '.join(str(error).split())})") from error
     try:
         return Recording(**arrays, source=source)
@@ -79,7 +81,7 @@ def _values(file: Any, name: str) -> NDArray[Any]:
     """The values of a dataset, which may claim more than any memory holds, since what was never written takes no room.
 
     Raises:
-        ValueError: there is no such dataset, or it is too large.
+        ValueError: there is no such dataset, it is too large, or larger than what it was packed from.
     """
     import h5py
 
@@ -88,4 +90,8 @@ def _values(file: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} is no dataset")
     if dataset.size is None or dataset.size > MAX_VALUES:
         raise ValueError(f"{name} holds {dataset.size} values, allowed are {MAX_VALUES}")
+    if dataset.nbytes > PACKED * dataset.id.get_storage_size():
+        raise ValueError(
+            f"{name} claims {dataset.nbytes} bytes of {dataset.dtype} in {dataset.id.get_storage_size()} of the file"
+        )
     return np.asarray(dataset)

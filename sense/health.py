@@ -11,18 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from design.arguments import instance, real
 from design.errors import InputError
-from design.files import atomic, read_json
+from design.files import atomic, read_bytes, read_json
+from design.output import writing
 from design.settings import validated
 
+from .document import LEAST_SPREAD_V
 from .evidence import HYPOTHESES, Evidence, Tail
 from .health_document import FORMAT, LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, HealthDocument, refuse_unsound
-from .limits import MAX_FIBRES
-from .output import writing
+from .limits import numbers, stream_of
 from .residuals import MEMBERS, REST, Shapes, Weights, expected, member, shapes_of, traces_of, train
 
 RECORDED, FELT = "health", "health_live"
@@ -103,9 +105,10 @@ class HealthModel:
             InputError: shapes, indices or the rate of false alarms out of range, fewer than 300 presses that are
                 whole, or no living fibre.
         """
-        if not 0 < false_alarms <= MAX_FALSE_ALARMS:
+        if not (false_alarms := real("false alarms a press", false_alarms, 0.0, MAX_FALSE_ALARMS)) > 0:
             raise InputError(f"false alarms a press are {false_alarms}, allowed is above 0 to {MAX_FALSE_ALARMS}")
-        check_presses(readings, times_s, begun, lifted)
+        instance("rng", rng, np.random.Generator)
+        readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
         dead = _dead(readings)
         living = np.setdiff1d(np.arange(readings.shape[1]), dead)
         if len(living) == 0:
@@ -201,10 +204,7 @@ class HealthModel:
         """
         path, weights = files_of(folder, name)
         document = validated(HealthDocument, read_json(path, FORMAT), f"{path}:")
-        try:
-            content = weights.read_bytes()
-        except OSError as error:
-            raise InputError(f"{weights}: cannot be read ({error.strerror})") from error
+        content = read_bytes(weights)
         if hashlib.sha256(content).hexdigest() != document.weights_sha256:
             raise InputError(f"{weights}: not the weights that {path.name} was written with; learn health again")
         dead = sorted(set(document.dead))
@@ -246,12 +246,18 @@ def files_of(folder: str | Path, name: str) -> tuple[Path, Path]:
     return Path(folder) / f"{name}.json", Path(folder) / f"{name}.safetensors"
 
 
-def check_presses(readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> None:
-    """Raise InputError unless these are readings (R, C), their times (R,) and presses (Q,) one after another."""
-    if readings.ndim != 2 or len(readings) < 2 or not 1 <= readings.shape[1] <= MAX_FIBRES:
-        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
-    if times_s.shape != (len(readings),) or not np.median(np.diff(times_s)) > 0:
-        raise InputError(f"times have shape {times_s.shape}, expected ({len(readings)},) that ascend")
+def checked_presses(
+    readings: ArrayLike, times_s: ArrayLike, begun: ArrayLike, lifted: ArrayLike
+) -> tuple[Array, Array, Indices, Indices]:
+    """Readings (R, C), R >= 2, their times (R,), and the presses (Q,) one after another, as plain arrays.
+
+    Raises:
+        InputError: they are something else.
+    """
+    times_s, readings = stream_of(times_s, readings)
+    begun, lifted = (numbers(edges, np.int64, "presses", copy=False) for edges in (begun, lifted))
+    if len(readings) < 2:
+        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2")
     if begun.ndim != 1 or begun.shape != lifted.shape or len(begun) == 0:
         raise InputError(f"presses have {begun.size} begins and {lifted.size} ends, expected as many, at least one")
     ends = np.stack([begun, lifted], axis=1).ravel()
@@ -261,6 +267,7 @@ def check_presses(readings: Array, times_s: Array, begun: Indices, lifted: Indic
             f"presses begin at {begun[0]} and end at {lifted[-1]} of {len(readings)} readings, expected a reading "
             "before the first, and each to end before the next begins"
         )
+    return readings, times_s, begun, lifted
 
 
 def _without(ratios: tuple[Array, Array], lost: Indices) -> tuple[Array, Array]:
@@ -282,4 +289,4 @@ def _dead(readings: Array) -> Indices:
     at_end = np.maximum((spread == low).mean(axis=0), (spread == high).mean(axis=0))
     # Where there is no noise every fibre rests at the end of its range.
     saturated = (at_end > 0.5) & (np.median(at_end) <= 0.5)
-    return np.flatnonzero(missing | (low == high) | saturated)
+    return np.flatnonzero(missing | (high - low < LEAST_SPREAD_V) | saturated)

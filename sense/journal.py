@@ -7,6 +7,7 @@ from reprlib import repr as shortened
 from typing import Any
 
 from design.errors import InputError
+from design.files import read_bytes
 
 from .limits import MAX_INDEX, MAX_MM
 
@@ -20,9 +21,7 @@ def read_journal(path: Path) -> dict[int, tuple[float, float, int, int]]:
         InputError: the file is missing, or a line other than a torn last one is no entry.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        text = read_bytes(path).decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: no journal ({error})") from error
     begun: dict[int, tuple[float, float, int]] = {}

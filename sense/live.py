@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import instance, real, shown, whole
 from design.errors import InputError
 
 from .health import HealthModel
+from .limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, stream_of
 from .live_press import DONE, NEEDS, Press, Ring
 from .localizer import RATE_TOLERANCE, Localizer
 from .monitor import Finding, Monitor
@@ -83,13 +85,17 @@ class Live:
             health: of that pad; without it no fibre is found bad.
 
         Raises:
-            InputError: one of them was learnt from other fibres, or at another rate.
+            InputError: there is none, or one was learnt from other fibres, or at another rate.
         """
-        for model in (*localizers, *([] if health is None else [health])):
+        fibres, rate_hz = whole("fibres", fibres, 1, MAX_FIBRES), real("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
+        if not isinstance(localizers, Sequence) or not localizers:
+            raise InputError(f"localizers are {shown(localizers)}, expected at least one")
+        self._monitor = None if health is None else Monitor(health)
+        models = [instance("localizers", each, Localizer) for each in localizers]
+        for model in (*models, *([] if health is None else [health])):
             _refuse_other(model, fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda each: NEEDS[each.features][::-1])
         self._usual = _usual(self._localizers[-1])
-        self._monitor = None if health is None else Monitor(health)
         self._finder = Finder(fibres)
         self._ring = Ring(1 + fibres)
         self._press: Press | None = None
@@ -115,9 +121,15 @@ class Live:
 
         Returns:
             Estimates and findings, in the order in which they were made.
+
+        Raises:
+            InputError: as `limits.stream_of`, or times before those that were fed last.
         """
         events: list[Event] = []
-        for row in np.column_stack([times_s, readings]):
+        times, rows = stream_of(times_s, readings, len(self._usual))
+        if len(times) and self._ring.end and not times[0] > self._ring.rows(self._ring.end - 1, self._ring.end)[0, 0]:
+            raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
+        for row in np.column_stack([times, rows]):
             self._ring.append(row)
             for change in self._finder.feed(row[:1], row[None, 1:]):
                 if change.down:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design import Contact, Morphology
+from design.arguments import real
 from design.errors import InputError
 from design.files import read_json
 from design.settings import validated
@@ -64,7 +65,8 @@ def connected(converter: Converter, rate_hz: float) -> Source:
 
 
 def replayed(recording: Recording, speed: float) -> Source:
-    """The readings of a recording, `speed` times as fast as they were taken."""
+    """The readings of a recording, `speed` times as fast as they were taken; InputError for a speed that is none."""
+    speed = real("speed", speed, 1e-9, np.inf)
     due_s = (recording.times_s - recording.times_s[0]) / speed
 
     def blocks() -> Iterator[Block]:

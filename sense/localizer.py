@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from design.arguments import instance, shown
 from design.errors import InputError
-from design.files import atomic, read_json
+from design.files import atomic, read_bytes, read_json
+from design.output import writing
 
 from .document import FORMAT, read_document
 from .network import Floats, Weights, forward, masked, pooled, refuse_unsound
-from .output import writing
 from .presses import SIZES, Inputs, press_inputs
 from .recording import Recording
 from .scaling import Scaled, Scaling
@@ -97,7 +98,7 @@ class Localizer:
         Raises:
             InputError: the recording has other fibres or another rate than the one that was learnt from.
         """
-        if recording.fibres != self.fibres:
+        if instance("recording", recording, Recording).fibres != self.fibres:
             raise InputError(f"recording has {recording.fibres} fibres, the localizer was trained on {self.fibres}")
         if abs(recording.rate_hz / self.rate_hz - 1) > RATE_TOLERANCE:
             raise InputError(
@@ -138,9 +139,13 @@ class Localizer:
 
     def _alive(self, lost: ArrayLike) -> NDArray[np.bool_]:
         alive = np.ones(self.fibres, dtype=bool)
-        for fibre in np.asarray(lost).ravel().tolist():
+        try:
+            fibres = np.asarray(lost).ravel().tolist()
+        except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
+            raise InputError(f"lost fibres are {shown(lost)}, expected their indices") from error
+        for fibre in fibres:
             if type(fibre) is not int or not 0 <= fibre < self.fibres:
-                raise InputError(f"lost fibre {fibre}: no such fibre, allowed are 0 to {self.fibres - 1}")
+                raise InputError(f"lost fibre {shown(fibre)}: no such fibre, allowed are 0 to {self.fibres - 1}")
             alive[fibre] = False
         if not alive.any():
             raise InputError(f"all {self.fibres} fibres are lost, at least one must be left")
@@ -201,10 +206,7 @@ class Localizer:
         folder = Path(folder)
         document = read_document(read_json(folder / DOCUMENT, FORMAT), str(folder / DOCUMENT))
         path = folder / WEIGHTS
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        content = read_bytes(path)
         if hashlib.sha256(content).hexdigest() != document.weights_sha256:
             raise InputError(f"{path}: not the weights that {DOCUMENT} was written with; calibrate again")
         scaling = Scaling(

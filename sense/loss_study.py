@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import instance, path, shown, whole
 from design.checkpoint import Checkpoints, State
 from design.errors import InputError
 from design.files import provenance
@@ -23,7 +24,8 @@ from design.losses import lost_subsets
 
 from . import settings
 from .calibration import learn, split_presses
-from .evaluation import by_place, errors_by_loss
+from .evaluation import by_place, errors_by_loss, held_back
+from .limits import MAX_FIBRES
 from .localizer import Found, Localizer
 from .recording import Recording
 
@@ -67,7 +69,11 @@ def robustness(
     """
     if localizer is None and not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
-    options = options or settings.Localizer()
+    instance("recording", recording, Recording)
+    if localizer is not None:
+        instance("localizer", localizer, Localizer)
+    keep_in = None if keep_in is None else path("keep_in", keep_in)
+    options, lost = settings.options_or_defaults(options), whole("lost", lost, 0, MAX_FIBRES)
     training, test = _presses(recording, localizer, options)
     levels = range(min(lost, recording.fibres - 1) + 1)
     places_mm = recording.presses_mm[test]
@@ -110,7 +116,7 @@ def _presses(recording: Recording, localizer: Localizer | None, options: setting
     if localizer is not None and digest in localizer.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     if localizer is not None and digest == localizer.learnt_from:
-        test = np.array(localizer.test, dtype=np.int64)
+        test = held_back(localizer, recording)
         return np.setdiff1d(known, test), test
     rng = np.random.default_rng(options.seed)
     training, test = split_presses(len(known), options.split, options.test_share, rng)
@@ -129,7 +135,7 @@ def _retrained(
     """What the network of each set of lost fibres finds for the test presses; finished ones are not made again."""
     subsets = [subset for level in levels for subset in lost_subsets(recording.fibres, level)]
     states = kept.begin(resume=True) if kept else {}
-    found = {lost: Found(**states[_number(lost)]) for lost in subsets if _number(lost) in states}
+    found = {lost: _found_of(states[_number(lost)], len(test)) for lost in subsets if _number(lost) in states}
     progress(len(found), len(subsets))
     options = options.model_copy(update={"method": "published", "features": "published"})
     from design.threads import one_torch_thread
@@ -172,6 +178,17 @@ def _state(found: Found) -> State:
         "r50_mm": found.r50_mm,
         "r90_mm": found.r90_mm,
     }
+
+
+def _found_of(state: State, presses: int) -> Found:
+    """What a network that was done found for so many presses; InputError where its file holds something else."""
+    shapes = {"places_mm": (presses, 2), "sd_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
+    arrays = {name: (array.shape, array.dtype.kind) for name, array in state.items()}
+    if arrays != {name: (shape, "f") for name, shape in shapes.items()}:
+        raise InputError(f"unfinished networks hold {shown(arrays)}, expected {shapes}; remove them to start anew")
+    if not all(np.isfinite(array).all() for array in state.values()):
+        raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
+    return Found(**state)
 
 
 def lines(document: dict[str, Any]) -> list[str]:

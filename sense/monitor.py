@@ -9,10 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import instance, whole
 from design.errors import InputError
 
 from .evidence import HYPOTHESES, MOST, climb, noise_of
-from .health import SETTLED, HealthModel, check_presses
+from .health import SETTLED, HealthModel, checked_presses
+from .limits import MAX_VOLTS, numbers, refuse_beyond
 from .residuals import RELEASED, REST, Floats, History, expected, trace
 
 MISSING = 20
@@ -91,7 +93,7 @@ class Monitor:
     """
 
     def __init__(self, model: HealthModel) -> None:
-        self.model = model
+        self.model = instance("model", model, HealthModel)
         self.presses = 0
         fibres = len(model.living)
         self._lost = np.zeros(fibres, dtype=bool)
@@ -120,12 +122,12 @@ class Monitor:
         Raises:
             InputError: other fibres than health was learnt from, or indices out of range.
         """
+        readings = numbers(readings, np.float64, "readings", copy=False)
         if readings.ndim != 2 or readings.shape[1] != self.model.fibres:
             raise InputError(f"readings have shape {readings.shape}, expected (R, {self.model.fibres})")
-        if not 1 <= begun < lifted <= len(readings):
-            raise InputError(
-                f"press begins at {begun} and is lifted at {lifted}, expected 1 <= begin < lift <= {len(readings)}"
-            )
+        refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
+        begun = whole("begun", begun, 1, len(readings) - 1)
+        lifted = whole("lifted", lifted, begun + 1, len(readings))
         traces = trace(readings[:, self.model.living], begun, lifted, 0, len(readings))
         level, settled = self._history.level, self._history.seen >= SETTLED
         inputs, targets = self.model.shapes.scaled(*self.model.shapes.advance(traces, self._history))
@@ -271,8 +273,8 @@ def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices,
     Raises:
         InputError: other fibres or another rate than health was learnt from, or presses out of order.
     """
-    check_presses(readings, times_s, begun, lifted)
-    model.refuse_other(readings, times_s)
+    readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
+    instance("model", model, HealthModel).refuse_other(readings, times_s)
     monitor = Monitor(model)
     lows, highs = np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
     findings: list[Finding] = []

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from design.files import write_text
+from design.output import writing
 
 from .localizer import Found
-from .output import writing
 
 COLUMNS = ("press", "x_mm", "y_mm", "sd_x_mm", "sd_y_mm", "r50_mm", "r90_mm")
 """Press, counted from 0; place from the pad's centre; standard deviations; radii that hold 50 % and 90 % of presses."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import instance, whole
 from design.errors import InputError
 from design.files import provenance
 from design.losses import lost_subsets
@@ -64,7 +65,9 @@ def recalibrate(
     Raises:
         InputError: too few presses of known place, or a recording that does not suit the localizer.
     """
-    known = np.flatnonzero(recording.known)
+    instance("localizer", localizer, Localizer)
+    known = np.flatnonzero(instance("recording", recording, Recording).known)
+    seed = whole("seed", seed, 0, 2**32 - 1)
     if len(known) < LEAST_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known place, expected at least {LEAST_PRESSES}")
     rng = np.random.default_rng(seed)

@@ -12,22 +12,23 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, TextIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from design.arguments import shown, whole
 from design.errors import InputError
 from design.files import read_json, write_json
+from design.output import lock, refuse_unwritable, writing
 
 from .journal import cut_torn_line, read_journal
-from .limits import MAX_FIBRES
-from .output import lock, refuse_unwritable, writing
+from .limits import MAX_FIBRES, MAX_INDEX, MAX_MM, numbers
 from .rig.devices import STATE_COLUMNS
-from .stream import BlockWriter
+from .stream import BlockWriter, write_at
 
 FORMAT = "padforge-recording/1"
-START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
 
 
 class Recorder:
@@ -41,27 +42,36 @@ class Recorder:
         last_s: time of the last reading or state, s; -inf where there is none.
 
     Raises:
-        InputError: `path` exists and is not an empty directory, or cannot be written.
+        InputError: `path` exists and is not an empty directory, or cannot be written, or too few or many fibres.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
+        fibres = whole("fibres", fibres, 1, MAX_FIBRES)
         refuse_existing(path)
         document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-            try:
-                self._stream: BinaryIO = (path / READINGS).open("xb")  # of two that start at once, one makes this file
+            try:  # of two that start at once, one makes this file
+                self._stream: BinaryIO = (path / READINGS).open("xb", buffering=0)
             except FileExistsError:
                 refuse_existing(path)
                 raise
-            write_json(path / START, document)
-            self._journal: TextIO = (path / JOURNAL).open("x", encoding="utf-8")
-            lock(self._journal, _busy(path))
-        self._begin_with(path, BlockWriter(self._stream, fibres))
+            try:
+                write_json(path / START, document)
+                self._journal: BinaryIO = (path / JOURNAL).open("xb", buffering=0)
+                lock(self._journal, _busy(path))
+            except BaseException:
+                self._stream.close()
+                for name in (JOURNAL, START, READINGS):  # a part of a recording would be in the way of another try
+                    (path / name).unlink(missing_ok=True)
+                raise
+        self._begin_with(path, BlockWriter(self._stream, fibres), 0)
 
-    def _begin_with(self, path: Path, blocks: BlockWriter) -> None:
+    def _begin_with(self, path: Path, blocks: BlockWriter, noted: int) -> None:
         self._path = path
         self._blocks = blocks
+        self._fibres = blocks.fibres
+        self._noted = noted  # bytes of the journal
         self._states: tuple[BlockWriter, BinaryIO] | None = None
         self._lines: list[str] = []
         self._press = 0
@@ -81,7 +91,7 @@ class Recorder:
         done = read_journal(path / JOURNAL)
         self = cls.__new__(cls)
         with writing(path):
-            self._journal = (path / JOURNAL).open("a", encoding="utf-8")
+            self._journal = (path / JOURNAL).open("r+b", buffering=0)
             try:
                 lock(self._journal, _busy(path))
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
@@ -89,7 +99,7 @@ class Recorder:
                 self._journal.close()
                 raise
             cut_torn_line(path / JOURNAL)
-            self._begin_with(path, blocks)
+            self._begin_with(path, blocks, (path / JOURNAL).stat().st_size)
             self._note_time(rows)
             if (path / STATES).exists():
                 states, file, state_rows = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
@@ -106,8 +116,19 @@ class Recorder:
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add (n,) times in s and (n, C) volts."""
-        rows = np.column_stack([np.asarray(times_s, dtype=np.float64), readings])
+        """Add (n,) times in s and (n, C) volts.
+
+        Raises:
+            InputError: shapes that do not fit, or times that are not finite.
+            OSError: the disk is full or gone; then nothing was added.
+        """
+        times, volts = numbers(times_s, np.float64, "times"), numbers(readings, np.float64, "readings")
+        if times.ndim != 1 or volts.shape != (len(times), self._fibres) or not np.isfinite(times).all():
+            raise InputError(
+                f"times have shape {times.shape} and readings {volts.shape}, expected (n,) finite numbers and "
+                f"(n, {self._fibres})"
+            )
+        rows = np.column_stack([times, volts])
         self._blocks.append(rows)
         self._note_time(rows)
         self.readings += len(rows)
@@ -115,7 +136,7 @@ class Recorder:
     def append_states(self, rows: NDArray[np.float64]) -> None:
         """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
         if self._states is None:
-            file = (self._path / STATES).open("xb")
+            file = (self._path / STATES).open("xb", buffering=0)
             self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
         self._states[0].append(rows)
         self._note_time(rows)
@@ -131,13 +152,28 @@ class Recorder:
             place_mm: NaN where it is not known.
             press: its number, by default one more than that of the last.
             more: what else is known of it, as JSON.
+
+        Raises:
+            InputError: a place, index or number that no press has, or what JSON cannot hold.
         """
-        self._press, self._down = self._press if press is None else press, True
-        x, y = (None if np.isnan(value) else value for value in np.asarray(place_mm, dtype=np.float64).tolist())
-        self._note({"event": "begun", "press": self._press, "reading": reading, "x_mm": x, "y_mm": y, **more})
+        place = numbers(place_mm, np.float64, "place")
+        if place.shape != (2,) or not (np.isnan(place).all() or (np.abs(place) <= MAX_MM).all()):
+            raise InputError(f"place is {shown(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
+        number = self._press if press is None else whole("press", press, 0, MAX_INDEX)
+        reading = whole("reading", reading, 0, MAX_INDEX)
+        x, y = (None if np.isnan(value) else value for value in place.tolist())
+        self._note({"event": "begun", "press": number, "reading": reading, "x_mm": x, "y_mm": y, **more})
+        self._press, self._down = number, True
 
     def finish(self, reading: int, **more: Any) -> None:
-        """Note that the probe is sent up; `reading` is the index of the reading that follows."""
+        """Note that the probe is sent up; `reading` is the index of the reading that follows.
+
+        Raises:
+            InputError: no press was begun, an index that no reading has, or `more` is what JSON cannot hold.
+        """
+        if not self._down:
+            raise InputError(f"press {self._press} was not begun, so it cannot be finished")
+        reading = whole("reading", reading, 0, MAX_INDEX)
         self._note({"event": "done", "press": self._press, "reading": reading, **more})
         self.done.add(self._press)
         self._press, self._down = self._press + 1, False
@@ -150,7 +186,10 @@ class Recorder:
         self._note({"event": "aborted", "press": self._press, "reading": self.readings, "reason": reason})
 
     def _note(self, event: Mapping[str, Any]) -> None:
-        self._lines.append(json.dumps(event, allow_nan=False) + "\n")
+        try:
+            self._lines.append(json.dumps(event, allow_nan=False) + "\n")
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputError(f"press {event['press']}: {shown(event)}, expected what JSON can hold") from error
 
     def sync(self) -> None:
         """Put all so far on the disk: the readings and states first, then what the journal says of them."""
@@ -159,9 +198,10 @@ class Recorder:
         if self._states is not None:
             self._states[0].flush()
             os.fsync(self._states[1].fileno())
-        self._journal.writelines(self._lines)
+        lines = "".join(self._lines).encode()
+        write_at(self._journal, self._noted, lines)
+        self._noted += len(lines)
         self._lines.clear()
-        self._journal.flush()
         os.fsync(self._journal.fileno())
 
     def __enter__(self) -> "Recorder":

@@ -7,18 +7,28 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import shown
 from design.errors import InputError
 from design.files import read_json
+from design.output import writing
 
 from .journal import read_journal
-from .limits import MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_S, MAX_VOLTS, MIN_RATE_HZ, numbers, refuse_beyond
-from .output import writing
+from .limits import (
+    MAX_FIBRES,
+    MAX_MM,
+    MAX_RATE_HZ,
+    MAX_S,
+    MAX_VOLTS,
+    MIN_RATE_HZ,
+    numbers,
+    refuse_beyond,
+    refuse_descent,
+)
 from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
 from .stream import read_blocks
 
@@ -145,7 +155,7 @@ class Recording:
         refuse_existing(path)
         unfinished = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
         try:
-            with Recorder(unfinished, self.fibres, self.source, provenance) as recorder:
+            with writing(path), Recorder(unfinished, self.fibres, self.source, provenance) as recorder:
                 recorder.append(self.times_s, self.readings)
                 for place, begun, lifted in zip(self.presses_mm, self.begun, self.lifted, strict=True):
                     recorder.begin(place, int(begun))
@@ -169,13 +179,11 @@ def _put(unfinished: Path, path: Path) -> None:
 
 def _validate(recording: Recording) -> None:
     if not isinstance(recording.source, Mapping):
-        raise InputError(f"source is {shortened(recording.source)}, expected a mapping")
+        raise InputError(f"source is {shown(recording.source)}, expected a mapping")
     try:
         json.dumps(dict(recording.source), allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"source is {shortened(dict(recording.source))}, expected what JSON can hold ({error})"
-        ) from error
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"source is {shown(dict(recording.source))}, expected what JSON can hold ({error})") from error
     readings, presses = recording.readings, recording.presses_mm
     if readings.ndim != 2 or not 1 <= readings.shape[1] <= MAX_FIBRES or len(readings) < 2:
         raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
@@ -193,9 +201,7 @@ def _validate(recording: Recording) -> None:
     half = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
     if half.any():
         raise InputError(f"press {int(np.argmax(half))} has one of x and y, expected both or neither")
-    if (np.diff(recording.times_s) <= 0).any():
-        row = int(np.argmax(np.diff(recording.times_s) <= 0)) + 1
-        raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
+    refuse_descent(recording.times_s)
     if not MIN_RATE_HZ <= recording.rate_hz <= MAX_RATE_HZ:
         raise InputError(
             f"times give {recording.rate_hz:g} readings a second, allowed is {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"

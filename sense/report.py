@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from design.errors import InputError
+from design.files import read_bytes
 from design.page import Section, beside, figures, folded, heading, paragraph, table
 
 from .limits import MAX_FIBRES
@@ -122,8 +123,9 @@ def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     """
     found = sorted([*folder.glob("[!.]*.json"), *(folder / "studies").glob("[!.]*.json")])
     for path in filter(Path.is_file, found):
+        content = read_bytes(path)
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
+            document = json.loads(content.decode())
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a JSON file ({error})") from error
         if isinstance(document, dict) and str(document.get("format")).startswith(STUDY):

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from .document import LEAST_SPREAD_V
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -141,7 +143,7 @@ def shapes_of(traces: Array) -> tuple[Shapes, Floats, Array]:
     own, spread = np.sqrt((inputs**2).mean(axis=0)), np.sqrt((targets**2).mean(axis=0))
     # Small components keep a part of their smallness, and so of their noise.
     size = np.sqrt(own * own.max(axis=1, keepdims=True))
-    shapes = Shapes(basis, np.where(size > 0, size, 1.0), np.where(spread > 0, spread, 1.0))
+    shapes = Shapes(basis, *(np.where(each > LEAST_SPREAD_V, each, 1.0) for each in (size, spread)))
     return shapes, *shapes.scaled(inputs, targets)
 
 

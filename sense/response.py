@@ -23,6 +23,7 @@ RIDGE_PLACE, RIDGE_HISTORY = 1.0, 3.0
 """Penalties on the squares of the weights: of bumps, and of history in units of its spread."""
 STEPS = 60
 """Cells along a side of the table the function is kept in."""
+_PART = 16_384
 
 
 @dataclass(frozen=True)
@@ -48,27 +49,36 @@ class Response:
         fibres, pasts = history.shape[1:]
         grid = np.linspace(-1, 1, STEPS + 1)
         at_table = bumps(np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2))
-        at_presses = bumps(places)
         usual = np.zeros((fibres, pasts))
         memory = np.zeros((fibres, pasts, windows.shape[2]))
         table = np.zeros((len(at_table), fibres, windows.shape[2]))
-        penalty = np.diag(np.repeat([RIDGE_PLACE, RIDGE_HISTORY], [at_presses.shape[1], pasts]))
+        penalty = np.diag(np.repeat([RIDGE_PLACE, RIDGE_HISTORY], [BUMPS**2, pasts]))
         for fibre in np.flatnonzero(alive.any(axis=0)):
             there = alive[:, fibre]
             past, answer = history[there, fibre], windows[there, fibre]
             usual[fibre] = past.mean(axis=0)
             spread = past.std(axis=0)
             past = np.divide(past - usual[fibre], spread, out=np.zeros_like(past), where=spread > LEAST_SPREAD_V)
-            known = np.hstack([at_presses[there], past])
-            weights = np.linalg.solve(known.T @ known + penalty, known.T @ answer)
+            own, both = _moments(places[there], past, answer)
+            weights = np.linalg.solve(own + penalty, both)
             memory[fibre] = np.divide(
                 weights[-pasts:].T if pasts else np.empty((windows.shape[2], 0)),
                 spread,
                 out=np.zeros((windows.shape[2], pasts)),
                 where=spread > LEAST_SPREAD_V,
             ).T
-            table[:, fibre] = at_table @ weights[: at_presses.shape[1]]
+            table[:, fibre] = at_table @ weights[: BUMPS**2]
         return cls(table.reshape(STEPS + 1, STEPS + 1, fibres, -1), memory, usual)
+
+
+def _moments(places: Array, past: Array, answer: Array) -> tuple[Array, Array]:
+    """K' K and K' answer of the bumps and history K of presses, a part at a time: they take kilobytes a press."""
+    own = both = np.zeros(())
+    for first in range(0, len(places), _PART):
+        part = slice(first, first + _PART)
+        known = np.hstack([bumps(places[part]), past[part]])
+        own, both = own + known.T @ known, both + known.T @ answer[part]
+    return own, both
 
 
 def settled(windows: Array, history: Array, memory: Array, usual: Array) -> Array:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from design.arguments import instance
 from design.errors import InputError
 from design.files import provenance
 
@@ -58,7 +59,8 @@ def size_curve(
     Raises:
         InputError: too few presses for a curve.
     """
-    options = options or settings.Localizer()
+    instance("recording", recording, Recording)
+    options = settings.options_or_defaults(options)
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.known)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))

@@ -6,6 +6,8 @@ CRC-32 covers all of the block but itself. A writer that dies leaves at worst a 
 off; damage before an intact block cannot come from that and is an error.
 """
 
+import re
+import struct
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -14,12 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.errors import InputError
+from design.files import read_bytes
+
+from .limits import MAX_BYTES
 
 Array = NDArray[np.float64]
 
 _MAGIC = b"PFB1"
 _UNIT = 256
-_CRC_OFFSET = 20
+_COUNT_OFFSET, _CRC_OFFSET = 16, 20
+_COUNT = struct.Struct("<I")
 _HEADER = 24
 
 
@@ -32,18 +38,22 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
         {
             "names": ["magic", "sequence", "first", "count", "crc", "rows"],
             "formats": ["S4", "<u4", "<u8", "<u4", "<u4", ("<f8", (rows, 1 + fibres))],
-            "offsets": [0, 4, 8, 16, _CRC_OFFSET, _HEADER],
+            "offsets": [0, 4, 8, _COUNT_OFFSET, _CRC_OFFSET, _HEADER],
             "itemsize": size,
         }
     )
 
 
 class BlockWriter:
-    """Appends rows to an open stream. Rows reach the file a full block at a time, or at `flush`."""
+    """Appends rows to an open stream. Rows reach the file a full block at a time, or at `flush`.
+
+    A write that fails adds nothing, and the next one overwrites whatever it left.
+    """
 
     def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:
         """Append to `file`, which holds so many blocks and rows already."""
         self._file = file
+        self.fibres = fibres
         self._dtype = block_dtype(fibres)
         self._rows = self._dtype["rows"].shape[0]
         self._waiting = np.empty((0, 1 + fibres))
@@ -62,7 +72,7 @@ class BlockWriter:
         """
         rows, _ = read_blocks(path, fibres)
         dtype = block_dtype(fibres)
-        file = path.open("r+b")
+        file = path.open("r+b", buffering=0)
         blocks = int(np.argmin(np.append(_sound(_blocks(file.read(), dtype)), False)))
         file.seek(blocks * dtype.itemsize)
         file.truncate()
@@ -92,9 +102,17 @@ class BlockWriter:
         payload[: len(rows)] = rows
         blocks["rows"] = payload.reshape(blocks["rows"].shape)
         blocks["crc"] = _checksums(blocks)
-        self._file.write(blocks.tobytes())
+        write_at(self._file, self._sequence * self._dtype.itemsize, blocks.tobytes())
         self._sequence += len(blocks)
         self._first += len(rows)
+
+
+def write_at(file: BinaryIO, position: int, data: bytes) -> None:
+    """Write `data` from a position on, all of it; where that fails, doing it again sets right what is half there."""
+    file.seek(position)
+    left = memoryview(data)
+    while left:
+        left = left[file.write(left) :]
 
 
 def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
@@ -107,10 +125,7 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
         InputError: the file is missing, or a block is damaged although intact ones follow.
     """
     dtype = block_dtype(fibres)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    content = read_bytes(path, MAX_BYTES)
     blocks = _blocks(content, dtype)
     sound = _sound(blocks)
     end = len(blocks) if sound.all() else int(np.argmin(sound))
@@ -138,17 +153,21 @@ def _sound(blocks: NDArray[np.void]) -> NDArray[np.bool_]:
         & (blocks["crc"] == _checksums(blocks))
         & (blocks["sequence"] == np.arange(len(blocks)))
         & (blocks["first"] == np.cumsum(counts) - counts)
+        & (counts <= blocks.dtype["rows"].shape[0])
     )
 
 
 def _holds_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
     """Whether an intact block lies anywhere in `content`, at whatever offset."""
-    start = content.find(_MAGIC)
-    while 0 <= start <= len(content) - dtype.itemsize:
+    most = dtype["rows"].shape[0]
+    for found in re.finditer(re.escape(_MAGIC), content[: max(len(content) - dtype.itemsize + len(_MAGIC), 0)]):
+        start = found.start()
+        (count,) = _COUNT.unpack_from(content, start + _COUNT_OFFSET)
+        if count > most:  # told at once, where a file is full of magic words
+            continue
         block = np.frombuffer(content, dtype, count=1, offset=start)
         if block["crc"][0] == _checksums(block)[0]:
             return True
-        start = content.find(_MAGIC, start + 1)
     return False
 
 

@@ -1,9 +1,11 @@
 """Reading CSV files: a file that is none is one clear line."""
 
 import csv
+import io
 from pathlib import Path
 
 from design.errors import InputError
+from design.files import read_bytes
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
@@ -14,11 +16,10 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
     Raises:
         InputError: the file cannot be read, or is no CSV.
     """
+    content = read_bytes(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *lines = list(csv.reader(file)) or [[]]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        text = io.StringIO(content.decode("utf-8-sig"), newline="")
+        header, *lines = list(csv.reader(text)) or [[]]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: not a CSV file ({error})") from error
     while lines and not lines[-1]:

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
+from design.arguments import whole
 from design.errors import InputError
 
 from .kernels.levels import unknown
 from .kernels.touches import find
+from .limits import MAX_FIBRES, stream_of
 
 DOUBT, SURE = 1e-3, 1e-9
 """Chances that white noise leaves the levels for a look, and that it is taken for a change."""
@@ -62,13 +64,13 @@ class Finder:
         fibres: C, the number of fibres read.
 
     Raises:
-        InputError: no fibre.
+        InputError: no fibre, or too many.
     """
 
     def __init__(self, fibres: int) -> None:
-        if fibres < 1:
-            raise InputError(f"fibres is {fibres}, allowed is 1 or more")
+        fibres = whole("fibres", fibres, 1, MAX_FIBRES)
         self._fibres, self._pad = unknown(fibres)
+        self._last_s = -np.inf
         seen = np.arange(1, fibres + 1)
         self._doubt, self._sure = (np.append(0.0, chdtri(seen, chance)) for chance in (DOUBT, SURE))
 
@@ -76,30 +78,35 @@ class Finder:
         """Take (n,) times in s, ascending, and (n, C) volts, NaN where missing; what became of the pad meanwhile.
 
         Raises:
-            InputError: shapes that do not fit.
+            InputError: as `limits.stream_of`, or times before those that were fed last.
         """
-        times, rows = np.array(times_s, dtype=np.float64), np.array(readings, dtype=np.float64, order="C")
-        if rows.shape != (*times.shape, len(self._fibres)) or times.ndim != 1:
-            raise InputError(
-                f"times have shape {times.shape} and readings {rows.shape}, expected (n,) and (n, {len(self._fibres)})"
-            )
-        events = np.empty((2 * len(times), 2), np.int64)
-        count = find(self._fibres, self._pad, times, rows, self._doubt, self._sure, events)
+        times, rows = stream_of(times_s, readings, len(self._fibres))
+        if len(times) and not times[0] > self._last_s:
+            raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
+        return self.follow(times, rows)
+
+    def follow(self, times_s: Array, readings: Array) -> list[Event]:
+        """The same of arrays of float64 that were checked already."""
+        events = np.empty((2 * len(times_s), 2), np.int64)
+        rows = np.ascontiguousarray(readings)
+        self._last_s = times_s[-1] if len(times_s) else self._last_s
+        count = find(self._fibres, self._pad, times_s, rows, self._doubt, self._sure, events)
         return [Event(bool(down), reading) for down, reading in events[:count].tolist()]
 
 
-def find_presses(readings: Array, times_s: Array) -> Presses:
+def find_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
     """Presses in readings of a pad.
 
     Args:
         readings: (R, C) volts, NaN where missing. times_s: (R,) ascending, s.
 
     Raises:
-        InputError: as `Finder`.
+        InputError: as `limits.stream_of`.
     """
+    times_s, readings = stream_of(times_s, readings)
     finder = Finder(readings.shape[1])
     parts = (slice(first, first + _PART) for first in range(0, len(readings), _PART))
-    events = [event for part in parts for event in finder.feed(times_s[part], readings[part])]
+    events = [event for part in parts for event in finder.follow(times_s[part], readings[part])]
     touched = [event.reading for event in events if event.down]
     released = [event.reading for event in events if not event.down]
     released += [len(readings)] * (len(touched) - len(released))

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from design import profiling
+
 from . import settings
 from .network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Floats, Weights
 
@@ -161,7 +163,10 @@ class _Member:
                 step(look if number % look == 0 else number % look)
                 if failures == PATIENCE:
                     step(steps - number)
+                    profiling.looked_at("training steps", number, steps)
                     break
+        else:
+            profiling.looked_at("training steps", steps, steps)
         return {name: w.cpu().numpy() for name, w in best.items()}
 
     def _loss(self) -> Tensor:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.console import json_option, load_spec, progress, seed_option, show_result, spec_option
+from design.console import json_option, load_spec, profile_option, progress, seed_option, show_result, spec_option
 
 from .orders import Order, plan_of, recorder_of
 
@@ -44,6 +44,7 @@ drivers_option = click.option(
 @seed_option
 @spec_option
 @click.option("--out", type=_FOLDER, default="out/pad/recording", show_default=True, help="Folder of the recording.")
+@profile_option
 def record(
     rig: str,
     morphology: Path | None,
@@ -58,6 +59,9 @@ def record(
     out: Path,
 ) -> None:
     """Record presses on a pad.
+
+    \b
+    padforge sense record --morphology out/pad/morphology.json --presses 1500
 
     \b
     --rig simulated                     a simulated pad, at once
@@ -108,6 +112,7 @@ def run_recording(
 ) -> "Recording":
     """Record presses on the simulated rig with the settings of `spec` into the run directory `out`."""
     from design.files import provenance
+    from design.profiling import stage
     from design.settings import Contact
 
     from ..recorder import refuse_existing
@@ -116,7 +121,8 @@ def run_recording(
 
     refuse_existing(out)
     options = spec.section(Rig, **overrides)
-    recording = simulate(pad, options, spec.section(Contact))
+    with stage("simulate"):
+        recording = simulate(pad, options, spec.section(Contact))
     recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
     return recording
 
@@ -213,6 +219,9 @@ def _steering(order: Order, rig: "Rig", model: Path | None) -> Callable[["PressP
 @click.pass_context
 def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | None, as_json: bool) -> None:
     """Look the rig over before a long run; nothing moves. Exit 1 where something fails.
+
+    \b
+    padforge sense doctor --rig ur5
 
     Ports, versions, rates, latency, and every channel's rest and noise.
     """

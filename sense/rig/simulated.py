@@ -4,7 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design import Contact, Morphology, signals
+from design.arguments import MOST_VALUES, instance, whole
+from design.errors import InputError
 
+from ..limits import MAX_FIBRES
 from ..recording import Recording
 from ..settings import Rig
 from .pad_model import Cycle, read_pad
@@ -25,8 +28,20 @@ def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = 
 
     Returns:
         The recording, the same for the same arguments.
+
+    Raises:
+        InputError: more fibres or readings than a recording may hold.
     """
-    rig = rig or Rig()
+    instance("pad", pad, Morphology)
+    rig = instance("rig", Rig() if rig is None else rig, Rig)
+    contact = instance("contact", Contact() if contact is None else contact, Contact)
+    whole("fibres of the pad", 2 * pad.grid, 2, MAX_FIBRES)
+    values = rig.presses * rig.readings_per_press * 2 * pad.grid
+    if values > MOST_VALUES:
+        raise InputError(
+            f"[rig] presses is {rig.presses}: with {rig.readings_per_press} readings each of {2 * pad.grid} fibres "
+            f"{values} values, allowed are {MOST_VALUES}"
+        )
     rng = np.random.default_rng(rig.seed)
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     places_mm = random_places(pad, rig.presses, rng)
@@ -42,7 +57,7 @@ def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = 
         source={
             "kind": "simulated",
             "rig": rig.model_dump(mode="json"),
-            "contact": (contact or Contact()).model_dump(),
+            "contact": contact.model_dump(),
             "morphology": {"pitch_mm": pad.pitch_mm, "knots": pad.knots.tolist()},
         },
     )

@@ -47,5 +47,5 @@ def read(source: Callable[[int], bytes]) -> Iterator[Row | dict[str, Any]]:
                 yield Row._make(_STATE.unpack(head)[1:])
             else:
                 yield json.loads(source(_ANSWER.unpack(head)[1]))
-        except (struct.error, json.JSONDecodeError):
+        except (struct.error, ValueError, RecursionError):
             return

@@ -1,10 +1,12 @@
 """Reads every state of a UR controller's RTDE stream and tells when each was taken on the host's clock."""
 
+import math
 import socket
 import struct
 import time
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 from . import ur_frames as frames
 
@@ -78,22 +80,24 @@ class RtdeReader:
         self._stamp: float | None = None
         if self._ask(frames.VERSION, struct.pack(">H", frames.PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {frames.PROTOCOL}")
-        self.version: tuple[int, ...] = struct.unpack(">4I", self._ask(frames.CONTROLLER))
+        self.version: tuple[int, ...] = _unpacked(struct.Struct(">4I"), self._ask(frames.CONTROLLER))
         self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125
         names = ",".join(VARIABLES).encode()
         types = self._ask(frames.OUTPUTS, struct.pack(">d", self.rate_hz) + names)[1:].decode().split(",")
         if "NOT_FOUND" in types:
-            raise ValueError(f"the controller has no {VARIABLES[types.index('NOT_FOUND')]}")
+            raise ValueError(f"the controller has no {VARIABLES[types.index('NOT_FOUND') % len(VARIABLES)]}")
+        if types != [frames.type_of(name) for name in VARIABLES]:
+            raise ValueError(f"the controller would send {','.join(types)[:200]!r} for {','.join(VARIABLES)}")
         self._layout = frames.layout(types)
         self._ask(frames.START)
 
     def read(self, timeout_s: float) -> Reading:
-        """The next state; TimeoutError after `timeout_s` without a byte."""
+        """The next state; TimeoutError after `timeout_s` without a byte, ValueError for one that is none."""
         self._link.settimeout(timeout_s)
         while not self._waiting:
             self._receive()
         arrived, payload = self._waiting.popleft()
-        return self._reading(arrived, self._layout.unpack(payload[1:]))
+        return self._reading(arrived, _unpacked(self._layout, payload[1:]))
 
     def close(self) -> None:
         """Close the link."""
@@ -123,6 +127,8 @@ class RtdeReader:
     def _reading(self, arrived: float, values: tuple[float, ...]) -> Reading:
         stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[15]
         mode, runtime, safety, progress = (int(value) for value in values[19:])
+        if not all(map(math.isfinite, values)):
+            raise ValueError("the controller sent a state that holds NaN or infinity")
         skipped = 0 if self._stamp is None else max(0, round((stamp - self._stamp) * self.rate_hz) - 1)
         self._stamp = stamp
         return Reading(
@@ -136,3 +142,10 @@ class RtdeReader:
             safety=safety,
             progress=progress,
         )
+
+
+def _unpacked(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
+    """The values of a payload; ValueError where it is of another size."""
+    if len(payload) != layout.size:
+        raise ValueError(f"the controller sent {len(payload)} bytes, expected {layout.size}")
+    return layout.unpack(payload)

@@ -45,7 +45,8 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
         def command(
             names: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
         ) -> None:
-            from ..output import refuse_unwritable
+            from design.output import refuse_unwritable
+
             from .study import lines, run
 
             refuse_unwritable(out)
@@ -101,6 +102,9 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
     """Errors by number of lost fibres, over all sets of them, and maps before and after (figures 3, 4 and 5).
 
+    \b
+    padforge study robustness square random-5 --lost 2
+
     For recordings of a built pad (figures 13 and 14) see `padforge sense robustness`.
     """
     from design.settings import Contact
@@ -112,7 +116,11 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
 @_command("sensitivity")
 def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Objects of other sizes and shapes, and other ones in use than in training (figure 6)."""
+    """Objects of other sizes and shapes, and other ones in use than in training (figure 6).
+
+    \b
+    padforge study sensitivity square
+    """
     from .sensitivity import sensitivity_study
 
     return sensitivity_study(_pads(names, seed), seed=seed)
@@ -121,7 +129,11 @@ def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
 @_command("scaling")
 @click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
 def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
-    """Larger surfaces, the pads repeated over them as tiles (figures 7 and 8)."""
+    """Larger surfaces, the pads repeated over them as tiles (figures 7 and 8).
+
+    \b
+    padforge study scaling optimised --grids 4,16,64
+    """
     from .scaling import scaling_study
 
     return scaling_study(_pads(names, seed, ("square", "optimised")), grids=_numbers(grids), seed=seed)
@@ -139,7 +151,11 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 @_command("force")
 def force(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Depth and force of a press from the signals that locate it, with a model of indentation."""
+    """Depth and force of a press from the signals that locate it, with a model of indentation.
+
+    \b
+    padforge study force square random-5
+    """
     from .force import force_study
 
     return force_study(_pads(names, seed), seed=seed)
@@ -147,7 +163,11 @@ def force(names: tuple[str, ...], *, seed: int) -> "Study":
 
 @_command("shape")
 def shape(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Which object was pressed, from the signals that locate it."""
+    """Which object was pressed, from the signals that locate it.
+
+    \b
+    padforge study shape random-5
+    """
     from .shape import shape_study
 
     return shape_study(_pads(names, seed), seed=seed)
@@ -155,7 +175,11 @@ def shape(names: tuple[str, ...], *, seed: int) -> "Study":
 
 @_command("drift", of="PAD_OR_RECORDING")
 def drift(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Denoising and drift compensation, on pads as simulated and on recordings; idle shares (figure 12, table III)."""
+    """Denoising and drift compensation, on pads as simulated and on recordings; idle shares (figure 12, table III).
+
+    \b
+    padforge study drift out/pad/recording
+    """
     from .drift import drift_study
     from .pads import is_recording, load_pads, load_recordings
 
@@ -167,7 +191,11 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
 
 @_command("multicontact")
 def multicontact(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Two contacts at once, whichever is named first, and how many there are (figure 9)."""
+    """Two contacts at once, whichever is named first, and how many there are (figure 9).
+
+    \b
+    padforge study multicontact square
+    """
     from .multicontact import multicontact_study
 
     return multicontact_study(_pads(names, seed), seed=seed)

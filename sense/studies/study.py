@@ -91,9 +91,8 @@ def run(
         InputError: tasks to go on from that belong to other settings, a folder that cannot be written, or in which the
             same study is at work.
     """
+    from design.output import refuse_unwritable, staged
     from design.plan import save_figure
-
-    from ..output import refuse_unwritable, staged
 
     refuse_unwritable(out)
     # What is kept goes by the number of a task, so the tasks and their order count as much as the settings.
@@ -114,7 +113,7 @@ def run(
 @contextmanager
 def _alone(out: Path, name: str) -> Iterator[None]:
     """Keep other runs of a study out of its folder; InputError where one is there."""
-    from ..output import lock
+    from design.output import lock
 
     out.mkdir(parents=True, exist_ok=True)
     path = out / f".{name}.lock"

@@ -107,7 +107,7 @@ def test_evaluation_counts_held_back_presses_of_its_own_recording_and_all_of_ano
     other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
     assert other["test_presses"] == 300
     assert other["split"] == "none"
-    with pytest.raises(InputError, match="lost is 4, allowed is 0 to 3"):
+    with pytest.raises(InputError, match="lost is 4, allowed is a whole number from 0 to 3"):
         evaluate(localizer, recording, [4])
 
 

@@ -10,10 +10,10 @@ from hypothesis.extra import numpy as hnp
 
 from design.errors import InputError
 from sense import Recording
-from sense.bench_filter import fibre, linear_program, objective
+from sense.bench.filter import fibre, linear_program, objective
 from sense.filter_streams import TotalVariation
 from sense.filters import running_median, stretches, total_variation
-from sense.kernels import interval_heap, robust_variation
+from sense.kernels import clips, interval_heap, robust_variation
 
 STEP_V = 3.3 / 1023
 LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])
@@ -308,3 +308,14 @@ def test_the_real_recording(published):
     blocks = [stream.feed(block) for block in np.array_split(y, 180)]
     assert len(y) - sum(map(len, blocks)) < 40  # readings held back: less than a press
     np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), x)
+
+
+def test_a_chain_of_clips_goes_back_and_is_decided_where_its_bounds_have_met():
+    low = np.array([0.0, -1.0, 2.0, -np.inf, 1.0])
+    high = np.array([5.0, 1.0, 3.0, np.inf, 4.0])
+    for last, expected in ((9.0, [1, 1, 3, 4, 4]), (-9.0, [1, 1, 2, 1, 1]), (2.5, [1, 1, 2.5, 2.5, 2.5])):
+        out = np.empty(5)
+        assert clips.clip_back(low, high, last, out) == 2  # 1 from the second on back, whatever follows
+        assert out.tolist() == expected
+    assert clips.clip_back(low[2:], high[2:], 9.0, np.empty(3)) == 0
+    assert clips.clip_back(np.append(low, 7.0), np.append(high, 7.0), 9.0, np.empty(6)) == 6

@@ -366,7 +366,7 @@ def test_a_recording_that_does_not_fit_is_refused(pad: Recording, model: HealthM
         examine(model, pad.readings, pad.times_s[1:], *presses)
     with pytest.raises(InputError, match=r"expected \(R, 6\)"):
         Monitor(model).update(pad.readings[:60, :5], 10, 30)
-    with pytest.raises(InputError, match="press begins at 0"):
+    with pytest.raises(InputError, match="begun is 0, allowed is a whole number from 1"):
         Monitor(model).update(pad.readings[:60], 0, 30)
 
 

@@ -230,3 +230,9 @@ def test_a_fault_of_the_rig_ends_it(live, monkeypatch: pytest.MonkeyPatch) -> No
     code, out, err = live("--json")
     assert (code, out) == (1, "")
     assert err.splitlines()[-1] == "padforge: the board does not send; reset it"
+
+
+@pytest.mark.parametrize("speed", [float("nan"), 0.0, -1.0])
+def test_a_replay_without_a_speed_is_refused_and_does_not_wait_for_ever(recording: Recording, speed: float) -> None:
+    with pytest.raises(InputError, match="speed is"):
+        replayed(recording, speed)

@@ -142,3 +142,36 @@ def test_a_fibre_without_readings_counts_as_lost_in_those_presses_only() -> None
     assert not found.alive[:, 2].any()
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
+
+
+@pytest.mark.parametrize(
+    ("features", "first", "end"), [("full", -10, 40), ("causal", -10, 20), ("early", -10, 20), ("published", -10, 40)]
+)
+def test_a_fibre_counts_where_three_quarters_of_what_is_looked_at_are_there(
+    features: str, first: int, end: int
+) -> None:
+    """Press 2 is sent down at 100 and up at 120; the last readings that count are what is missing."""
+    most = (end - first) // 4
+    for missing, there in ((most, True), (most + 1, False)):
+        for begin in (100 + first, 100 + end - missing):
+            readings = noise()
+            readings[begin : begin + missing, 1] = np.nan
+            assert press_inputs(readings, BEGUN, LIFTED, features).alive[2, 1] == there
+    readings = noise()
+    readings[50 : 100 + first, 1] = readings[100 + end : 140, 1] = np.nan
+    assert press_inputs(readings, BEGUN, LIFTED, features).alive[2, 1]
+
+
+def test_of_a_ramp_every_window_gives_its_middle() -> None:
+    """Readings that count themselves: a press from 5000 to 5020, its rest 5.5 before it."""
+    ramp = np.arange(5100.0)[:, None]
+    begun, lifted = np.array([5000]), np.array([5020])
+    down = [1, 2, 3, 4, 5, 6.5, 9.5, 13.5, 17.5]
+    up = [20, 21, 22, 23, 24.5, 27, 31, 36.5]
+    past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
+    slow = [-402, -2010]
+    for features, windows in (("full", down + up), ("causal", down), ("early", down[:6])):
+        found = press_inputs(ramp, begun, lifted, features)
+        np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
+        np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
+    np.testing.assert_allclose(press_inputs(ramp, begun, lifted, "published").windows[0, 0], [4990 - 0, 5010, 5030])

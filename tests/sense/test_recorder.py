@@ -145,3 +145,33 @@ def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
 
     with pytest.raises(RuntimeError, match="the first thing"):
         broken()
+
+
+def test_a_press_that_was_not_begun_cannot_be_finished(tmp_path):
+    """Its line would make the whole journal one that nobody can read."""
+    path = made(tmp_path)
+    with Recorder.resume(path) as recorder, pytest.raises(InputError, match="was not begun"):
+        recorder.finish(recorder.readings)
+    assert len(Recording.open(path).begun) == 5
+
+
+def test_presses_without_a_number_count_on_from_the_last(tmp_path):
+    """One that was aborted is made again under its number; after a break the count goes on."""
+    with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
+        for number in range(2):
+            recorder.append(np.arange(5) / 10 + number, np.zeros((5, FIBRES)))
+            recorder.begin((0, 0), recorder.readings)
+            recorder.finish(recorder.readings)
+        recorder.begin((0, 0), recorder.readings)
+        recorder.abort("the arm stopped")
+        recorder.begin((0, 0), recorder.readings)
+        recorder.finish(recorder.readings)
+        recorder.begin((0, 0), recorder.readings, press=7)
+        recorder.finish(recorder.readings)
+        assert recorder.done == {0, 1, 2, 7}
+        with pytest.raises(InputError, match="press 8 was not begun"):
+            recorder.finish(recorder.readings)
+    with Recorder.resume(tmp_path / "run") as recorder:
+        recorder.begin((0, 0), recorder.readings)
+        recorder.finish(recorder.readings)
+        assert recorder.done == {0, 1, 2, 7, 8}

@@ -335,5 +335,15 @@ def test_readings_that_do_not_fit_are_refused(times: np.ndarray, readings: np.nd
 
 
 def test_a_pad_without_fibres_is_refused() -> None:
-    with pytest.raises(InputError, match="fibres is 0, allowed is 1 or more"):
+    with pytest.raises(InputError, match="fibres is 0, allowed is a whole number from 1 to 512"):
         Finder(0)
+
+
+def test_readings_are_fed_in_the_order_of_their_times() -> None:
+    finder = Finder(2)
+    finder.feed([0.0, 0.1], np.zeros((2, 2)))
+    for again in (0.05, 0.1):
+        with pytest.raises(InputError, match=f"times begin at {again} s, expected later than the last reading, 0.1 s"):
+            finder.feed([again, 0.3], np.zeros((2, 2)))
+    finder.feed([], np.zeros((0, 2)))
+    finder.feed([0.11], np.zeros((1, 2)))

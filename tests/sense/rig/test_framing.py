@@ -155,7 +155,13 @@ def test_noise_without_an_edge_neither_grows_nor_passes() -> None:
         b"\x02\x00",
         b"\x90\x01",
         Block(np.full((1, 8), 4096, np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.array([[0] * 7 + [4096]], np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.array([[0] * 7 + [4 * 4095 + 1]], np.uint16), 4, 0xFF, 0, 0, 0, 0).pack(),
         Block(np.zeros((1, 8), np.uint16), 0, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 8), np.uint16), 17, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((0, 8), np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 0), np.uint16), 1, 0, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 1), np.uint16), 1, 0x1000, 0, 0, 0, 0).pack(),
         Block(np.zeros((17, 8), np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
         Block(np.zeros((2, 8), np.uint16), 1, 0x7F, 0, 0, 0, 0).pack(),
         Block(np.zeros((2, 8), np.uint16), 1, 0xFF, 0, 0, 0, 0).pack()[:-1],
@@ -169,3 +175,26 @@ def test_a_payload_that_is_no_frame_counts_as_damaged_although_its_check_is_righ
     decoder = Decoder()
     assert decoder.feed(encode(Forged(Kind.STOP))) == []
     assert decoder.damaged == 1
+
+
+def test_the_bytes_of_a_frame_are_as_documented() -> None:
+    """A board of another make relies on them. CRC-16/CCITT-FALSE of "123456789" is 29B1."""
+    assert encode(Request(Kind.START)) == b"\0\x02\x03" + _check_bytes(b"\x02\x03") + b"\0"
+    assert _check_bytes(b"123456789") == bytes([0x80, 0x80 | 0x29B1 >> 7 & 0x7F, 0x80 | 0x29B1 & 0x7F])
+    assert Settings(1_000_000, 0x0FF, 4).pack() == bytes.fromhex("02 40420f00 ff00 04")
+    assert Ack(3, 1, Settings(1, 2, 3)).pack() == bytes.fromhex("82 03 01 01000000 0200 03")
+    block = Block(np.array([[1, 2], [3, 4]], np.uint16), 5, 0x0011, 6, 7, 8, 9)
+    head = bytes.fromhex("90 02 05 1100 0600 07000000 08000000 09000000")
+    assert block.pack() == head + bytes.fromhex("0100 0200 0300 0400")
+    identity = Identity((1, 2, 3), 12, 8, "pad", bytes(range(16)))
+    assert identity.pack() == b"\x81\x01\x02\x03\x0c\x08pad" + bytes(13) + bytes(range(16))
+
+
+def _check_bytes(coded: bytes) -> bytes:
+    """CRC-16/CCITT-FALSE bit by bit, in 2, 7 and 7 bits with the top bit set."""
+    crc = 0xFFFF
+    for byte in coded:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return bytes([0x80 | crc >> 14, 0x80 | crc >> 7 & 0x7F, 0x80 | crc & 0x7F])

@@ -36,6 +36,26 @@ def test_a_serpentine_takes_short_steps():
     assert {*map(tuple, serpentine.places_mm.round(6))} == {*map(tuple, grid.places_mm.round(6))}
 
 
+def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row():
+    line = [-22.5, 0.0, 22.5]
+    rows = [(x, y) for y in line for x in line]
+    assert made(presses=9, plan="grid").places_mm.tolist() == [list(place) for place in rows]
+    assert made(presses=8, plan="grid").places_mm.tolist() == [list(place) for place in rows[:8]]
+    turned = [*rows[:3], *rows[5:2:-1], *rows[6:]]
+    assert made(presses=9, plan="boustrophedon").places_mm.tolist() == [list(place) for place in turned]
+    assert made(presses=1, plan="grid").places_mm.tolist() == [[0, 0]]
+    uniform = made(presses=2000).places_mm
+    assert np.abs(uniform).max() > 22.4
+    np.testing.assert_allclose(uniform.mean(axis=0), 0, atol=1.5)
+
+
+@pytest.mark.parametrize("depth", [0.0, -1.0])
+def test_presses_go_in(depth):
+    with pytest.raises(InputError, match="press 1 has depth"):
+        PressPlan.of([[0, 0, 1e-3], [0, 0, depth]])
+    assert len(PressPlan.of([[0, 0, 1e-3]])) == 1
+
+
 def test_a_plan_from_a_file(tmp_path):
     (tmp_path / "plan.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n")
     assert read_plan(tmp_path / "plan.csv", 3.0).document() == [[1, 2, 3], [-3.5, 4, 3]]

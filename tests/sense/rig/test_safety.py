@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sense.rig.devices import ArmState, Pose, RigFault
-from sense.rig.safety import DEPTH_SLACK_MM, Limits, require_safe, tilt_deg, wait_until_still, watch
+from sense.rig.safety import Limits, require_safe, tilt_deg, wait_until_still, watch
 from sense.settings import Rig
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
@@ -98,6 +98,60 @@ def test_limits_that_limit_nothing(change: dict[str, object]) -> None:
         replace(LIMITS, **change)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize(
+    "change", [{"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}]
+)
+def test_limits_that_just_limit(change: dict[str, object]) -> None:
+    replace(LIMITS, **change)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="tool"):
+        replace(LIMITS, tool=(0.0, math.pi * 0.94, 0.0))
+
+
+def test_targets_on_the_limits_are_safe_and_a_hair_beyond_are_not() -> None:
+    x, y, z, *tool = SAFE
+    for pose in ((-100, y, z), (100, y, z), (x, -500, z), (x, -300, z), (x, y, 44), (x, y, 120)):
+        require_safe((*pose, *tool), 250, 1200, LIMITS)
+    for pose in ((-100.1, y, z), (100.1, y, z), (x, -500.1, z), (x, -299.9, z), (x, y, 43.9), (x, y, 120.1)):
+        refused((*pose, *tool))
+    assert "speed 250.1" in refused(SAFE, 250.1)
+    assert "acceleration 1200.1" in refused(SAFE, 50, 1200.1)
+    require_safe((x, y, z, 0.0, math.pi - math.radians(1.99), 0.0), 50, 500, LIMITS)
+    assert "tilted by 2.0" in refused((x, y, z, 0.0, math.pi - math.radians(2.01), 0.0))
+
+
+def test_tilt_is_the_angle_between_the_axes_of_two_tools() -> None:
+    """A rotation about x by a takes the z axis to (0, -sin a, cos a); one about y to (sin b, 0, cos b)."""
+    for a, b in ((0.3, 0.4), (2.0, -1.0), (math.pi, 3.0)):
+        cosine = math.cos(a) * math.cos(b)
+        assert tilt_deg((a, 0, 0), (0, b, 0)) == pytest.approx(math.degrees(math.acos(cosine)))
+    axis = (1 / math.sqrt(3),) * 3  # a third of a turn about the diagonal takes z to x
+    third = tuple(2 * math.pi / 3 * part for part in axis)
+    assert tilt_deg(third, (0, math.pi / 2, 0)) == pytest.approx(0, abs=1e-9)
+    assert tilt_deg(third, (0, 0, 0)) == pytest.approx(90)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"time_s": 9.51},
+        {"force_n": 39.9},
+        {"force_n": -39.9},
+        {"force_n": None},
+        {"pose": (0.0, -400.0, 44.0 - 0.29, *SAFE[3:])},
+        {"pose": (900.0, 900.0, 900.0, *SAFE[3:])},
+    ],
+)
+def test_states_that_let_a_move_go_on(change: dict[str, object]) -> None:
+    watch(replace(REST, **change), LIMITS, 10.0, until_s=10.0)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("speed", "rests"), [(0.9, True), (1.1, False)])
+def test_a_tip_rests_below_a_millimetre_a_second(speed: float, rests: bool) -> None:
+    actor = Actor(replace(REST, speed_mm_s=speed), replace(REST, protective_stop=True))
+    with contextlib.nullcontext() if rests else pytest.raises(RigFault):
+        actor.wait()
+
+
 def test_limits_of_the_settings() -> None:
     limits = Limits.of(Rig(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20))
     assert (limits.box_mm, limits.contact_mm, limits.max_speed_mm_s) == (((-1, 1), (-2, 2), (0, 90)), 30, 80)
@@ -112,12 +166,12 @@ def test_limits_of_the_settings() -> None:
     [
         ({"emergency_stop": True, "protective_stop": True}, "emergency_stop"),
         ({"protective_stop": True}, "protective_stop"),
-        ({"time_s": 9.4}, "stale"),
+        ({"time_s": 9.49}, "stale"),
         ({"time_s": math.nan}, "stale"),
-        ({"force_n": 41.0}, "force"),
-        ({"force_n": -41.0}, "force"),
+        ({"force_n": 40.1}, "force"),
+        ({"force_n": -40.1}, "force"),
         ({"force_n": math.nan}, "force"),
-        ({"pose": (0.0, -400.0, 44.0 - 1.1 * DEPTH_SLACK_MM, *SAFE[3:])}, "refused"),
+        ({"pose": (0.0, -400.0, 44.0 - 0.31, *SAFE[3:])}, "refused"),
         ({"pose": (0.0, -400.0, math.nan, *SAFE[3:])}, "refused"),
     ],
 )

@@ -1,0 +1,71 @@
+"""`[rig]` and `[localizer]`: the defaults, and where their ranges end."""
+
+import pytest
+
+from design import InputError, Spec
+from sense.settings import Localizer, Rig
+
+
+def test_the_defaults_are_those_of_the_published_bench() -> None:
+    rig = Rig().model_dump()
+    expected = {
+        "presses": 1500,
+        "plan": "uniform",
+        "rate_hz": 13.3,
+        "readings_per_press": 40,
+        "depth_mm": 5.0,
+        "seed": 0,
+        "noise_mv": 1.6,
+        "drift_mv": 40.0,
+        "creep": 0.1,
+        "hysteresis": 0.2,
+        "converter_rate_hz": 1000.0,
+        "channels": 8,
+        "box_mm": "unknown",
+        "contact_mm": "unknown",
+        "pad_angle_deg": 0.0,
+        "max_depth_mm": 6.0,
+        "clearance_mm": 10.0,
+        "travel_mm_s": 100.0,
+        "press_mm_s": 40.0,
+        "acceleration_mm_s2": 500.0,
+        "max_force_n": 60.0,
+    }
+    assert {key: rig[key] for key in expected} == expected
+    assert Localizer().model_dump() == {
+        "method": "masked",
+        "features": "full",
+        "split": "random",
+        "test_share": 0.15,
+        "lost": 3,
+        "members": 2,
+        "hidden": 256,
+        "layers": 5,
+        "epochs": 600,
+        "batch": 256,
+        "rate": 0.004,
+        "seed": 0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("model", "key", "kept", "refused"),
+    [
+        (Rig, "max_force_n", (0.1, 250.0), (0.0, 250.1)),
+        (Rig, "max_depth_mm", (0.1, 50.0), (0.0, 50.1)),
+        (Rig, "press_mm_s", (0.1, 250.0), (0.0, 250.1)),
+        (Rig, "travel_mm_s", (0.1, 500.0), (0.0, 500.1)),
+        (Rig, "clearance_mm", (1.0, 500.0), (0.9, 500.1)),
+        (Rig, "channels", (1, 8), (0, 9)),
+        (Localizer, "test_share", (0.01, 0.99), (0.0, 1.0)),
+        (Localizer, "lost", (0, 8), (-1, 9)),
+        (Localizer, "rate", (1e-6, 1.0), (0.0, 1.1)),
+    ],
+)
+def test_values_at_the_ends_of_what_is_allowed(model: type, key: str, kept: tuple, refused: tuple) -> None:
+    name = model.__name__.lower()
+    for value in kept:
+        Spec({name: {key: value}}).section(model)
+    for value in refused:
+        with pytest.raises(InputError, match=rf"\[{name}\] {key}"):
+            Spec({name: {key: value}}).section(model)
