@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING
 import click
 
 from design.cli import INTERRUPTED, design
-from design.console import json_option, load_spec, out_option, progress, seed_option, show_result, spec_option
+from design.console import (
+    json_option,
+    load_spec,
+    out_option,
+    profile_option,
+    progress,
+    seed_option,
+    show_result,
+    spec_option,
+)
 from design.errors import Fault, InputError
 from fabricate.cli import fabricate
 from sense.cli import sense
@@ -46,7 +55,12 @@ cli.add_command(study)
 @cli.command()
 @click.argument("path", type=click.Path(dir_okay=False, path_type=Path), default="pad.toml")
 def init(path: Path) -> None:
-    """Write a settings file, pad.toml, with every default and a comment a key."""
+    """Write a settings file, pad.toml, with every default and a comment a key.
+
+    \b
+    padforge init
+    padforge init soft.toml
+    """
     from design.files import write_text
     from design.settings import commented_toml
 
@@ -60,24 +74,38 @@ def init(path: Path) -> None:
 @spec_option
 @seed_option
 @out_option("out/pad")
+@profile_option
 @click.pass_context
 def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) -> None:
     """Do the whole job: optimise, mould, record presses on the simulated rig, calibrate, report.
 
+    \b
+    padforge run
+    padforge run --spec pad.toml --seed 1 --out out/soft
+
     Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
     """
+    from design.output import claimed
+    from design.profiling import stage
+
     settings = load_spec(spec)
     _check_ahead(settings, out)
-    code = _run_stages(settings, seed, out)
-    if code != INTERRUPTED:
-        click.echo(f"report: {write_report(out)}")
+    with claimed(out):
+        code = _run_stages(settings, seed, out)
+        if code != INTERRUPTED:
+            with stage("report"):
+                click.echo(f"report: {write_report(out)}")
     context.exit(code)
 
 
 @cli.command()
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path), default="out/pad")
 def report(folder: Path) -> None:
-    """Write report.html for the pad in FOLDER: whatever its stages have left there, on one page."""
+    """Write report.html for the pad in FOLDER: whatever its stages have left there, on one page.
+
+    \b
+    padforge report out/pad
+    """
     click.echo(f"report: {write_report(folder)}")
 
 
@@ -193,7 +221,7 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
 def _require_replaceable(recorded: Path) -> None:
     """Refuse to run over a recording, unless it is a simulated one, which the same seed gives again."""
     from design.files import read_json
-    from sense.recorder import FORMAT, START
+    from sense.recorder import FILES, FORMAT, START
 
     if not recorded.exists() or (recorded.is_dir() and not any(recorded.iterdir())):
         return
@@ -201,6 +229,9 @@ def _require_replaceable(recorded: Path) -> None:
     kind = source.get("kind") if isinstance(source, dict) else None
     if kind != "simulated":
         raise InputError(f"{recorded}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
+    strange = sorted(path.name for path in recorded.iterdir() if path.name not in FILES)
+    if strange:
+        raise InputError(f"{recorded}: holds {strange[0]}, which is no part of a recording; choose another --out")
 
 
 def write_report(folder: Path) -> Path:

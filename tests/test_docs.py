@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from inspect import cleandoc
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -116,16 +117,16 @@ def arguments(command: str) -> Iterator[list[str]]:
             yield from map(list, product(*choices))
 
 
-def every(command: click.Command) -> Iterator[click.Command]:
-    yield command
-    for each in command.commands.values() if isinstance(command, click.Group) else ():
-        yield from every(each)
+def every(command: click.Command, name: str = "padforge") -> Iterator[tuple[str, click.Command]]:
+    yield name, command
+    for word, each in command.commands.items() if isinstance(command, click.Group) else ():
+        yield from every(each, f"{name} {word}")
 
 
 @pytest.fixture
 def parser(monkeypatch: pytest.MonkeyPatch) -> click.Command:
     """The command line, of which only the parser is left: no command does anything, no file has to exist."""
-    for command in every(cli):
+    for _, command in every(cli):
         monkeypatch.setattr(command, "callback", lambda *_, **__: None)
 
     def convert(_: click.Path, value: Any, *__: Any) -> Path:
@@ -145,6 +146,16 @@ def test_every_command_parses(page: Path, parser: click.Command) -> None:
                 if not whole and isinstance(error, click.MissingParameter | click.exceptions.NoArgsIsHelpError):
                     continue
                 pytest.fail(f"{relative(page)}: {command}: {error.format_message()}")
+
+
+@pytest.mark.parametrize(("name", "command"), every(cli), ids=lambda value: value if isinstance(value, str) else "")
+def test_help_has_examples_that_parse(name: str, command: click.Command, parser: click.Command) -> None:
+    lines = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
+    assert [line for line in lines if line.startswith(name)]
+    for line in lines:
+        example, _, _ = line.partition("  ")  # what follows explains it
+        for call in arguments(example):
+            parser.main(call, standalone_mode=False, prog_name="padforge")
 
 
 def test_the_parser_refuses_what_does_not_exist(parser: click.Command) -> None:

@@ -141,6 +141,17 @@ def test_a_report_on_damaged_files_names_them(tmp_path, content):
     assert "design.json: not as padforge writes it" in result.stderr
 
 
+def test_what_is_no_part_of_a_recording_is_never_removed(tmp_path):
+    recording = tmp_path / "out" / "pad" / "recording"
+    recording.mkdir(parents=True)
+    (recording / "start.json").write_text('{"format": "padforge-recording/1", "source": {"kind": "simulated"}}')
+    (recording / "notes.txt").write_text("of the day")
+    result = padforge("run", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "holds notes.txt, which is no part of a recording" in result.stderr
+    assert (recording / "notes.txt").read_text() == "of the day"
+
+
 def test_a_bare_command_shows_its_help(tmp_path):
     result = padforge(cwd=tmp_path)
     assert result.returncode == 2

@@ -1,0 +1,183 @@
+"""Disks that are full, closed or shared, and ends in the middle: files are whole or not there, without litter."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design.files import atomic, write_json
+from design.morphology import Morphology
+from fabricate.soundness import read_mesh
+
+from .clock import few
+from .door import CHEAP, contents
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")
+
+LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
+
+COMMANDS = {
+    "design": ("design", "--out", "pad"),
+    "genetic": ("design", "--method", "genetic", "--out", "pad"),
+    "show": ("design", "show", "made/morphology.json", "--out", "pad/plan.png"),
+    "fabricate": ("fabricate", "made/morphology.json", "--formats", "stl,3mf,svg,dxf,png", "--out", "pad"),
+    "picture": ("fabricate", "check", "made/morphology.json", "--picture", "pad/found.png"),
+    "init": ("init", "pad/new.toml"),
+    "report": ("report", "pad"),
+    "record": ("sense", "record", "--out", "pad/recording"),
+}
+"""Commands that write into the folder `pad`, cheap ones."""
+
+ENDED = """
+import resource, sys
+limit = int(sys.argv.pop(1))
+if limit >= 0:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+import padforge
+padforge.main()
+"""
+"""The command line under a limit of the size of files, bytes; -1 for none."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with settings, and a pad in `made` that was designed before."""
+    folder = tmp_path_factory.mktemp("disk")
+    (folder / "pad.toml").write_text(CHEAP)
+    Morphology.random(2, 1, 3).save(folder / "made" / "morphology.json")
+    return folder
+
+
+@pytest.fixture
+def room(made: Path, tmp_path: Path) -> Path:
+    """Such a folder of its own, with the results of an earlier search in `pad`."""
+    (tmp_path / "pad.toml").write_text(CHEAP)
+    for name in ("made", "pad"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "morphology.json").write_bytes((made / "made" / "morphology.json").read_bytes())
+    write_json(tmp_path / "pad" / "fabrication.json", {"format": "padforge-fabrication/1"})
+    return tmp_path
+
+
+def start(folder: Path, *arguments: str, limit: int = -1, tied: bool = False) -> subprocess.Popen[str]:
+    root = Path(__file__).resolve().parents[2]
+    # Root may write everywhere, unless it starts without that right.
+    without = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if tied and os.geteuid() == 0 else []
+    return subprocess.Popen(
+        [*without, sys.executable, "-c", ENDED, str(limit), *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(root)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def require_whole(folder: Path) -> None:
+    """Every file in a folder can be read to its end by what reads its kind; temporary ones are none."""
+    for path in folder.rglob("*"):
+        if not path.is_file() or path.name.startswith("."):
+            continue
+        match path.suffix:
+            case ".json":
+                json.loads(path.read_text())
+            case ".stl" | ".3mf":
+                read_mesh(path)
+            case ".png":
+                assert path.read_bytes().endswith(b"IEND\xaeB`\x82"), path
+            case ".svg":
+                assert path.read_text().rstrip().endswith("</svg>"), path
+            case ".dxf":
+                assert path.read_text().rstrip().endswith("EOF"), path
+            case ".npz":
+                np.load(path).close()
+            case ".html":
+                assert path.read_text().rstrip().endswith("</html>"), path
+
+
+def litter(folder: Path) -> list[str]:
+    return [name for name in contents(folder) if Path(name).name.startswith(".")]
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [
+        ("fabricate", 2000),
+        ("record", 0),
+        *(
+            pytest.param(name, limit, marks=LONG)
+            for name in ("design", "picture", "show", "report")
+            for limit in (0, 2000)
+        ),
+    ],
+)
+def test_a_full_disk_leaves_old_files_and_no_litter(room: Path, name: str, limit: int):
+    before = (room / "pad" / "morphology.json").read_bytes()
+    child = start(room, *COMMANDS[name], limit=limit)
+    _, err = child.communicate(timeout=120)
+    assert child.returncode == 2, err
+    assert err.startswith("padforge: "), err
+    assert err.count("\n") == 1, err
+    assert litter(room) == []
+    require_whole(room)
+    if limit == 0:
+        assert (room / "pad" / "morphology.json").read_bytes() == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write everywhere")
+@pytest.mark.parametrize("name", ["fabricate", "init", pytest.param("design", marks=LONG), "record"])
+def test_a_closed_folder_is_one_line(room: Path, name: str):
+    (room / "pad").chmod(0o555)
+    before = contents(room)
+    child = start(room, *COMMANDS[name], tied=True)
+    _, err = child.communicate(timeout=120)
+    assert (child.returncode, err.count("\n")) == (2, 1), err
+    assert err.startswith("padforge: "), err
+    assert contents(room) == before
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
+def test_an_end_while_writing_leaves_whole_files(room: Path, ending: signal.Signals):
+    child = start(room, *COMMANDS["fabricate"])
+    begun = time.monotonic()
+    while not litter(room / "pad") and child.poll() is None and time.monotonic() < begun + 60:
+        time.sleep(0.0005)
+    child.send_signal(ending)
+    _, err = child.communicate(timeout=60)
+    assert child.returncode in (-signal.SIGKILL, 130, 0), err
+    assert "Traceback" not in err
+    require_whole(room)
+    if ending != signal.SIGKILL:
+        assert litter(room) == []
+
+
+@pytest.mark.parametrize("name", ["fabricate", pytest.param("design", marks=LONG), pytest.param("genetic", marks=LONG)])
+def test_two_at_once_leave_one_result(room: Path, name: str):
+    children = [start(room, *COMMANDS[name]) for _ in range(2)]
+    for child in children:
+        _, err = child.communicate(timeout=120)
+        assert child.returncode in (0, 1, 2), err
+        assert "Traceback" not in err, err
+        assert child.returncode != 2 or (err.startswith("padforge: ") and err.count("\n") == 1), err
+    assert 0 in [child.returncode for child in children]
+    assert litter(room) == []
+    require_whole(room)
+    Morphology.load(room / "pad" / "morphology.json")
+
+
+def test_a_device_is_never_put_aside(tmp_path: Path):
+    pipe = tmp_path / "pipe.png"
+    os.mkfifo(pipe)
+    with pytest.raises(ValueError, match=r"pipe\.png: cannot be written"), atomic(pipe):
+        pass
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
