@@ -1,18 +1,15 @@
 """padforge: the front door. One command; `run` chains design, fabricate and sense, `report` shows what they made."""
 
-import os
 import shutil
-import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from io import TextIOWrapper
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from design.cli import INTERRUPTED, design
+from design.cli import design
 from design.console import (
     json_option,
     load_spec,
@@ -23,7 +20,8 @@ from design.console import (
     show_result,
     spec_option,
 )
-from design.errors import Fault, InputError
+from design.endings import INTERRUPTED, run_to_end
+from design.errors import InputError
 from fabricate.cli import fabricate
 from sense.cli import sense
 from sense.studies.cli import study
@@ -288,55 +286,8 @@ def _as_written(path: Path) -> Iterator[None]:
 
 
 def main() -> None:
-    """Run the command line; a user's own mistake is one line on stderr and exit 2."""
-    _prepare()
-    try:
-        _require_words(sys.argv[1:])
-        code = cli.main(standalone_mode=False, prog_name="padforge")
-    except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message(), file=sys.stderr)
-        code = 2
-    except (click.exceptions.Abort, KeyboardInterrupt):
-        code = _fail("interrupted; what was finished is kept", INTERRUPTED)
-    except click.ClickException as error:
-        code = _fail(error.format_message(), 2)
-    except InputError as error:
-        code = _fail(str(error), 2)
-    except Fault as fault:
-        code = _fail(str(fault), fault.exit_code)
-    except OSError as error:
-        code = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
-    except MemoryError as error:
-        code = _fail(f"this takes more memory than there is ({error or 'no more is given'})", 2)
-    sys.exit(code)
-
-
-def _prepare() -> None:
-    """Let names that are no text be printed, and an end from outside clear up as Ctrl-C does."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-    for ending in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
-        number = getattr(signal, ending)
-        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
-            signal.signal(number, signal.default_int_handler)
-
-
-def _require_words(words: list[str]) -> None:
-    """Refuse what no shell can hand over, but a caller from Python can: such names would trip whatever opens them."""
-    for word in words:
-        try:
-            odd = b"\0" in os.fsencode(word)
-        except UnicodeEncodeError:
-            odd = True
-        if odd:
-            raise InputError(f"{word!r}: holds characters that no argument can have")
-
-
-def _fail(message: str, code: int) -> int:
-    with suppress(OSError):  # of a disk that is full: the exit code says the same
-        print(f"padforge: {' '.join(message.split())}", file=sys.stderr)
-    return code
+    """Run the command line."""
+    sys.exit(run_to_end(cli, "padforge"))
 
 
 if __name__ == "__main__":

@@ -18,14 +18,13 @@ from .console import (
     show_result,
     spec_option,
 )
+from .endings import INTERRUPTED
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from .search import SearchResult
     from .settings import Spec
-
-INTERRUPTED = 130
 
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 

@@ -1,5 +1,7 @@
 """Fixtures shared by all tests."""
 
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -8,6 +10,14 @@ from hypothesis import settings
 settings.register_profile("padforge", deadline=None, derandomize=True)
 settings.register_profile("stress", deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile("padforge")
+
+coverage = sys.modules.get("coverage")
+if coverage is not None and coverage.Coverage.current() is not None:
+    # kernels run compiled: the lines that a run compiles count as covered, so none may come from the usual cache
+    from numba.core import config
+
+    fresh = tempfile.TemporaryDirectory(prefix="padforge-coverage-")
+    config.JIT_COVERAGE, config.CACHE_DIR = 1, fresh.name  # pyright: ignore[reportAttributeAccessIssue]
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
 

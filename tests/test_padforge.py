@@ -12,6 +12,9 @@ import pytest
 import trimesh
 from safetensors.numpy import load_file
 
+import padforge as front_door
+from design import Morphology
+
 SMALL = """
 [pad]
 grid = 2
@@ -204,3 +207,23 @@ def test_the_readme_names_files_that_are_there():
     for name in ("out/gallery/plan.png", "out/gallery/mould.png", "out/gallery/error_map.png", "constraints.txt"):
         assert name in text
         assert (root / name).exists()
+
+
+def test_the_front_door_in_one_process(tmp_path, monkeypatch, capsys):
+    """Settings, a page of what is there, and one line for what is not."""
+
+    def ends(*arguments):
+        monkeypatch.setattr(sys, "argv", ["padforge", *arguments])
+        with pytest.raises(SystemExit) as end:
+            front_door.main()
+        return end.value.code
+
+    monkeypatch.chdir(tmp_path)
+    assert ends("init") == 0
+    assert (tmp_path / "pad.toml").read_text(encoding="utf-8").count("[") >= 8
+    capsys.readouterr()
+    assert ends("init") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    Morphology.straight(2).save(tmp_path / "pad" / "morphology.json")
+    assert ends("report", "pad") == 0
+    assert "<svg" in (tmp_path / "pad" / "report.html").read_text(encoding="utf-8")

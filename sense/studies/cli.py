@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.cli import INTERRUPTED
 from design.console import json_option, load_spec, out_option, progress, show_result, spec_option
+from design.endings import INTERRUPTED
 from design.errors import InputError
 
 if TYPE_CHECKING:

@@ -37,7 +37,10 @@ def test_the_running_number_of_touched_fibres():
     presses, strays = rng.uniform(-1, 6, (30, 2)), np.array([0.3, 1.1])
     reach = np.array([[-1, 1, -0.5, 0.7, 0.1], [-1, 1, -0.2, 0.4, 0.1]])
     numbers = [
-        sum(len(can_touch(press[1 - family], *reach[family, 2:4], strays[family], 4)) for family in (0, 1))
+        sum(
+            len(can_touch(press[1 - family], reach[family, 2], reach[family, 3], strays[family], 4))
+            for family in (0, 1)
+        )
         for press in presses
     ]
     np.testing.assert_array_equal(count_touched(strays, presses, reach, 4), np.append(0, np.cumsum(numbers)))

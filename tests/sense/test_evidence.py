@@ -78,12 +78,12 @@ def test_ratios_are_those_of_densities(seed: int) -> None:
             fit(0 * m, floor) - healthy,
             fit(0.5 * m, np.hypot(0.5 * s, floor)) - healthy,
             math.log(odd) - healthy,
-            shift_ratio(loud, math.log(5) / model.noise_spread[c]),
+            shift_ratio(float(loud), float(math.log(5) / model.noise_spread[c])),
         ]
 
         def rest(press: int, c: int = c) -> float:
             own = np.hypot(spread[press, c, -1] * model.scale[c, -1], model.extra[c, -1])
-            return (targets[press, c, -1] - mean[press, c, -1]) / own
+            return float((targets[press, c, -1] - mean[press, c, -1]) / own)
 
         new = (rest(q) - persistence * rest(max(q - 1, 0))) / innovation
         staying, beginning = list(common), [float(np.clip(ratio, -6, 6)) for ratio in common]

@@ -1,5 +1,7 @@
 """Traces become the numbers of the network, press by press, as the formulas say."""
 
+import math
+
 import numpy as np
 
 from sense.residuals import COMPONENTS, INPUTS, REST, TARGETS, TRACE, History, Shapes, shapes_of
@@ -13,7 +15,7 @@ def test_a_press_is_told_by_its_answer_its_rest_and_what_is_left_of_those_before
     traces[5, 1, 3] = np.nan
     basis = rng.normal(0, 1, (FIBRES, TRACE, COMPONENTS))
     shapes, history = Shapes(basis, np.ones((FIBRES, INPUTS)), np.ones((FIBRES, TARGETS))), History.none(FIBRES)
-    levels, memory, seen = [None] * FIBRES, np.zeros((FIBRES, COMPONENTS)), [0] * FIBRES
+    levels, memory, seen = [math.nan] * FIBRES, np.zeros((FIBRES, COMPONENTS)), [0] * FIBRES
     for number, press in enumerate(traces):
         inputs, targets = shapes.advance(press, history)
         for fibre in range(FIBRES):
@@ -23,13 +25,13 @@ def test_a_press_is_told_by_its_answer_its_rest_and_what_is_left_of_those_before
                 continue
             rest = press[fibre, :REST].mean()
             answer = (press[fibre] - rest) @ basis[fibre]
-            level = rest if levels[fibre] is None else levels[fibre]
+            level = rest if math.isnan(levels[fibre]) else levels[fibre]
             np.testing.assert_allclose(inputs[fibre], [*answer, rest - level, *memory[fibre]], atol=1e-9)
             np.testing.assert_allclose(targets[fibre], [*answer, rest - level], atol=1e-9)
             seen[fibre] += 1
             levels[fibre] = level + max(1 / 50, 1 / seen[fibre]) * (rest - level)
             memory[fibre] = 0.7 * (memory[fibre] + answer)
-        np.testing.assert_allclose(history.level, list(levels), atol=1e-9, err_msg=str(number))
+        np.testing.assert_allclose(history.level, levels, atol=1e-9, err_msg=str(number))
         np.testing.assert_array_equal(history.seen, seen)
 
 

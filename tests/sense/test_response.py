@@ -54,6 +54,12 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived() -> None:
     after = Response.fit(places, windows, history, alive)
     assert np.array_equal(before.table, after.table)
     assert np.array_equal(before.memory, after.memory)
+    lived = alive[:, 0]
+    left = settled(windows, history, after.memory, after.usual)[lived, 0] - answer(places)[lived, 0]
+    assert np.sqrt((left**2).mean()) < 0.15  # noise is 0.1, and what memory shows about 3
+    assert after.usual[0] == pytest.approx(history[lived, 0].mean(axis=0))
+    middle = answer(np.zeros((1, 2)))[0]
+    np.testing.assert_allclose(after.table[STEPS // 2, STEPS // 2], middle, atol=0.1)
     alive[:, 1] = False
     gone = Response.fit(places, windows, history, alive)
     assert not gone.table[:, :, 1].any()

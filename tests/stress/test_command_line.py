@@ -191,7 +191,7 @@ def command_lines(draw: st.DrawFn) -> list[str]:
     command = draw(st.sampled_from(sorted(COMMANDS)))
     arguments, options = COMMANDS[command]
     wrong = st.one_of(
-        st.sampled_from(PATHS), st.sampled_from(HOSTILE), st.text(st.characters(exclude_characters="\0"), max_size=20)
+        st.sampled_from(PATHS), st.sampled_from(HOSTILE), st.text(st.characters(exclude_characters="\0/"), max_size=20)
     )
     one_in = draw(st.sampled_from((1, 3, 6)))
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 
+from sense.rig import clock
 from sense.rig.clock import SampleClock
 
 SETTLE_S = 0.5
@@ -113,3 +115,17 @@ def test_a_step_of_the_delay_is_caught_up_with_without_ever_going_back() -> None
 def test_there_is_no_time_before_the_first_block() -> None:
     with pytest.raises(ValueError, match="no block"):
         SampleClock(1e-3).times(0, 1)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
+def test_the_line_under_the_points_is_the_highest_at_their_middle(seed: int, count: int, size: float) -> None:
+    """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
+    rng = np.random.default_rng(seed)
+    x, y = np.sort(rng.uniform(0, 100, count)), size * rng.uniform(0, 1, count)
+    offset, slope = clock._line_under(list(zip(x.tolist(), y.tolist(), strict=True)))
+    steepest = clock._MAX_SKEW
+    below = np.column_stack([np.ones(count), x])
+    best = linprog([-1, -x.mean()], below, y, bounds=[(None, None), (-steepest, steepest)])
+    assert abs(slope) <= steepest
+    assert (offset + slope * x <= y + 1e-12).all()
+    assert offset + slope * x.mean() == pytest.approx(-best.fun, abs=1e-9)

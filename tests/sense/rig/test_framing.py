@@ -180,6 +180,9 @@ def test_a_payload_that_is_no_frame_counts_as_damaged_although_its_check_is_righ
 def test_the_bytes_of_a_frame_are_as_documented() -> None:
     """A board of another make relies on them. CRC-16/CCITT-FALSE of "123456789" is 29B1."""
     assert encode(Request(Kind.START)) == b"\0\x02\x03" + _check_bytes(b"\x02\x03") + b"\0"
+    for period in range(1, 4000, 7):
+        coded = cobs_encode(Settings(period, 0x0FF, 4).pack())
+        assert encode(Settings(period, 0x0FF, 4)) == b"\0" + coded + _check_bytes(coded) + b"\0"
     assert _check_bytes(b"123456789") == bytes([0x80, 0x80 | 0x29B1 >> 7 & 0x7F, 0x80 | 0x29B1 & 0x7F])
     assert Settings(1_000_000, 0x0FF, 4).pack() == bytes.fromhex("02 40420f00 ff00 04")
     assert Ack(3, 1, Settings(1, 2, 3)).pack() == bytes.fromhex("82 03 01 01000000 0200 03")

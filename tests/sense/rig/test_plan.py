@@ -59,6 +59,8 @@ def test_presses_go_in(depth):
 def test_a_plan_from_a_file(tmp_path):
     (tmp_path / "plan.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n")
     assert read_plan(tmp_path / "plan.csv", 3.0).document() == [[1, 2, 3], [-3.5, 4, 3]]
+    (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
+    assert read_plan(tmp_path / "gaps.csv", 2.5).document() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
     (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,1.5\n")
     assert read_plan(tmp_path / "deep.csv", 3.0).document() == [[1, 2, 1.5]]
 

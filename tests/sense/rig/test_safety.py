@@ -145,8 +145,8 @@ def test_states_that_let_a_move_go_on(change: dict[str, object]) -> None:
     watch(replace(REST, **change), LIMITS, 10.0, until_s=10.0)  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("speed", "rests"), [(0.9, True), (1.1, False)])
-def test_a_tip_rests_below_a_millimetre_a_second(speed: float, rests: bool) -> None:
+@pytest.mark.parametrize(("speed", "rests"), [(0.9, True), (1.0, True), (1.1, False)])
+def test_a_tip_rests_up_to_a_millimetre_a_second(speed: float, rests: bool) -> None:
     actor = Actor(replace(REST, speed_mm_s=speed), replace(REST, protective_stop=True))
     with contextlib.nullcontext() if rests else pytest.raises(RigFault):
         actor.wait()
