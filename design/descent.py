@@ -152,6 +152,9 @@ class Descent:
             group["lr"] = rate
         self._optimiser.zero_grad()
         total.backward()
+        for variable in (self.fibres.spans, self.fibres.cross):
+            if variable.grad is not None:  # where all presses are told apart beyond doubt, or none are, it may be NaN
+                variable.grad.nan_to_num_(0.0, 0.0, 0.0)
         self._optimiser.step()
 
     def _penalty(self, travel: Tensor, cross: Tensor, margin: float) -> Tensor:

@@ -58,7 +58,7 @@ def disorder_area(pad: Morphology) -> float:
     `disorder` approaches it times (samples - 1) / (M + 1).
     """
     travel, cross, _ = fibre_axes(pad)
-    return float(kernels.disorder_area(travel[0], cross[0], population_slopes(travel, cross)[0]))
+    return max(0.0, float(kernels.disorder_area(travel[0], cross[0], population_slopes(travel, cross)[0])))
 
 
 def idle_share(signals: Array, threshold: float = 0.0) -> float:

@@ -109,7 +109,7 @@ def search(
         _run(problem, states, pool, stop, report, checkpoints)
         found = _candidates(problem, states, pool, stop)
     with profiling.stage("check and score"):
-        best, violations = _choose(found, problem)
+        best, violations = _choose([*found, *([origin] if origin else [])], problem)
         terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
     if checkpoints and not stop.reason:
         checkpoints.clear()

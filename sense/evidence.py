@@ -8,7 +8,7 @@ measured on presses that the prediction was not fitted on: the heights of health
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
 """Offsets of the rest that are looked for, in spreads of the residual of the rest."""
+NEVER = 1e5
+"""A height that no climb reaches."""
 HYPOTHESES = ("stuck", "silent", "weak", "odd", "noisy", *(f"offset {size:+g}" for size in OFFSETS))
 """Reads one value; answers nothing; answers by half; answers as to another press; is five times as noisy; and has a
 rest that was moved by one of `OFFSETS`."""
@@ -212,6 +214,12 @@ class Tail:
         """
         rows = [_tail(stay, begin) for stay, begin in ratios]
         return cls(np.stack([level for level, _ in rows]), np.stack([slope for _, slope in rows]))
+
+    def without(self, hypothesis: str) -> "Tail":
+        """One by which no height of a hypothesis is rare."""
+        level = self.level.copy()
+        level[:, HYPOTHESES.index(hypothesis)] = NEVER
+        return replace(self, level=level)
 
     def rarity(self, heights: Array, lost: int) -> Array:
         """(..., H) heights to minus the logarithm of how often a healthy pad passes them, a press, without `lost`

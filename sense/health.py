@@ -23,7 +23,15 @@ from design.settings import validated
 
 from .document import LEAST_SPREAD_V
 from .evidence import HYPOTHESES, Evidence, Tail
-from .health_document import FORMAT, LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, HealthDocument, refuse_unsound
+from .health_document import (
+    FORMAT,
+    LEAST_PRESSES,
+    MAX_FALSE_ALARMS,
+    MOST_LOST,
+    WEAK_PRESSES,
+    HealthDocument,
+    refuse_unsound,
+)
 from .limits import numbers, stream_of
 from .residuals import MEMBERS, REST, Shapes, Weights, expected, member, shapes_of, traces_of, train
 
@@ -94,7 +102,8 @@ class HealthModel:
         """Learn from a recording of a healthy pad.
 
         Presses that lack a reading (NaN) of a living fibre are left out. One living fibre is enough for what its own
-        readings tell (stuck, noisy, offset); whether it answers rightly only two or more tell.
+        readings tell (stuck, noisy, offset); whether it answers rightly only two or more tell. From fewer than
+        WEAK_PRESSES a press at an unusual place looks like a weak fibre; such models never call one weak.
 
         Args:
             readings: (R, C) volts, NaN where missing. times_s: (R,) ascending, s.
@@ -147,7 +156,7 @@ class HealthModel:
             shapes=shapes,
             weights=weights,
             evidence=evidence,
-            tail=Tail.fit(ratios),
+            tail=Tail.fit(ratios) if len(traces) >= WEAK_PRESSES else Tail.fit(ratios).without("weak"),
             rests=np.stack([rests.min(axis=0), rests.max(axis=0)]),
             fibres=readings.shape[1],
             dead=tuple(dead.tolist()),

@@ -20,6 +20,9 @@ MOST_LOST = 2
 """What is chance is learnt for no to this many fibres left out."""
 LEAST_PRESSES = 300
 """Fewest presses that health is learnt from."""
+WEAK_PRESSES = 850
+"""Presses from which a fibre that answers by half is told from one pressed where it seldom was; from 680, simulated
+pads gave a false alarm in every other recording, from 850 none in 12."""
 POSITIVE = (
     *("shapes.inputs", "shapes.targets", "evidence.scale", "evidence.other_spread", "evidence.noise"),
     *("evidence.noise_spread", "evidence.constant", "evidence.innovation", "tail.slope"),

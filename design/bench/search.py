@@ -63,6 +63,6 @@ BENCH = Bench(
     trials,
     "localisation error (grid units)",
     ("genetic", GENERATIONS[-1]),
-    ("with rules", STEPS[-1]),
+    ("descent", STEPS[0]),
     plain=(),
 )

@@ -12,6 +12,8 @@ from .table import SUMMARY_FORMAT, summary_rows, write_bench, write_csv
 
 ROUNDS = 2, 5
 """Every trial is in the first two; the others are for those not settled."""
+ENOUGH_S = 300.0
+"""After so long no more rounds begin than every trial has."""
 RECHECKS = 5
 """Further rounds for trials that seem slower than before."""
 
@@ -35,7 +37,10 @@ def run_benches(
         if measure(bench, measured[bench.name], lambda step: report(f"{bench.name}, {what}, {step}"), again):
             documents[bench.name] = write_bench(bench, measured[bench.name], out)
 
+    begin = time.perf_counter()
     for number in range(ROUNDS[1]):
+        if number >= ROUNDS[0] and time.perf_counter() - begin > ENOUGH_S:
+            break
         for bench in benches:
             settled = measured[bench.name].settled
             take(bench, f"round {number + 1}", lambda key, s=settled, n=number: n < ROUNDS[0] or not s(key))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from design import Morphology
 from design.errors import InputError
-from sense import Recording, residuals
+from sense import Recording, health, residuals
 from sense import settings as sense_settings
 from sense.evidence import HYPOTHESES, Tail, climb, noise_of
 from sense.health import RECORDED, HealthModel, files_of
@@ -31,7 +31,7 @@ DOCUMENT, WEIGHTS = (path.name for path in files_of("", RECORDED))
 
 @pytest.fixture(scope="module")
 def pad() -> Recording:
-    """900 presses on a simulated pad of six fibres."""
+    """PRESSES on a simulated pad of six fibres."""
     return simulate(Morphology.random(3, knots=3, seed=5), sense_settings.Rig(presses=PRESSES, seed=1, drift_mv=10))
 
 
@@ -39,6 +39,7 @@ def pad() -> Recording:
 def quick_training() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(residuals, "STEPS", 400)
+        patch.setattr(health, "WEAK_PRESSES", LEARNT)  # of this pad they suffice
         yield
 
 
@@ -404,3 +405,12 @@ def test_on_the_published_recording_faults_are_named_and_health_is_not(published
         found = later(model, readings, short, first=1000)[0]
         assert set(found.fibres) <= ({1, 4} if fault is swapped else {1})
         assert 300 <= found.press <= 300 + within
+
+
+def test_health_learnt_from_few_presses_calls_no_fibre_weak(pad: Recording) -> None:
+    model = learn(pad.readings, pad, 500)
+    end = int(pad.begun[500])
+    assert not examine(model, pad.readings[:end], pad.times_s[:end], pad.begun[:500], pad.lifted[:500])
+    readings = pad.readings.copy()
+    weak(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
+    assert "weak" not in {finding.kind for finding in later(model, readings, pad, 500)}
