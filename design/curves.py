@@ -108,6 +108,7 @@ def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> 
     Fibres that touch or run on each other count at the middle of what they share. Without `across` only fibres of
     one family are looked at.
     """
+    instance("across", across, bool)
     lines = np.array([shapely.LineString(points) for points in flatten(pad, tolerance)])
     first, second = shapely.STRtree(lines).query(lines)
     wanted = (first < second) & (across | ((first < pad.grid) == (second < pad.grid)))

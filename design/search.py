@@ -101,6 +101,7 @@ def search(
         raise InputError(f"report is {shown(report)}, expected a function")
     if executor is not None:
         instance("executor", executor, Executor)
+    instance("resume", resume, bool)
     states = checkpoints.begin(resume) if checkpoints else {}
     stop = _Stop(begin, time_budget)
     kept = sum(bool(state["done"]) for state in states.values())

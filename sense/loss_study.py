@@ -67,6 +67,7 @@ def robustness(
         InputError: neither way wanted, too few presses, a recording seen in a recalibration or that does not suit the
             localizer, a localizer that knows no lost fibres, or networks in `keep_in` of other settings.
     """
+    instance("retrain", retrain, bool)
     if localizer is None and not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
     instance("recording", recording, Recording)

@@ -45,6 +45,10 @@ def test_a_folder_has_a_digest_that_follows_its_content(tmp_path):
     before = sha256(tmp_path)
     (tmp_path / "a").write_text("2")
     assert sha256(tmp_path) != before
+    (tmp_path / "a").write_text("1")
+    assert sha256(tmp_path) == before
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert sha256(tmp_path) != before
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")

@@ -65,3 +65,20 @@ def test_staged_files_appear_together_or_not_at_all(tmp_path):
     assert list((tmp_path / "out").iterdir()) == []
     work(fails=False)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["one", "two"]
+
+
+def test_a_folder_in_the_way_of_a_staged_file_moves_none(tmp_path):
+    (tmp_path / "two").mkdir()
+    (tmp_path / "one").write_text("old")
+
+    def work():
+        with staged(tmp_path) as folder:
+            for name in ("one", "two"):
+                (folder / name).write_text("new")
+
+    with pytest.raises(InputError, match="two: is a folder, expected a file or nothing"):
+        work()
+    assert (tmp_path / "one").read_text() == "old"
+    (tmp_path / "two").rmdir()
+    work()
+    assert [(tmp_path / name).read_text() for name in ("one", "two")] == ["new", "new"]

@@ -136,6 +136,14 @@ def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
         search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
 
 
+def test_a_state_of_another_start_is_refused(tmp_path):
+    problem = Problem(Pad(), (Contact(),), SMALL, QUICK)
+    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance(problem, 0, None).state)
+    (tmp_path / "search" / "start_0000.npz").rename(tmp_path / "search" / "start_0001.npz")
+    with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
+        search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
+
+
 def test_a_generation_that_fits_no_memory_is_refused():
     settings = Search(method="genetic", population=100_000)
     with pytest.raises(InputError, match="population is 100000: that takes"):

@@ -1,3 +1,5 @@
+from typing import Any
+
 from design.bench import harness
 from fabricate import bench
 
@@ -9,7 +11,9 @@ def test_every_way_stays_within_the_tolerance(monkeypatch):
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     measured = harness.Measured()
     harness.measure(bench.BENCH, measured, lambda step: None, lambda key: False)
-    rows = [dict(zip(("case", "way", "size"), key, strict=False)) | dict(row) for key, row in measured.found.items()]
+    rows: list[dict[str, Any]] = [
+        {"case": case, "way": way, "size": size, **row} for (case, way, size, _), row in measured.found.items()
+    ]
     assert len(rows) == 2 * 3 + 2 * 2
     assert {row["way"] for row in rows if row["case"] == "N=1"} == {"manifold3d", "direct CAD", "fused CAD"}
     for row in rows:

@@ -254,7 +254,8 @@ def test_total_variation_is_as_good_as_the_best_there_is(seed: int) -> None:
     if not there.any():
         assert np.isnan(found).all()
         return
-    assert values[there].min() <= found.min()
+    least = 5e-324  # between subnormal values there is nothing
+    assert values[there].min() <= found.min() + least
     assert found.max() <= values[there].max()
     cost = np.abs(values - found)[there].sum() + lam * np.abs(np.diff(found)).sum()
     assert cost <= _slow_variation(values, lam) * (1 + 1e-9) + 1e-300

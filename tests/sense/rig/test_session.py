@@ -10,7 +10,7 @@ from sense.recorder import Recorder
 from sense.recording import Recording
 from sense.rig.devices import RigFault
 from sense.rig.plan import PressPlan
-from sense.rig.session import Session
+from sense.rig.session import Session, require_safe_plan
 
 from .fakes import RIG, FakeArm, FakeConverter, Time
 
@@ -74,6 +74,12 @@ def test_nothing_moves_before_all_of_the_plan_is_safe(tmp_path, change, cause):
         run(tmp_path, arm, converter, options, plan)
     assert fault.value.cause == "refused"
     assert arm.moves == []
+
+
+def test_a_pose_above_the_pad_is_as_safe_as_the_press_below_it():
+    require_safe_plan(PLAN, RIG.model_copy(update={"clearance_mm": 70.0}))
+    with pytest.raises(RigFault, match=r"z 120\.5 mm; allowed 40 to 120 mm"):
+        require_safe_plan(PLAN, RIG.model_copy(update={"clearance_mm": 70.5}))
 
 
 def test_an_arm_outside_its_box_is_not_moved(tmp_path):
@@ -183,3 +189,11 @@ def test_times_of_a_resumed_recording_go_on(tmp_path):
     times = Recording.open(tmp_path / "run").times_s
     assert (np.diff(times) > 0).all()
     assert np.diff(times).max() == pytest.approx(1, abs=0.2)
+
+
+def test_a_reading_of_the_very_moment_came_before_the_command(tmp_path):
+    arm, converter, options = rig(tmp_path)
+    with recorder(tmp_path) as keep:
+        session = Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep)
+        session._recent.extend([0.25, 0.5, 0.75])
+        assert [session._after(moment_s) for moment_s in (0.0, 0.25, 0.5, 0.74, 0.75)] == [3, 2, 1, 1, None]
