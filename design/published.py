@@ -1,7 +1,10 @@
 """Files of the published study: MATLAB morphologies with the presses and signals they were sampled at."""
 
+import faulthandler
 import io
+import os
 import struct
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
@@ -34,6 +37,7 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
     stored = read_bytes(path)
     try:
         _refuse_swollen(stored)
+        _refuse_crashing(stored)
         content = scipy.io.loadmat(io.BytesIO(stored))
     except Exception as error:  # SciPy's reader raises whatever a torn stream leads it to
         raise InputError(f"{path}: not a readable MATLAB file, torn or of another kind ({error})") from error
@@ -56,6 +60,24 @@ def _refuse_swollen(stored: bytes) -> None:
             if size > MOST_BYTES:
                 raise ValueError(f"it unpacks to more than {MOST_BYTES} bytes")
         at += 8 + length
+
+
+def _refuse_crashing(stored: bytes) -> None:
+    """Raise ValueError where SciPy's compiled reader would take the whole process down: a child tries it first."""
+    if not hasattr(os, "fork"):
+        return
+    child = os.fork()
+    if child == 0:
+        try:
+            faulthandler.disable()
+            warnings.simplefilter("ignore")
+            scipy.io.loadmat(io.BytesIO(stored))
+        except BaseException:  # it is for the parent to tell
+            pass
+        finally:
+            os._exit(0)
+    if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
+        raise ValueError("the reader breaks down over it")
 
 
 def load_morphology(path: Path) -> Morphology:

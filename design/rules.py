@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 _TOLERANCE_MM = 1e-3
 
-_FINEST_TURN = 2e-5
+_FINEST_TURN = 1e-4
 """Radians between the points at which bends are looked at, at least: matters for radii far beyond the pad's size."""
 
 _CROSSING_TOLERANCE = 1e-6

@@ -16,7 +16,7 @@ from numba import njit
 
 from .exact import local_cubic, make_scratch, stretches_inside
 from .press import INVERSE, MANHATTAN, UNIFORM, weigh
-from .quadrature import HALVINGS, PRECISION, across, kronrod
+from .quadrature import HALVINGS, across, kronrod, precise
 from .reach import EPS, touched_range
 
 GRAZING = 0.02
@@ -124,10 +124,11 @@ def _inner(
                 out[x] += sign * (place[x, 0] + rising * place[x, 1])
         return
     stack[0, 0], stack[0, 1] = a, b
-    top = 0
+    top, pieces = 0, 0
     while top >= 0:
         low, high = stack[top]
-        if kronrod(span, low, high, radius, weight, length)[1] > PRECISION and top < HALVINGS:
+        pieces += 1
+        if top < HALVINGS and not precise(kronrod(span, low, high, radius, weight, length)[1], pieces):
             stack[top, 1] = 0.5 * (low + high)
             top += 1
             stack[top, 0], stack[top, 1] = 0.5 * (low + high), high

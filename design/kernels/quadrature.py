@@ -46,6 +46,9 @@ GAUSS = np.array(
 )
 PRECISION = 1e-11
 HALVINGS = 48
+PIECES, PATIENCE = 500, 100
+"""Beyond PIECES, what counts as precise doubles with every PATIENCE more: where rounding is all that is left, halving
+would never end."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -82,18 +85,25 @@ def kronrod(span: Any, a: float, b: float, radius: float, weight: int, length: i
 
 
 @njit(cache=True, error_model="numpy")
+def precise(error: float, pieces: int) -> bool:
+    """Whether a piece need not be halved, the `pieces`-th that is looked at."""
+    return error <= PRECISION * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
+
+
+@njit(cache=True, error_model="numpy")
 def measure(span: Any, a: float, b: float, radius: float, weight: int, length: int, stack: Any) -> float:
     """Integral of the density over a stretch [a, b] that lies wholly inside the press."""
     if weight == UNIFORM and length == MANHATTAN:
         mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
         return (b - a) * (span[1] + abs(mean_rise))
-    total = 0.0
+    total, pieces = 0.0, 0
     stack[0, 0], stack[0, 1] = a, b
     top = 0
     while top >= 0:
         low, high = stack[top]
         part, error = kronrod(span, low, high, radius, weight, length)
-        if error <= PRECISION or top >= HALVINGS:
+        pieces += 1
+        if precise(error, pieces) or top >= HALVINGS:
             total += part
             top -= 1
         else:

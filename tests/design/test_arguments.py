@@ -10,7 +10,9 @@ from design import arguments
 from design.errors import InputError
 
 
-@pytest.mark.parametrize(("value", "allowed"), [(2, True), (5, True), (1, False), (6, False), (True, False), (3.0, False)])
+@pytest.mark.parametrize(
+    ("value", "allowed"), [(2, True), (5, True), (1, False), (6, False), (True, False), (3.0, False)]
+)
 def test_a_whole_number_is_one_within_its_bounds(value, allowed):
     if allowed:
         assert arguments.whole("n", np.int8(value), 2, 5) == value
@@ -43,5 +45,5 @@ def test_a_path_is_neither_empty_nor_longer_than_systems_take():
     longest = "a" * arguments.LONGEST_PATH
     assert arguments.path("file", longest) == Path(longest)
     for value in ("", "a\0b", longest + "a", 3, None):
-        with pytest.raises(InputError, match="file is .*, expected a path"):
+        with pytest.raises(InputError, match=r"file is .*, expected a path"):
             arguments.path("file", value)

@@ -72,6 +72,21 @@ def test_ctrl_c_leaves_the_best_and_what_to_resume_from(tmp_path):
     assert (tmp_path / "pad" / "search" / "start_0000.npz").exists()
 
 
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_an_end_from_outside_is_as_ctrl_c_unless_it_is_ignored():
+    """As under nohup, which ignores that the terminal hangs up."""
+    code = (
+        "import signal\n"
+        "from design.endings import _prepare\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "_prepare()\n"
+        "print(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN)\n"
+        "print(signal.getsignal(signal.SIGTERM) is signal.default_int_handler)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True"]
+
+
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
     code, _, err = finished(design(tmp_path, "--scheduler", "tcp://127.0.0.1:9"))
     assert code == 2

@@ -13,7 +13,9 @@ from design.errors import InputError
 from design.losses import lost_subsets
 from design.settings import validated
 from sense import Localizer, Recording, Rig, calibrate, evaluate, import_mat, locate
-from sense.calibration import split_presses
+from sense.calibration import learn_health, split_presses
+from sense.health import FELT, RECORDED, HealthModel
+from sense.monitor import Finding
 from sense.settings import Localizer as Options
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
@@ -206,6 +208,25 @@ def test_levels_and_test_presses_that_are_not_there_are_refused(localizer: Local
         evaluate(localizer, recording, [])
     with pytest.raises(InputError, match="test press 300 of the localizer: no such press, allowed are 0 to 299"):
         evaluate(replace(localizer, test=(0, 300)), recording, [0])
+
+
+def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Localizer, recording: Recording) -> None:
+    whole, without = (locate(localizer, recording, lost).places_mm for lost in ((), (1,)))
+    found = locate(localizer, recording, findings=[Finding(9, 5, (1,), "weak", 6.0)]).places_mm
+    assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
+    np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)
+    np.testing.assert_allclose(found[5:], without[5:], atol=1e-4)
+
+
+def test_health_is_learnt_from_the_presses_that_were_not_held_back(
+    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(HealthModel, "fit", lambda readings, times_s, begun, lifted, **options: (begun, lifted))
+    learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
+    edges = learn_health(recording, localizer)
+    assert 0 < len(localizer.test) < len(learnt)
+    np.testing.assert_array_equal(edges[RECORDED], (recording.begun[learnt], recording.lifted[learnt]))
+    assert len(edges[FELT][0]) == len(edges[FELT][1]) == len(learnt)
 
 
 @pytest.mark.parametrize("rate_hz", [1e-300, 0.0999, np.inf])

@@ -15,10 +15,11 @@ from design import Morphology
 from design.errors import InputError
 from sense import Recording, health, residuals
 from sense import settings as sense_settings
+from sense.document import LEAST_SPREAD_V
 from sense.evidence import HYPOTHESES, Tail, climb, noise_of
-from sense.health import RECORDED, HealthModel, files_of
+from sense.health import RECORDED, HealthModel, _dead, checked_presses, files_of
 from sense.health_document import LEAST_PRESSES
-from sense.monitor import TEXTS, Finding, Monitor, examine, lines
+from sense.monitor import TEXTS, Finding, Monitor, _Press, examine, lines
 from sense.residuals import INPUTS, MEMBERS, TARGETS, TRACE, expected, traces_of
 from sense.rig.simulated import simulate
 
@@ -251,6 +252,19 @@ def test_a_bad_fibre_is_named_once_with_its_fault(
     assert sorted(named) == sorted(guilty)
 
 
+@pytest.mark.parametrize(("beyond", "kind"), [(-1.01, "open"), (-0.99, "stuck"), (0.99, "stuck"), (1.01, "open")])
+def test_one_value_farther_off_than_rests_ever_spread_is_open_and_else_stuck(
+    model: HealthModel, beyond: float, kind: str
+) -> None:
+    low, high = model.rests[:, 1]
+    value = (high if beyond > 0 else low) + beyond * (high - low)
+    monitor = Monitor(model)
+    fibres = len(model.living)
+    flat, none = np.full((fibres, TRACE), value), np.zeros((fibres, 1))
+    monitor._recent.append(_Press(flat, none.astype(np.float32), none, np.zeros(fibres), np.ones(fibres, bool)))
+    assert monitor._kind(1, 0, 0) == kind
+
+
 def test_a_healthy_pad_is_left_in_peace(pad: Recording, model: HealthModel) -> None:
     assert later(model, pad.readings, pad) == []
 
@@ -369,6 +383,47 @@ def test_a_recording_that_does_not_fit_is_refused(pad: Recording, model: HealthM
         Monitor(model).update(pad.readings[:60, :5], 10, 30)
     with pytest.raises(InputError, match="begun is 0, allowed is a whole number from 1"):
         Monitor(model).update(pad.readings[:60], 0, 30)
+
+
+@pytest.mark.parametrize(
+    ("begun", "lifted", "sound"),
+    [
+        ([1, 5], [5, 9], True),
+        ([0, 5], [4, 9], False),
+        ([1, 4], [5, 9], False),
+        ([1, 5], [1, 9], False),
+        ([1, 5], [2, 5], False),
+        ([1, 5], [5, 10], False),
+    ],
+)
+def test_presses_follow_each_other_within_the_readings(begun: list[int], lifted: list[int], sound: bool) -> None:
+    readings, times_s = np.zeros((9, 2)), np.arange(9.0)
+    if sound:
+        found = checked_presses(readings, times_s, begun, lifted)
+        assert [part.tolist() for part in found[2:]] == [begun, lifted]
+    else:
+        with pytest.raises(InputError, match="each to end before the next begins"):
+            checked_presses(readings, times_s, begun, lifted)
+
+
+def test_fibres_that_read_one_value_or_stand_at_the_end_of_their_range_are_dead() -> None:
+    """At the end for more than half of the time, which most fibres are not."""
+    rng = np.random.default_rng(0)
+    readings = 1.5 + 0.01 * rng.standard_normal((1000, 9))
+    readings[:, 1] = 1.5
+    readings[:510, 2] = readings[:, 2].max()
+    readings[:490, 3] = readings[:, 3].max()
+    readings[:510, 4] = readings[:, 4].min()
+    readings[:510, 5] = np.nan
+    readings[:490, 6] = np.nan
+    for fibre, spread in ((7, 0.99), (8, 1.01)):
+        readings[:, fibre] = 1.5 + spread * LEAST_SPREAD_V * rng.permutation(np.linspace(0, 1, 1000))
+    assert _dead(readings).tolist() == [1, 2, 4, 5, 7]
+
+
+def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthModel) -> None:
+    for alarms in (1e-3, 1e-5):
+        assert np.exp(-replace(model, false_alarms=alarms).threshold) == pytest.approx(alarms / len(HYPOTHESES))
 
 
 def test_what_cannot_be_learnt_from_is_refused(pad: Recording) -> None:

@@ -72,6 +72,31 @@ def test_the_rate_rises_once_and_ends_at_nothing() -> None:
     assert (np.diff(rates[peak:]) < 0).all()
 
 
+@pytest.mark.parametrize(("share", "rate"), [(0.05, 0.25), (0.1, 0.5), (0.2, 1.0), (0.4, 0.8535533906), (0.6, 0.5)])
+def test_the_rate_rises_along_a_line_and_falls_along_a_cosine(share: float, rate: float) -> None:
+    assert one_cycle(share) == pytest.approx(rate)
+
+
+def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of presses at the corners of the known places, half of a normal distribution remains on either axis."""
+    corners = np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32)
+    samples = training.Samples(np.zeros((4, 1, 1), np.float32), np.ones((4, 1), bool), corners)
+    seen: list[torch.Tensor] = []
+
+    def spy(table: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+        seen.append(places)
+        return looked_up(table, places)
+
+    monkeypatch.setattr(training, "looked_up", spy)
+    options = sense_settings.Localizer(hidden=8, layers=1, lost=0)
+    member = training._Member(samples, samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
+    for _ in range(500):
+        member._loss()
+    inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
+    assert inwards.min() >= -1e-6
+    assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([training.MOVED] * 2, rel=0.06)
+
+
 def test_a_masked_fibre_changes_nothing(localizer: Localizer, recording: Recording) -> None:
     presses = localizer.inputs(recording)
     spoilt = presses.inputs.copy()
@@ -183,6 +208,18 @@ def test_recordings_that_do_not_suit_are_refused(localizer: Localizer, recording
     )
     with pytest.raises(InputError, match="readings a second"):
         localizer.inputs(faster)
+
+
+@pytest.mark.parametrize(("ratio", "suits"), [(0.74, False), (0.76, True), (1.24, True), (1.26, False)])
+def test_a_recording_is_up_to_a_quarter_faster_or_slower(
+    localizer: Localizer, recording: Recording, ratio: float, suits: bool
+) -> None:
+    other = replace(recording, times_s=recording.times_s / ratio)
+    if suits:
+        assert np.isfinite(localizer.locate(localizer.inputs(other)).places_mm).all()
+    else:
+        with pytest.raises(InputError, match="readings a second"):
+            localizer.inputs(other)
 
 
 def raw(windows: np.ndarray, history: np.ndarray | None = None) -> Inputs:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import settings as checked
 from hypothesis import strategies as st
@@ -15,11 +16,12 @@ from hypothesis import strategies as st
 import padforge
 from design.errors import InputError
 from sense import Localizer, Recording, adaptation, evaluate
-from sense.adaptation import adapt
+from sense.adaptation import FAR_NOISE, _Presses, adapt
 from sense.correction import _corrected, _parts, fit_correction
 from sense.evaluation import distances
-from sense.recalibration import recalibrate
-from sense.training import Samples
+from sense.localizer import Found
+from sense.recalibration import _Trial, recalibrate
+from sense.training import INPUT_NOISE, MOVED, Samples
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])
 GAINS = np.array([0.8, 1.2, 1.1, 0.9])
@@ -51,6 +53,47 @@ def short() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(adaptation, "STEPS", 15)
         yield
+
+
+def off_by(*amounts: float, radius: float = 1.0) -> Found:
+    """Presses in the middle, found to the side by so many mm."""
+    count = len(amounts)
+    radii = np.full(count, radius)
+    return Found(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
+
+
+def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> _Trial:
+    places = np.zeros((4, 2))
+    return _Trial(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
+
+
+def test_a_gain_counts_every_number_of_lost_fibres_alike() -> None:
+    """With all fibres errors shrink by 1, 2, 3, 4 mm, with one lost by 0 and by 4 mm: by 1.5 to 3 in the mean."""
+    before = {(): off_by(2, 4, 6, 8), (0,): off_by(5, 5, 5, 5), (1,): off_by(5, 5, 5, 5)}
+    after = {(): off_by(1, 2, 3, 4), (0,): off_by(5, 5, 5, 5), (1,): off_by(1, 1, 1, 1)}
+    gain, error = trial_of([[0, 1], [2, 3]]).gain(before, after)
+    assert gain == pytest.approx(2.25)
+    assert error == pytest.approx(np.std([1.5, 2.0, 2.5, 3.0], ddof=1) / 2)
+    assert trial_of([[0, 1], [2, 3]]).gain(after, before)[0] == pytest.approx(-2.25)
+
+
+def test_a_fold_is_changed_by_the_other_presses_only() -> None:
+    trial = trial_of([[1, 3], [0, 2]], np.arange(4))
+    seen: list[list[int]] = []
+
+    def change(localizer: int, raw: np.ndarray, places_mm: np.ndarray) -> int:
+        assert places_mm.shape == (2, 2)
+        seen.append(raw.tolist())
+        return localizer + 1
+
+    assert trial.changed([10, 20], change) == [11, 21]  # pyright: ignore
+    assert seen == [[0, 2], [1, 3]]
+
+
+def test_radii_that_hold_are_not_narrowed_and_others_widened() -> None:
+    found = {(): off_by(0.1, 0.1, 0.1, 0.1), (0,): off_by(3, 3, 3, 3), (1,): off_by(3, 3, 3, 3)}
+    widened = trial_of([[0, 1], [2, 3]]).widened(found)
+    np.testing.assert_allclose(widened, [[1, 1, 1], [3 / np.sqrt(2), 3, 3]])
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +218,40 @@ def test_adapting_leaves_lost_fibres_alone(localizer: Localizer, recording: Reco
     weights = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
     assert all(np.isfinite(weight).all() for weight in weights.values())
     assert not np.array_equal(weights["last.w"], localizer.weights["last.w"])
+
+
+@pytest.mark.parametrize(("old", "moved"), [(0.0, True), (1e18, False)])
+def test_the_more_was_learnt_before_the_less_new_presses_count(
+    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch, old: float, moved: bool
+) -> None:
+    """Of what was learnt before nothing is kept where it counts nothing, and all where it alone counts."""
+    presses = localizer.inputs(recording)[NEW]
+    samples = Samples(presses.inputs, presses.alive, localizer.scaling.targets(recording.presses_mm[NEW]))
+    monkeypatch.setattr(adaptation, "OLD_PRESSES", old)
+
+    def adapted(slope: float) -> np.ndarray:
+        monkeypatch.setattr(adaptation, "_change", lambda found, before: slope * found.sum())
+        rng = np.random.default_rng(0)
+        return adapt(localizer.weights, samples, localizer.table, 2, rng)["last.b"]
+
+    before = localizer.weights["last.b"]
+    assert np.allclose(adapted(0.0), before, atol=1e-6) != moved
+    assert np.array_equal(adapted(0.0), adapted(1.0)) == moved
+
+
+def test_presses_are_moved_nearby_or_to_anywhere_on_the_pad() -> None:
+    """Of a fibre that reads the place itself, from presses all made at one place."""
+    grid = np.linspace(-1, 1, 9, dtype=np.float32)
+    table = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)[:, :, None]
+    at = np.tile(np.float32([0.25, -0.5]), (5, 1))
+    presses = _Presses(Samples(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0))
+    entries, places = presses.nearby()
+    assert (entries[0, :, :2] - places).std().item() == pytest.approx(INPUT_NOISE, rel=0.2)
+    np.testing.assert_allclose(places.std(dim=0), [MOVED] * 2, rtol=0.2)
+    np.testing.assert_allclose(places.mean(dim=0), at[0], atol=0.05)
+    far = torch.cat([presses.anywhere()[0, :, :2] for _ in range(20)]).numpy()
+    np.testing.assert_allclose(far.mean(axis=0), 0, atol=0.06)
+    np.testing.assert_allclose(np.square(far).mean(axis=0), 1 / 3 + FAR_NOISE**2, rtol=0.06)
 
 
 def test_the_command_writes_a_whole_model(

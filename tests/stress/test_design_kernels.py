@@ -64,6 +64,22 @@ def whole_lengths(pad: Morphology, contact: Contact) -> Array:
                      for knots, a in zip(pad.knots, axes, strict=True)])  # fmt: skip
 
 
+def test_a_weight_that_rounding_blurs_is_summed_in_time():
+    """On a span all but vertical a small press is known to some digits only; halving it would go on for ever."""
+    steep = np.empty((6, 7, 2))
+    steep[:] = Morphology.straight(3).knots[:, :1]
+    for fibre, axis in enumerate((0, 0, 0, 1, 1, 1)):
+        steep[fibre, :, axis] = np.linspace(0, 4, 7)
+    steep[3, 1:6, 1] = 1.0791468550554812 + 1e-9 * np.arange(5)
+    steep[3, 1:6, 0] = 2.75378692228376, 0.5403860200896449, 2.1014172899029036, 1.9433414353271563, 3.7361740638249987
+    press = [3.5059369232428153, 1.0791468560554813]
+    contact = Contact(radius=1e-6, sides=5, weight="inverse", length="euclidean")
+    with ends_in_time():
+        found = signals(Morphology(steep), [press, [1.801357466597148, 1.0791468580554815]], contact)
+    assert (found[:, 3] > 1).all()
+    assert (found[:, 3] < 100).all()
+
+
 @settings(few(60), suppress_health_check=LAX)
 @given(st.data())
 def test_signals_lie_between_nothing_and_the_whole_fibre(data):

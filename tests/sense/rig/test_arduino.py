@@ -15,9 +15,9 @@ import pytest
 from design.errors import InputError
 from sense.rig import arduino as module
 from sense.rig.arduino import Arduino, Assembler
-from sense.rig.board_emulator import EmulatedBoard
+from sense.rig.board_emulator import MAX_PERIOD_NS, MIN_NS_PER_CONVERSION, EmulatedBoard, judge
 from sense.rig.devices import RigFault, Samples
-from sense.rig.framing import Block, Decoder, Settings, encode
+from sense.rig.framing import Block, Decoder, Settings, Status, encode
 from sense.rig.serial_link import BoardPort, find_ports, refusal
 
 serial = pytest.importorskip("serial")
@@ -110,6 +110,32 @@ def test_other_rates_channels_and_averages(rate_hz: float, options: dict[str, An
         assert samples.volts.shape[1] == options.get("channels", 8)
         assert len(samples.times_s) > 0.2 * rate_hz
         check(samples, board)
+
+
+def test_a_sample_is_complete_a_period_after_the_one_before() -> None:
+    """Of the board itself, which is the truth of the tests here."""
+    board = EmulatedBoard(waves, skew_ppm=1000)
+    with connected(board, 500.0):
+        assert board._started_s is not None
+        since_s = board.truth_s(np.array([0, 9])) - board._started_s
+        assert since_s == pytest.approx([2e-3 * 1.001, 20e-3 * 1.001], rel=1e-4)
+        block = board._block(32, board.truth_s(32 + np.arange(4)))
+        assert (block.first, block.time_us, len(block.counts)) == (32, 36 * 2000, 4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "status"),
+    [
+        (Settings(8 * MIN_NS_PER_CONVERSION, 0xFF, 1), Status.OK),
+        (Settings(8 * MIN_NS_PER_CONVERSION - 1, 0xFF, 1), Status.TOO_FAST),
+        (Settings(12 * 16 * MIN_NS_PER_CONVERSION, 0xFFF, 16), Status.OK),
+        (Settings(12 * 16 * MIN_NS_PER_CONVERSION - 1, 0xFFF, 16), Status.TOO_FAST),
+        (Settings(MAX_PERIOD_NS, 1, 1), Status.OK),
+        (Settings(MAX_PERIOD_NS + 1, 1, 1), Status.BAD_SETTINGS),
+    ],
+)
+def test_a_period_is_at_least_that_of_its_conversions(settings: Settings, status: Status) -> None:
+    assert judge(settings) == status
 
 
 def test_garbled_bytes_cost_samples_that_are_counted_and_never_give_a_wrong_one() -> None:

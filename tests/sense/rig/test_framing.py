@@ -93,6 +93,16 @@ def test_a_block_keeps_every_number_and_takes_at_most_18_bytes_a_sample() -> Non
     assert len(sent) / 16 < 18
 
 
+@pytest.mark.parametrize("averaging", [1, 2, MAX_AVERAGING])
+def test_the_largest_block_with_every_count_at_its_limit_comes_back(averaging: int) -> None:
+    """No number in it has a zero byte, so that COBS has most to add."""
+    counts = np.full((MAX_SAMPLES, MAX_CHANNELS), averaging * FULL_SCALE, np.uint16)
+    block = Block(counts, averaging, 2**MAX_CHANNELS - 1, 0x0101, 0x01010101, 0x01010101, 0x01010101)
+    decoder = Decoder()
+    assert payloads(decoder.feed(encode(block))) == [block.pack()]
+    assert decoder.damaged == 0
+
+
 def damage_in_one_place(sent: bytes) -> Iterator[bytes]:
     for i in range(len(sent)):
         yield from (sent[:i] + bytes([sent[i] ^ 1 << bit]) + sent[i + 1 :] for bit in range(8))
