@@ -24,8 +24,8 @@ class Change:
     Attributes:
         bench: its name. key: of the trial.
         what: SLOWER, LESS_ACCURATE or LOOKS_AT_MORE.
-        before, now: seconds an item, error or share visited. ratio: by which it is worse, above 1; times are divided by
-            the pace of their machine before.
+        before, now: seconds an item, error or share visited. ratio: by which it is worse, above 1; of times, by the
+            pace of the machine at its best or beside the trial, whichever tells less.
     """
 
     bench: str
@@ -63,13 +63,14 @@ def read_earlier(path: Path) -> dict[str, Mapping[str, Any]]:
 
 def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
     """Changes for the worse of the package's own ways, in trials that both runs of a benchmark have, worst first."""
-    earlier, times, earlier_times = _rows(before), _times(now), _times(before)
+    earlier, pace = _rows(before), before["pace_s"] / now["pace_s"]
     changes = []
     for key, row in _rows(now).items():
         if key not in earlier or key[1] in now["plain"]:
             continue
         old = earlier[key]
-        ratios = {SLOWER: (old["seconds"], row["seconds"], times[key] / earlier_times[key])}
+        slower = min(pace * row["seconds"] / old["seconds"], row["paces"] / old["paces"])
+        ratios = {SLOWER: (old["seconds"], row["seconds"], slower)}
         for what, column, least in ((LESS_ACCURATE, "error", ROUNDING), (LOOKS_AT_MORE, "visited", 1e-3)):
             if old[column] is not None and row[column] is not None:
                 ratios[what] = (old[column], row[column], max(row[column], least) / max(old[column], least))
@@ -81,11 +82,6 @@ def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
 
 def _rows(document: Mapping[str, Any]) -> dict[Key, Mapping[str, Any]]:
     return {(row["case"], row["way"], row["size"], row["repetition"]): row for row in document["rows"]}
-
-
-def _times(document: Mapping[str, Any]) -> dict[Key, float]:
-    """Of every trial, by the pace of the machine."""
-    return {key: row["seconds"] / document["pace_s"] for key, row in _rows(document).items()}
 
 
 def compared(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]) -> int:

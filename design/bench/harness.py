@@ -2,7 +2,8 @@
 
 The least time counts, since whatever disturbs a measurement only adds to it; and because disturbances last, the same
 trial is timed again in later rounds, with other trials between, until its two best rounds agree. The pace of the
-machine is told by a fixed piece of work that is timed beside every trial: runs are compared by times divided by it.
+machine is told by a fixed piece of work that is timed before and after every trial: runs are compared by times divided
+by the least of all paces, and, since one that is busy throughout never shows its best, by the pace beside the trial.
 """
 
 import os
@@ -86,11 +87,13 @@ class Measured:
     Attributes:
         found: of every trial, what its judge says.
         times: of every trial, seconds an item in each round that it was part of.
+        paces: of every trial, those times divided by the time of the fixed piece of work beside them.
         pace_s: least time of the fixed piece of work, seconds.
     """
 
     found: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
     times: dict[Key, list[float]] = field(default_factory=dict)
+    paces: dict[Key, list[float]] = field(default_factory=dict)
     pace_s: float = np.inf
 
     def settled(self, key: Key) -> bool:
@@ -113,24 +116,28 @@ def measure(bench: Bench, so_far: Measured, report: Report, again: Callable[[Key
         if known and (slow or not again(trial.key)):
             continue
         report(f"{trial.case}, {trial.way}" + (f" {trial.size:g}" if trial.size else ""))
-        so_far.pace_s = min(so_far.pace_s, _fixed_work())
-        result, seconds = _timed(trial.work)
+        before = _fixed_work()
+        result, seconds, quick = _timed(trial.work)
+        paces = [*before, *_fixed_work()]
+        so_far.pace_s = min(so_far.pace_s, *paces)
         so_far.times.setdefault(trial.key, []).append(seconds / trial.items)
+        beside = min(paces) if quick else float(np.median(paces))
+        so_far.paces.setdefault(trial.key, []).append(seconds / trial.items / beside)
         if trial.key not in so_far.found:
             so_far.found[trial.key] = trial.judge(result)
         taken += 1
     return taken
 
 
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What `work` returns, and its least time in seconds; the first call of quick work warms up."""
+def _timed(work: Callable[[], Any]) -> tuple[Any, float, bool]:
+    """What `work` returns, its least time in seconds, and whether it is quick: then its first call only warms up."""
     result, first = _once(work)
     if first > QUICK_S:
-        return result, first
+        return result, first, False
     times: list[float] = []
     while not times or (sum(times) < BUDGET_S and len(times) < 1000):
         times.append(_once(work)[1])
-    return result, min(times)
+    return result, min(times), len(times) > 1
 
 
 def _once(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -160,6 +167,6 @@ def _waited_s() -> float:
 _NUMBERS = np.random.default_rng(0).random(20_000)
 
 
-def _fixed_work() -> float:
-    """Seconds that a fixed piece of work takes at best, in numpy and in the interpreter: under a millisecond."""
-    return min(_once(lambda: (np.sort(_NUMBERS), sum(i * 0.5 for i in range(5000))))[1] for _ in range(5))
+def _fixed_work() -> list[float]:
+    """Seconds that a fixed piece of work takes, in numpy and in the interpreter, ten times: under a millisecond."""
+    return [_once(lambda: (np.sort(_NUMBERS), sum(i * 0.5 for i in range(5000))))[1] for _ in range(10)]

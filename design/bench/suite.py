@@ -33,8 +33,12 @@ def run_benches(
     measured = {bench.name: Measured() for bench in benches}
     documents: dict[str, dict[str, Any]] = {}
 
+    def pace_s() -> float:
+        return min(each.pace_s for each in measured.values())
+
     def take(bench: Bench, what: str, again: Callable[[Key], bool]) -> None:
         if measure(bench, measured[bench.name], lambda step: report(f"{bench.name}, {what}, {step}"), again):
+            measured[bench.name].pace_s = pace_s()
             documents[bench.name] = write_bench(bench, measured[bench.name], out)
 
     begin = time.perf_counter()

@@ -20,14 +20,15 @@ FORMAT = "padforge-bench/1"
 SUMMARY_FORMAT = "padforge-benches/1"
 
 Row = dict[str, Any]
-"""One line of a benchmark: "case", "way", "size", "repetition", "error", "seconds", "visited" and more columns."""
+"""One line of a benchmark: "case", "way", "size", "repetition", "error", "seconds", "paces", "visited" and more."""
 
 
 def write_bench(bench: Bench, measured: Measured, out: Path) -> dict[str, Any]:
     """Write `NAME.json`, `NAME.csv` and `NAME.png` to `out`; each row gets its speed relative to the reference."""
     rows = [
         dict(zip(("case", "way", "size", "repetition"), key, strict=True))
-        | {"error": None, "seconds": min(measured.times[key]), "visited": None, **found}
+        | {"error": None, "seconds": min(measured.times[key]), "paces": min(measured.paces[key])}
+        | {"visited": None, **found}
         for key, found in measured.found.items()
     ]
     base = {row["case"]: row["seconds"] for row in medians(rows) if (row["way"], row["size"]) == bench.reference}

@@ -25,7 +25,7 @@ def bench(error=0.1, work=lambda: None, name="x"):
 
 def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
     row = {"case": "a", "way": way, "size": 0, "repetition": 0}
-    row |= {"error": error, "seconds": seconds, "visited": visited, "speed": 1.0}
+    row |= {"error": error, "seconds": seconds, "paces": seconds / pace, "visited": visited, "speed": 1.0}
     return {"bench": "x", "plain": ["plain"], "pace_s": pace, "rows": [row]}
 
 
@@ -65,13 +65,15 @@ def test_a_trial_is_settled_when_its_two_best_rounds_agree():
 def test_time_is_an_items_and_waits_for_a_core_do_not_count(monkeypatch):
     waits = iter([0.0, 0.006] * 1000)
     monkeypatch.setattr(harness, "_waited_s", lambda: next(waits))
-    monkeypatch.setattr(harness, "_fixed_work", lambda: 1.0)
+    monkeypatch.setattr(harness, "_fixed_work", lambda: [0.5, 1.0])
     now = iter([0.0, 0.01] * 1000)
     monkeypatch.setattr(harness.time, "perf_counter", lambda: next(now))
     trial = Trial("a", "ours", 0, lambda: None, items=2)
     so_far = Measured()
     measure(Bench("x", lambda: iter([trial]), "", ("ours", 0), ("ours", 0), ()), so_far, lambda s: None, lambda k: True)
     assert so_far.times[trial.key] == [pytest.approx(0.002)]
+    assert so_far.paces[trial.key] == [pytest.approx(0.002 / 0.75)]
+    assert so_far.pace_s == 0.5
 
 
 def test_files_hold_what_was_measured(tmp_path):
@@ -100,8 +102,9 @@ def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
     so_far = Measured(pace_s=1e-3)
     for number, (error, seconds) in enumerate(((0.1, 2.0), (0.3, 9.0), (0.2, 4.0))):
         so_far.found["a", "slow", 1, number] = {"error": error}
-        so_far.times["a", "slow", 1, number] = [seconds + 1, seconds]
-    so_far.found["a", "fast", 0, 0], so_far.times["a", "fast", 0, 0] = {"error": 0.4}, [0.5]
+        so_far.times["a", "slow", 1, number] = so_far.paces["a", "slow", 1, number] = [seconds + 1, seconds]
+    so_far.found["a", "fast", 0, 0] = {"error": 0.4}
+    so_far.times["a", "fast", 0, 0] = so_far.paces["a", "fast", 0, 0] = [0.5]
     made = write_bench(Bench("x", lambda: iter(()), "error", ("slow", 1), ("fast", 0), ()), so_far, tmp_path)
     assert [row["speed"] for row in made["rows"]] == [2.0, pytest.approx(4 / 9), 1.0, 8.0]
     row = f"{'a':<20} {'slow':<13} {1:>7} {'0.200':>9} {'4.00 s':>10} {'1.00x':>8} {'-':>8}"
@@ -132,6 +135,12 @@ def test_what_has_become_worse_is_found(now, what):
     assert [change.what for change in worse(before, now)] == what
 
 
+def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
+    now = document(seconds=1.5)
+    now["rows"][0]["paces"] = 1.05e3
+    assert not worse(document(), now)
+
+
 def test_errors_of_rounding_are_all_alike():
     assert not worse(document(error=1e-17), document(error=9e-16))
     assert [change.ratio for change in worse(document(error=0.0), document(error=1e-14))] == [pytest.approx(10)]
@@ -149,7 +158,7 @@ def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path):
     summary, _ = run_benches([bench(work=lambda: time.perf_counter())], tmp_path, lambda step: None, {})
     before = summary["benches"]
     for row in before["x"]["rows"]:
-        row["seconds"] = 0.002 * before["x"]["pace_s"] / 2e-4  # what 2 ms would have been
+        row["seconds"], row["paces"] = 10 * before["x"]["pace_s"], 10.0  # some 2 ms
     delays = iter([0.004] * 12)
 
     def disturbed():
