@@ -9,7 +9,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ..files import provenance, write_json, write_text
 from ..palette import CURVES, FAINT, INK
@@ -169,6 +171,7 @@ def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:
                 axes.loglog(*zip(*points, strict=True), marker, color=colour, label=way, markersize=size, linewidth=1.4)
         axes.set_title(case, loc="left", color=INK)
         axes.set_xlabel(f"run time ({unit})")
+        _number(axes)
         axes.grid(color=FAINT, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(error_label)
@@ -176,3 +179,11 @@ def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:
     panels[-1].legend(shown.values(), shown.keys(), frameon=False)
     figure.suptitle(f"{name}: error against run time", x=0.01, ha="left", color=INK)
     return figure
+
+
+def _number(axes: Axes) -> None:
+    """Plain numbers on logarithmic axes, at 1, 2 and 5 where a decade fills much of one."""
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())

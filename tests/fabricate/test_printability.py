@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+import shapely
 
 from design.morphology import Morphology
 from fabricate.findings import Finding
-from fabricate.printability import check
+from fabricate.printability import _thinner, check
 from fabricate.settings import DEFAULTS, Settings
 from fabricate.soundness import SOUND
 
@@ -152,6 +153,12 @@ class TestSilicone:
         assert finding.measured == pytest.approx(gap_mm, abs=max(0.015, 0.02 * gap_mm))
         assert all(abs(y) < gap_mm for _, y in finding.places_mm)
         assert bool(finding.places_mm) == (status != "pass")
+
+    @pytest.mark.parametrize(("length", "patches"), [(0.02, 0), (0.05, 1)])
+    def test_corners_of_less_than_a_hundredth_of_a_square_millimetre_are_no_walls(self, length, patches):
+        """A peg 0.3 mm wide on a block: 0.006 and 0.015 mm² of it are thinner than 0.4 mm."""
+        block, peg = shapely.box(0, 0, 10, 5), shapely.box(4, 5, 4.3, 5 + length)
+        assert len(_thinner(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
 
     def test_tracks_of_different_depths_may_come_near(self):
         """Two horizontals that cross lie at two depths, and their verticals far apart."""

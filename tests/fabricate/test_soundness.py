@@ -6,6 +6,7 @@ import trimesh.exchange.stl
 from manifold3d import Manifold, OpType
 
 from design.errors import InputError
+from fabricate import soundness
 from fabricate.settings import Printer
 from fabricate.soundness import SOUND, check_mesh, inspect_mesh, sound
 
@@ -20,6 +21,24 @@ class TestSound:
         assert found["manifold"].status == found["watertight"].status == "fail"
         assert found["watertight"].measured == len(found["watertight"].places_mm) == 3
         assert "ridge_width" not in found
+
+    def test_two_boxes_that_share_an_edge(self):
+        watertight = {f.name: f for f in sound(*_together(self.box, block(10, 20, 5, at=(10, 20, 0))))}["watertight"]
+        assert (watertight.status, watertight.measured) == ("fail", 1)
+        assert near(watertight, 5, 10, 1e-6)
+
+    @pytest.mark.parametrize(("most", "more"), [(4, True), (1000, False)])
+    def test_pairs_that_cut_through_each_other_are_counted_up_to_a_limit(self, monkeypatch, most, more):
+        monkeypatch.setattr(soundness, "_MOST_PAIRS", most)
+        crossing = _together(self.box, block(2, 30, 2, at=(0.3, 0.2, 0.1)))
+        found = {f.name: f for f in sound(*crossing)}["self_intersection"]
+        assert found.status == "fail"
+        assert (found.measured == most) == more
+        assert found.message.endswith("pairs of triangles and more cut through each other") == more
+
+    def test_sizes_are_told_rounded_up(self):
+        found = inspected(block(10.002, 20.01, 5))["bed"]
+        assert found.message.startswith("10.01 x 20.01 x 5 mm to print")
 
     def test_one_triangle_turned_round(self):
         faces = np.array(self.box.faces)

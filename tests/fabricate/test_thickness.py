@@ -148,6 +148,11 @@ class TestWidth:
         assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in found["wall_thickness"].places_mm)
         assert bool(found["wall_thickness"].places_mm) == (status != "pass")
 
+    @pytest.mark.parametrize("layer", [0.1, 0.4])
+    def test_a_leaning_wall_is_measured_in_the_middle_of_its_last_layer(self, layer):
+        found = inspected(tray(draft_deg=30, wall=0.5), printer=Printer(layer_mm=layer))["wall_thickness"]
+        assert found.measured == pytest.approx(0.5 + layer / 2 * math.tan(math.radians(30)), rel=0.04)
+
     @pytest.mark.parametrize(("floor", "status"), [(0.2, "fail"), (0.35, "fail"), (0.5, "pass")])
     def test_a_thin_floor(self, floor, status):
         found = inspected(tray(floor=floor))
