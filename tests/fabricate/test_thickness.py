@@ -7,7 +7,7 @@ import trimesh
 from hypothesis import assume, given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
-from manifold3d import Manifold, Mesh, OpType
+from manifold3d import CrossSection, Manifold, Mesh, OpType
 
 from fabricate import slices
 from fabricate.settings import Printer
@@ -150,8 +150,14 @@ class TestWidth:
 
     @pytest.mark.parametrize("layer", [0.1, 0.4])
     def test_a_leaning_wall_is_measured_in_the_middle_of_its_last_layer(self, layer):
-        found = inspected(tray(draft_deg=30, wall=0.5), printer=Printer(layer_mm=layer))["wall_thickness"]
-        assert found.measured == pytest.approx(0.5 + layer / 2 * math.tan(math.radians(30)), rel=0.04)
+        """A wall 0.5 mm thick at the rim, and thicker by half a millimetre a millimetre below it."""
+        side, top, over = 20.0, FLOOR + DEPTH, 1.0
+        flare = 1 + (DEPTH + over) / side
+        hollow = Manifold.extrude(CrossSection.square((side, side), True), DEPTH + over, scale_top=(flare, flare))
+        outer = side + DEPTH + 2 * 0.5
+        box = Manifold.cube((outer, outer, top), True).translate((0, 0, top / 2))
+        found = inspected(box - hollow.translate((0, 0, FLOOR)), printer=Printer(layer_mm=layer))["wall_thickness"]
+        assert found.measured == pytest.approx(0.5 + layer / 2 * 0.5, abs=0.015)
 
     @pytest.mark.parametrize(("floor", "status"), [(0.2, "fail"), (0.35, "fail"), (0.5, "pass")])
     def test_a_thin_floor(self, floor, status):

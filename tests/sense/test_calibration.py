@@ -223,7 +223,7 @@ def test_health_is_learnt_from_the_presses_that_were_not_held_back(
 ) -> None:
     monkeypatch.setattr(HealthModel, "fit", lambda readings, times_s, begun, lifted, **options: (begun, lifted))
     learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
-    edges = learn_health(recording, localizer)
+    edges: dict[str, Any] = {**learn_health(recording, localizer)}
     assert 0 < len(localizer.test) < len(learnt)
     np.testing.assert_array_equal(edges[RECORDED], (recording.begun[learnt], recording.lifted[learnt]))
     assert len(edges[FELT][0]) == len(edges[FELT][1]) == len(learnt)
