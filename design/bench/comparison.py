@@ -11,8 +11,10 @@ from .harness import Key
 from .table import FORMAT, SUMMARY_FORMAT
 
 SLOWER, LESS_ACCURATE, LOOKS_AT_MORE = "slower", "less accurate", "looks at more"
-ALARM = {SLOWER: 1.15, LESS_ACCURATE: 1.25, LOOKS_AT_MORE: 1.1}
+ALARM = {SLOWER: 1.2, LESS_ACCURATE: 1.25, LOOKS_AT_MORE: 1.1}
 """Ratios beyond which a change is told of."""
+LONG_S, ALARM_LONG = 0.2, 1.25
+"""Work that takes longer seldom meets a quiet moment on a busy machine, and is slower from another ratio on."""
 ROUNDING = 1e-15
 """Errors below are all alike."""
 
@@ -74,9 +76,10 @@ def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
         for what, column, least in ((LESS_ACCURATE, "error", ROUNDING), (LOOKS_AT_MORE, "visited", 1e-3)):
             if old[column] is not None and row[column] is not None:
                 ratios[what] = (old[column], row[column], max(row[column], least) / max(old[column], least))
-        changes += [
-            Change(now["bench"], key, what, *each) for what, each in ratios.items() if not each[2] <= ALARM[what]
-        ]
+        for what, (then, since, ratio) in ratios.items():
+            limit = ALARM_LONG if what == SLOWER and then > LONG_S else ALARM[what]
+            if not ratio <= limit:  # so is NaN
+                changes.append(Change(now["bench"], key, what, then, since, ratio))
     return sorted(changes, key=lambda change: -change.ratio)
 
 

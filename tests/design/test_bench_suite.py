@@ -117,7 +117,7 @@ def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
     ("now", "what"),
     [
         (document(seconds=1.3), ["slower"]),
-        (document(seconds=1.1), []),
+        (document(seconds=1.24), []),
         (document(seconds=0.5), []),
         (document(seconds=1.3, pace=1.3e-3), []),  # the machine is slower
         (document(seconds=1.0, pace=0.7e-3), ["slower"]),  # the machine is faster
@@ -133,6 +133,11 @@ def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
 def test_what_has_become_worse_is_found(now, what):
     before = document(way=now["rows"][0]["way"] if now["rows"][0]["way"] != "new" else "ours")
     assert [change.what for change in worse(before, now)] == what
+
+
+def test_quick_work_is_slower_from_a_smaller_ratio_on():
+    assert [change.what for change in worse(document(seconds=0.1), document(seconds=0.121))] == ["slower"]
+    assert not worse(document(seconds=0.1), document(seconds=0.119))
 
 
 def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
