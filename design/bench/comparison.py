@@ -15,6 +15,8 @@ ALARM = {SLOWER: 1.2, LESS_ACCURATE: 1.25, LOOKS_AT_MORE: 1.1}
 """Ratios beyond which a change is told of."""
 LONG_S, ALARM_LONG = 0.2, 1.25
 """Work that takes longer seldom meets a quiet moment on a busy machine, and is slower from another ratio on."""
+PACE_SLACK = 1.1
+"""By how much the least pace of two runs on one machine may differ; quick work meets its best time more surely."""
 ROUNDING = 1e-15
 """Errors below are all alike."""
 
@@ -26,8 +28,8 @@ class Change:
     Attributes:
         bench: its name. key: of the trial.
         what: SLOWER, LESS_ACCURATE or LOOKS_AT_MORE.
-        before, now: seconds an item, error or share visited. ratio: by which it is worse, above 1; of times, by the
-            pace of the machine at its best or beside the trial, whichever tells less.
+        before, now: seconds an item, error or share visited. ratio: by which it is worse, above 1; of times, as far as
+            the pace of the machine does not explain it.
     """
 
     bench: str
@@ -71,8 +73,7 @@ def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
         if key not in earlier or key[1] in now["plain"]:
             continue
         old = earlier[key]
-        slower = min(pace * row["seconds"] / old["seconds"], row["paces"] / old["paces"])
-        ratios = {SLOWER: (old["seconds"], row["seconds"], slower)}
+        ratios = {SLOWER: (old["seconds"], row["seconds"], _slower(old, row, pace))}
         for what, column, least in ((LESS_ACCURATE, "error", ROUNDING), (LOOKS_AT_MORE, "visited", 1e-3)):
             if old[column] is not None and row[column] is not None:
                 ratios[what] = (old[column], row[column], max(row[column], least) / max(old[column], least))
@@ -81,6 +82,14 @@ def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
             if not ratio <= limit:  # so is NaN
                 changes.append(Change(now["bench"], key, what, then, since, ratio))
     return sorted(changes, key=lambda change: -change.ratio)
+
+
+def _slower(old: Mapping[str, Any], row: Mapping[str, Any], pace: float) -> float:
+    """How much slower a trial is, `pace` being how much faster the machine was before than it is now."""
+    plain = row["seconds"] / old["seconds"]
+    if old["seconds"] > LONG_S:
+        return min(pace * plain, row["paces"] / old["paces"])
+    return min(plain, PACE_SLACK * pace * plain)
 
 
 def _rows(document: Mapping[str, Any]) -> dict[Key, Mapping[str, Any]]:

@@ -138,6 +138,7 @@ def test_what_has_become_worse_is_found(now, what):
 def test_quick_work_is_slower_from_a_smaller_ratio_on():
     assert [change.what for change in worse(document(seconds=0.1), document(seconds=0.121))] == ["slower"]
     assert not worse(document(seconds=0.1), document(seconds=0.119))
+    assert not worse(document(seconds=0.1), document(seconds=0.13, pace=1.3e-3))  # the machine is slower
 
 
 def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
