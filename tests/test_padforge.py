@@ -1,5 +1,6 @@
 """The front door: what it imports, how it fails, and the whole chain on a small pad."""
 
+import hashlib
 import json
 import math
 import shutil
@@ -226,7 +227,10 @@ def test_the_front_door_in_one_process(chain, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.count("\n") == 1
     shutil.copytree(chain[0] / "out" / "pad", tmp_path / "pad")
     page = tmp_path / "pad" / "report.html"
-    before = page.read_bytes()
-    page.unlink()
-    assert ends("report", "pad") == 0
-    assert page.read_bytes() == before
+    pages = []
+    for _ in range(2):
+        page.unlink()
+        assert ends("report", "pad") == 0
+        pages.append(hashlib.sha256(page.read_bytes()).hexdigest())
+    assert pages[0] == pages[1]
+    assert ">Calibration</h2>" in page.read_text(encoding="utf-8")
