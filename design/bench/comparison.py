@@ -15,6 +15,8 @@ ALARM = {SLOWER: 1.2, LESS_ACCURATE: 1.25, LOOKS_AT_MORE: 1.1}
 """Ratios beyond which a change is told of."""
 LONG_S, ALARM_LONG = 0.2, 1.25
 """Work that takes longer seldom meets a quiet moment on a busy machine, and is slower from another ratio on."""
+TINY_S = 1e-3
+"""Work that takes less depends on where a process happens to lie in memory: it counts as slower in company only."""
 PACE_SLACK = 1.1
 """By how much the least pace of two runs on one machine may differ; quick work meets its best time more surely."""
 ROUNDING = 1e-15
@@ -81,7 +83,9 @@ def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
             limit = ALARM_LONG if what == SLOWER and then > LONG_S else ALARM[what]
             if not ratio <= limit:  # so is NaN
                 changes.append(Change(now["bench"], key, what, then, since, ratio))
-    return sorted(changes, key=lambda change: -change.ratio)
+    slower = [change.key[1] for change in changes if change.what == SLOWER]  # ways
+    alone = [c for c in changes if c.what == SLOWER and c.before < TINY_S and slower.count(c.key[1]) == 1]
+    return sorted((change for change in changes if change not in alone), key=lambda change: -change.ratio)
 
 
 def _slower(old: Mapping[str, Any], row: Mapping[str, Any], pace: float) -> float:

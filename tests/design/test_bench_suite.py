@@ -141,6 +141,17 @@ def test_quick_work_is_slower_from_a_smaller_ratio_on():
     assert not worse(document(seconds=0.1), document(seconds=0.13, pace=1.3e-3))  # the machine is slower
 
 
+def test_tiny_work_is_slower_in_company_only():
+    def two(*seconds):
+        made = document(seconds=seconds[0])
+        made["rows"].append(made["rows"][0] | {"case": "b", "seconds": seconds[1], "paces": seconds[1] / 1e-3})
+        return made
+
+    before = two(1e-4, 2e-4)
+    assert not worse(before, two(1.4e-4, 2e-4))
+    assert {change.key[0] for change in worse(before, two(1.4e-4, 2.8e-4))} == {"a", "b"}
+
+
 def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
     now = document(seconds=1.5)
     now["rows"][0]["paces"] = 1.05e3
