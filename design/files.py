@@ -14,11 +14,9 @@ from typing import Any
 
 from .arguments import shown
 from .errors import InputError
+from .output import UNFINISHED, writing
 
 _PACKAGES = ("padforge", "numpy", "scipy")
-
-_UNFINISHED = ".unfinished-"
-"""Names of files begin with this until they are whole."""
 
 MOST_BYTES = 2**28
 """A file of more is none that padforge has written, but for recordings."""
@@ -34,14 +32,14 @@ def atomic(path: Path) -> Iterator[Path]:
     Raises:
         InputError: what the system has against writing `path`, such as a full disk.
     """
-    if path.name.startswith(_UNFINISHED):  # it is another one's, who puts it in place
+    if path.name.startswith(UNFINISHED):  # it is another one's, who puts it in place
         yield path
         return
-    try:
+    with writing(path):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it is there and no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_UNFINISHED, suffix=path.suffix)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=UNFINISHED, suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
         try:
@@ -50,8 +48,6 @@ def atomic(path: Path) -> Iterator[Path]:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def _widen_permissions(path: Path) -> None:

@@ -14,6 +14,9 @@ try:
 except ImportError:  # not a POSIX system
     fcntl = None
 
+UNFINISHED = ".unfinished-"
+"""Names of files and folders begin with this until they are whole."""
+
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
@@ -47,7 +50,7 @@ def staged(folder: Path) -> Iterator[Path]:
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as name:
+        with tempfile.TemporaryDirectory(dir=folder, prefix=UNFINISHED) as name:
             yield Path(name)
             files = sorted(Path(name).iterdir())
             in_the_way = [file.name for file in files if (folder / file.name).is_dir()]

@@ -110,7 +110,7 @@ def search(
         _run(problem, states, pool, stop, report, checkpoints)
         found = _candidates(problem, states, pool, stop)
     with profiling.stage("check and score"):
-        best, violations = _choose([*found, *([origin] if origin else [])], problem)
+        best, violations = _choose(found if origin is None else [*found, origin], problem)
         terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
     if checkpoints and not stop.reason:
         checkpoints.clear()

@@ -12,7 +12,7 @@ from design.errors import InputError
 from design.files import provenance
 from design.losses import lost_subsets
 from design.profiling import stage
-from design.settings import validated
+from design.settings import section, validated
 
 from . import settings
 from .evaluation import conformal, evaluate
@@ -60,7 +60,7 @@ def calibrate(
         InputError: an option out of range, too few presses to hold a share back, or a training that diverged.
     """
     instance("recording", recording, Recording)
-    options = settings.options_or_defaults(options)
+    options = section("options", options, settings.Localizer)
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
     options = validated(settings.Localizer, {**options.model_dump(), **given}, "[localizer]")
     if options.method == "published":

@@ -151,12 +151,12 @@ class HealthModel:
             sets = [rng.permutation(len(living))[:lost] for _ in range(LOSSES if lost else 1)]
             told = [_without(evidence.ratios(*measured, *judged(chosen)), chosen) for chosen in sets]
             ratios.append((np.concatenate([stay for stay, _ in told]), np.concatenate([begin for _, begin in told])))
-        rests = traces[:, :, :REST].mean(axis=2)
+        rests, tail = traces[:, :, :REST].mean(axis=2), Tail.fit(ratios)
         return cls(
             shapes=shapes,
             weights=weights,
             evidence=evidence,
-            tail=Tail.fit(ratios) if len(traces) >= WEAK_PRESSES else Tail.fit(ratios).without("weak"),
+            tail=tail if len(traces) >= WEAK_PRESSES else tail.without("weak"),
             rests=np.stack([rests.min(axis=0), rests.max(axis=0)]),
             fibres=readings.shape[1],
             dead=tuple(dead.tolist()),

@@ -21,6 +21,7 @@ from design.checkpoint import Checkpoints, State
 from design.errors import InputError
 from design.files import provenance
 from design.losses import lost_subsets
+from design.settings import section
 
 from . import settings
 from .calibration import learn, split_presses
@@ -74,7 +75,7 @@ def robustness(
     if localizer is not None:
         instance("localizer", localizer, Localizer)
     keep_in = None if keep_in is None else path("keep_in", keep_in)
-    options, lost = settings.options_or_defaults(options), whole("lost", lost, 0, MAX_FIBRES)
+    options, lost = section("options", options, settings.Localizer), whole("lost", lost, 0, MAX_FIBRES)
     training, test = _presses(recording, localizer, options)
     levels = range(min(lost, recording.fibres - 1) + 1)
     places_mm = recording.presses_mm[test]

@@ -4,7 +4,6 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer
 
-from design.arguments import instance
 from design.settings import Section
 
 Features = Literal["full", "causal", "early", "published"]
@@ -104,11 +103,6 @@ class Localizer(Section):
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     rate: float = Field(default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")
-
-
-def options_or_defaults(options: Localizer | None) -> Localizer:
-    """How to learn: as given, or the defaults for None; anything else is an InputError."""
-    return Localizer() if options is None else instance("options", options, Localizer)
 
 
 MODELS: dict[str, type[Section]] = {"rig": Rig, "localizer": Localizer}

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from design.arguments import instance
 from design.errors import InputError
 from design.files import provenance
+from design.settings import section
 
 from . import settings
 from .calibration import learn, split_presses
@@ -60,7 +61,7 @@ def size_curve(
         InputError: too few presses for a curve.
     """
     instance("recording", recording, Recording)
-    options = settings.options_or_defaults(options)
+    options = section("options", options, settings.Localizer)
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.known)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))

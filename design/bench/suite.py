@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files import write_json
+from ..output import refuse_unwritable
 from .comparison import SLOWER, Change, worse
 from .harness import Bench, Key, Measured, Report, measure
 from .table import SUMMARY_FORMAT, summary_rows, write_bench, write_csv
@@ -29,7 +30,11 @@ def run_benches(
     Returns:
         The summary, as in `bench.json`, and what has become worse. A trial counts as slower only if it is so in every
         one of its rounds.
+
+    Raises:
+        InputError: `out` cannot be written, told before anything is measured.
     """
+    refuse_unwritable(out)
     measured = {bench.name: Measured() for bench in benches}
     documents: dict[str, dict[str, Any]] = {}
 
@@ -56,7 +61,7 @@ def run_benches(
     summary = {
         "format": SUMMARY_FORMAT,
         "summary": summary_rows(list(documents.values())),
-        "benches": {name: documents[name] for name in documents},
+        "benches": documents,
     }
     write_csv(summary["summary"], out / "bench.csv")
     write_json(out / "bench.json", summary)

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from design import Contact, Morphology, signals
 from design.arguments import MOST_VALUES, instance, whole
 from design.errors import InputError
+from design.settings import section
 
 from ..limits import MAX_FIBRES
 from ..recording import Recording
@@ -33,8 +34,7 @@ def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = 
         InputError: more fibres or readings than a recording may hold.
     """
     instance("pad", pad, Morphology)
-    rig = instance("rig", Rig() if rig is None else rig, Rig)
-    contact = instance("contact", Contact() if contact is None else contact, Contact)
+    rig, contact = section("rig", rig, Rig), section("contact", contact, Contact)
     whole("fibres of the pad", 2 * pad.grid, 2, MAX_FIBRES)
     values = rig.presses * rig.readings_per_press * 2 * pad.grid
     if values > MOST_VALUES:

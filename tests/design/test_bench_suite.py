@@ -171,6 +171,12 @@ def test_a_change_is_told_in_one_line():
     assert compared({"x": document()}, {"x": document(), "y": document()}) == 1
 
 
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file/out: cannot be written"):
+        run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
+
+
 def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path):
     summary, _ = run_benches([bench(work=lambda: time.perf_counter())], tmp_path, lambda step: None, {})
     before = summary["benches"]

@@ -1,6 +1,7 @@
 """Both searches through their one face: they improve, obey the rules, stop, resume, and depend on the seed alone."""
 
 import signal
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -171,6 +172,14 @@ def test_a_search_from_a_pad_improves_on_it():
     assert after.terms["ambiguity_lost_0"] + after.terms["ambiguity_lost_1"] < (
         before["ambiguity_lost_0"] + before["ambiguity_lost_1"]
     )
+
+
+def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
+    free = Rules(enforce=False)
+    origin = search(settings=SMALL, rules=free).morphology
+    monkeypatch.setattr(sys.modules["design.search"], "_candidates", lambda *_: [Morphology.straight(4)])
+    assert search(settings=SMALL, rules=free, origin=origin).morphology == origin
+    assert search(settings=SMALL, rules=free).morphology == Morphology.straight(4)
 
 
 def test_an_origin_that_does_not_fit_is_refused():

@@ -7,6 +7,8 @@ import pytest
 from design import Contact, InputError, Spec
 from design.settings import MODELS, Pad, Rules, Search, commented_toml
 
+from ..limits import require_ends
+
 
 def test_the_written_defaults_read_back_as_the_defaults():
     text = commented_toml(MODELS)
@@ -103,12 +105,7 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
     ],
 )
 def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):
-    name = model.__name__.lower()
-    for value in kept:
-        Spec({name: {key: value}}).section(model)
-    for value in refused:
-        with pytest.raises(InputError, match=rf"\[{name}\] {key}"):
-            Spec({name: {key: value}}).section(model)
+    require_ends(model, key, kept, refused)
 
 
 def test_keys_of_very_many_parts_are_refused_at_once(tmp_path):

@@ -2,8 +2,9 @@
 
 import pytest
 
-from design import InputError, Spec
 from sense.settings import Localizer, Rig
+
+from ..limits import require_ends
 
 
 def test_the_defaults_are_those_of_the_published_bench() -> None:
@@ -63,9 +64,4 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
     ],
 )
 def test_values_at_the_ends_of_what_is_allowed(model: type, key: str, kept: tuple, refused: tuple) -> None:
-    name = model.__name__.lower()
-    for value in kept:
-        Spec({name: {key: value}}).section(model)
-    for value in refused:
-        with pytest.raises(InputError, match=rf"\[{name}\] {key}"):
-            Spec({name: {key: value}}).section(model)
+    require_ends(model, key, kept, refused)

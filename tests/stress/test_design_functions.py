@@ -32,7 +32,7 @@ from design.score import score
 from design.settings import Pad, Rules, Search
 
 from .clock import ends_in_time, few
-from .values import LAX, anything, contacts, pads, presses
+from .values import LAX, call_spoiled, contacts, pads, presses
 
 Arguments = dict[str, Any]
 PAD = Morphology.random(2, 3, seed=1)
@@ -161,24 +161,6 @@ SLOW_CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Arg
         lambda found, given: finite([level.mean for level in found]),
     ),
 }
-
-
-def call_spoiled(calls: Mapping[str, Any], data: st.DataObject) -> None:
-    """Call one of the functions with one or two of its arguments replaced by anything."""
-    name = data.draw(st.sampled_from(sorted(calls)))
-    function, sound, verify = calls[name]
-    spoiled = data.draw(st.sets(st.sampled_from(sorted(sound)), min_size=1, max_size=2))
-    others = [value for _, arguments, _ in calls.values() for value in arguments.values()]
-    given_ = sound | {key: data.draw(anything() | st.sampled_from(others)) for key in spoiled}
-    with ends_in_time():
-        try:
-            found = function(**given_)
-        except InputError as error:
-            said = str(error)
-        else:
-            return verify(found, given_)
-    assert len(said.splitlines()) == 1
-    assert len(said) < 1000
 
 
 @settings(few(600), suppress_health_check=LAX)

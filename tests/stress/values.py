@@ -4,6 +4,7 @@ import datetime
 import decimal
 import fractions
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from design import Contact, InputError, Morphology
 from design.morphology import assemble
+
+from .clock import ends_in_time
 
 Array = NDArray[np.float64]
 LAX = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much, HealthCheck.large_base_example]
@@ -152,3 +155,21 @@ def presses(draw: st.DrawFn, pad: Morphology, most: int = 12) -> Any:
         return places
     types = {"f4": "<f4", "i4": "<i4", "big-endian": ">f8"}
     return np.asarray(places, types.get(kind, "f8"), order="F" if kind == "fortran" else "C")
+
+
+def call_spoiled(calls: Mapping[str, Any], data: st.DataObject) -> None:
+    """Call one of the functions with one or two of its arguments replaced by anything."""
+    name = data.draw(st.sampled_from(sorted(calls)))
+    function, sound, verify = calls[name]
+    spoiled = data.draw(st.sets(st.sampled_from(sorted(sound)), min_size=1, max_size=2))
+    others = [value for _, arguments, _ in calls.values() for value in arguments.values()]
+    given_ = sound | {key: data.draw(anything() | st.sampled_from(others)) for key in spoiled}
+    with ends_in_time():
+        try:
+            found = function(**given_)
+        except InputError as error:
+            said = str(error)
+        else:
+            return verify(found, given_)
+    assert len(said.splitlines()) == 1
+    assert len(said) < 1000

@@ -1,0 +1,18 @@
+"""Where the ranges of settings end."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+from design import InputError, Spec
+
+
+def require_ends(model: type, key: str, kept: Iterable[Any], refused: Iterable[Any]) -> None:
+    """See that a key of a section takes the values `kept`, and that each of those `refused` is named."""
+    name = model.__name__.lower()
+    for value in kept:
+        Spec({name: {key: value}}).section(model)
+    for value in refused:
+        with pytest.raises(InputError, match=rf"\[{name}\] {key}"):
+            Spec({name: {key: value}}).section(model)
