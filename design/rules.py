@@ -18,6 +18,7 @@ from .settings import Rules
 Array = NDArray[np.float64]
 
 _TOLERANCE_MM = 1e-3
+_FOLD_TOLERANCE = 1e-4  # of the gap where that is more: all points within a gap of each other are compared
 
 _FINEST_TURN = 1e-4
 """Radians between the points at which bends are looked at, at least: matters for radii far beyond the pad's size."""
@@ -66,7 +67,8 @@ def check(pad: Morphology, rules: Rules) -> list[Violation]:
     - `border_mm`: the distance of every fibre to the two sides of the pad that it runs along.
     - `max_length_mm`: the arc length of a fibre.
 
-    Distances are right to twice the 1e-3 mm to which curves are flattened, bend radii below R to 0.5 %.
+    Distances are right to twice the 1e-3 mm to which curves are flattened, those of a fibre to itself to 2e-4 g if that
+    is more; bend radii below R to 0.5 %.
     """
     pad, rules = instance("pad", pad, Morphology), instance("rules", rules, Rules)
     lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.pitch_mm)]
@@ -118,6 +120,8 @@ def _gaps(lines: list[Array], limit: float) -> list[Violation]:
 def _folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
     if limit == 0:
         return []
+    if _FOLD_TOLERANCE * limit > _TOLERANCE_MM:
+        lines = [pad.to_mm(points) for points in flatten(pad, _FOLD_TOLERANCE * limit / pad.pitch_mm)]
     found = []
     for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
         fold = fold_gap(lines[fibre], limit)

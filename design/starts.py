@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .genetic import Breeding
 
 SLICE = {"descent": 25, "genetic": 2}  # steps or generations between two looks: about a third of a second
+SLICE_S = 1.0  # where steps are slow a slice ends after this, so that a time budget holds
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,11 @@ class Slice:
 
 def advance(problem: Problem, start: int, state: State | None) -> Slice:
     """The next slice of a start, from its beginning if `state` is None."""
-    run = _open(problem, start, state)
-    run.advance(SLICE[problem.search.method])
+    run, until = _open(problem, start, state), time.perf_counter() + SLICE_S
+    for _ in range(SLICE[problem.search.method]):
+        run.advance(1)
+        if run.done or time.perf_counter() > until:
+            break
     return Slice(run.state(), run.step, run.objective, run.done)
 
 

@@ -55,6 +55,22 @@ def test_branches_of_one_fibre_too_close_are_found_with_their_gap():
     assert check(zigzag(0.5), only(min_gap_mm=0.48)) == []
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_folds_of_a_large_pad_with_a_large_gap_are_those_of_a_small_one(seed, monkeypatch):
+    """The same courses, a hundred times larger: what is found is too, to 2e-4 of the gap, from fewer points."""
+    small = Morphology.random(1, 9, seed)
+    found = [check(Morphology(small.knots, 10.0 * s), only(min_gap_mm=4.0 * s)) for s in (1, 100)]
+    assert found[0]
+    assert [v.fibres for v in found[0]] == [v.fibres for v in found[1]]
+    for one, hundred in zip(*found, strict=True):
+        assert hundred.measured / 100 == pytest.approx(one.measured, abs=4.0 * 2e-4 + 2e-3)
+    measured = []
+    monkeypatch.setattr("design.rules.fold_gap", lambda line, gap: measured.append(len(line)))
+    check(Morphology(small.knots, 1000.0), only(min_gap_mm=0.8))
+    check(Morphology(small.knots, 1000.0), only(min_gap_mm=400.0))
+    assert measured[2] < measured[0] / 5
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_the_fold_found_is_one_of_the_curve(seed):
     """Against points of SciPy's curve, 0.02 mm apart: none lies nearer, and some almost as near."""

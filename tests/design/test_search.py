@@ -164,6 +164,15 @@ def test_a_time_budget_ends_it_with_the_best_so_far():
     assert found.seconds < 30
 
 
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatch):
+    settings = SMALL.model_copy(update={"method": method, "steps": 30, "generations": 4, "starts": 1})
+    whole = search(settings=settings)
+    monkeypatch.setattr("design.starts.SLICE_S", -1.0)
+    assert advance(Problem(Pad(), (Contact(),), settings, Rules(), None), 0, None).step == 1
+    assert search(settings=settings).morphology == whole.morphology
+
+
 def test_a_search_from_a_pad_improves_on_it():
     origin = search(settings=Search(knots=5, starts=1, steps=60, lost=1, seed=3)).morphology
     before = score(origin, Contact(), lost=1)
