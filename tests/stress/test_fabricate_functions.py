@@ -203,9 +203,9 @@ def meshes(draw: st.DrawFn) -> tuple[Any, Any]:
     copies = draw(st.sampled_from([1, 1, 2, 30]))
     vertices = np.concatenate([vertices + rng.choice([0, 0.5, 1, 3], 3) for _ in range(copies)])
     triangles = np.concatenate([triangles + i * len(vertices) // copies for i in range(copies)])
-    for spoil in draw(st.lists(st.sampled_from(sorted(_SPOILS)), max_size=2)):
-        vertices, triangles = _SPOILS[spoil](vertices, triangles, rng)
     with np.errstate(all="ignore"):
+        for spoil in draw(st.lists(st.sampled_from(sorted(_SPOILS)), max_size=2)):
+            vertices, triangles = _SPOILS[spoil](vertices, triangles, rng)
         vertices = vertices * draw(st.sampled_from([1, 1, 20, 1e-9, 1e-4, 1e5, 1e300]))
     return vertices, triangles
 
