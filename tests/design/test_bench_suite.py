@@ -136,9 +136,9 @@ def test_what_has_become_worse_is_found(now, what):
 
 
 def test_quick_work_is_slower_from_a_smaller_ratio_on():
-    assert [change.what for change in worse(document(seconds=0.1), document(seconds=0.121))] == ["slower"]
-    assert not worse(document(seconds=0.1), document(seconds=0.119))
-    assert not worse(document(seconds=0.1), document(seconds=0.13, pace=1.3e-3))  # the machine is slower
+    assert [change.what for change in worse(document(seconds=0.01), document(seconds=0.0121))] == ["slower"]
+    assert not worse(document(seconds=0.01), document(seconds=0.0119))
+    assert not worse(document(seconds=0.01), document(seconds=0.013, pace=1.3e-3))  # the machine is slower
 
 
 def test_tiny_work_is_slower_in_company_only():
