@@ -5,6 +5,7 @@ executor of the `concurrent.futures` kind, here or on a cluster; between them a 
 stopped, and nothing of that changes what it finds.
 """
 
+import math
 import os
 import signal
 import threading
@@ -234,7 +235,9 @@ def _candidates(problem: Problem, states: dict[int, State], pool: Executor, stop
         return [finish(problem, 0, None)]
     if not stop:
         return [finish(problem, start, state) for start, state in sorted(states.items())]
-    best = min(states, key=lambda start: states[start]["history"][-1, 1])
+    # a start with nothing noted yet has only just begun
+    noted = {start: state["history"][-1, 1] if len(state["history"]) else math.inf for start, state in states.items()}
+    best = min(noted, key=lambda start: noted[start])
     return [finish(problem, best, states[best], stop.mend_until())]
 
 

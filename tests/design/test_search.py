@@ -173,6 +173,14 @@ def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatc
     assert search(settings=settings).morphology == whole.morphology
 
 
+def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch):
+    monkeypatch.setattr("design.starts.SLICE_S", -1.0)
+    found = search(settings=SMALL, time_budget=1e-6)
+    assert found.stopped == "out of time"
+    assert found.morphology.knots.shape == (8, 5, 2)
+    assert search(settings=SMALL, time_budget=0.5).stopped == "out of time"
+
+
 def test_a_search_from_a_pad_improves_on_it():
     origin = search(settings=Search(knots=5, starts=1, steps=60, lost=1, seed=3)).morphology
     before = score(origin, Contact(), lost=1)
