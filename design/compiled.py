@@ -16,10 +16,10 @@ def forget_outdated(package: Path) -> None:
     kept = package / "__pycache__"
     with suppress(OSError):
         kept.mkdir(exist_ok=True)
-        now = sha256(b"\0".join(source.read_bytes() for source in sorted(package.glob("*.py")))).hexdigest()
+        now = sha256(b"\0".join(source.read_bytes() for source in sorted(package.glob("*.py")))).digest()
         stamp = kept / "kernels.sha256"
-        if stamp.exists() and stamp.read_text() == now:
+        if stamp.exists() and stamp.read_bytes() == now:
             return
         for compiled in kept.glob("*.nb[ic]"):
             compiled.unlink(missing_ok=True)
-        stamp.write_text(now)
+        stamp.write_bytes(now)

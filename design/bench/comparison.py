@@ -14,7 +14,7 @@ SLOWER, LESS_ACCURATE, LOOKS_AT_MORE = "slower", "less accurate", "looks at more
 ALARM = {SLOWER: 1.2, LESS_ACCURATE: 1.25, LOOKS_AT_MORE: 1.1}
 """Ratios beyond which a change is told of."""
 LONG_S, ALARM_LONG = 0.02, 1.25
-"""Work that takes longer seldom meets a quiet moment on a busy machine, and is slower from another ratio on."""
+"""Work that takes longer is seldom undisturbed: it is slower from another ratio on, by the pace beside it too."""
 TINY_S = 1e-3
 """Work that takes less depends on where a process happens to lie in memory: it counts as slower in company only."""
 PACE_SLACK = 1.1

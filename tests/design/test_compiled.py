@@ -45,3 +45,12 @@ def test_a_folder_that_cannot_be_written_is_left_alone(package):
     (package / "__pycache__").touch()
     forget_outdated(package)
     assert (package / "__pycache__").is_file()
+
+
+def test_a_damaged_stamp_is_no_stamp(package):
+    kept = package / "__pycache__"
+    kept.mkdir()
+    (kept / "outer.py311.1.nbc").touch()
+    (kept / "kernels.sha256").write_bytes(b"\xff\xfe")
+    forget_outdated(package)
+    assert not list(kept.glob("*.nbc"))
