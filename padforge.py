@@ -10,24 +10,25 @@ from typing import TYPE_CHECKING
 import click
 
 from design.cli import design
-from design.console import (
+from design.common.command_line import (
+    INTERRUPTED,
     json_option,
     load_spec,
     out_option,
     profile_option,
     progress,
+    run_to_end,
     seed_option,
     show_result,
     spec_option,
 )
-from design.endings import INTERRUPTED, run_to_end
-from design.errors import InputError
+from design.common.errors import InputError
 from fabricate.cli import fabricate
-from sense.cli import sense
+from sense.cli.main import sense
 from sense.studies.cli import study
 
 if TYPE_CHECKING:
-    from design.settings import Section, Spec
+    from design.common.settings import Section, Spec
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -59,8 +60,8 @@ def init(path: Path) -> None:
     padforge init
     padforge init soft.toml
     """
-    from design.files import write_text
-    from design.settings import commented_toml
+    from design.common.files import write_text
+    from design.common.settings import commented_toml
 
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or move it away")
@@ -83,8 +84,8 @@ def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) 
 
     Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
     """
-    from design.output import claimed
-    from design.profiling import stage
+    from design.common.files import claimed
+    from design.common.profiling import stage
 
     settings = load_spec(spec)
     _check_ahead(settings, out)
@@ -108,13 +109,13 @@ def report(folder: Path) -> None:
 
 
 BENCHES = {
-    "contact": "design.bench.contact:BENCH",
-    "objective": "design.bench.objective:BENCH",
-    "search": "design.bench.search:BENCH",
-    "networks": "design.bench.networks:BENCH",
-    "filter": "sense.bench.filter:BENCH",
-    "localizer": "sense.bench.localizer:BENCH",
-    "mould": "fabricate.bench:BENCH",
+    "contact": "design.pad.benchmark:BENCH",
+    "objective": "design.criteria.benchmark:BENCH",
+    "search": "design.optimisers.benchmark:BENCH",
+    "networks": "design.evaluation.benchmark:BENCH",
+    "filter": "sense.processing.benchmark:BENCH",
+    "localizer": "sense.localizer.calibration.benchmark:BENCH",
+    "mould": "fabricate.mould.benchmark:BENCH",
 }
 """Where each bench is, imported when it is asked for."""
 
@@ -143,9 +144,9 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
     from dataclasses import asdict
     from pkgutil import resolve_name
 
-    from design.bench.comparison import compared, lines, read_earlier
-    from design.bench.suite import run_benches
-    from design.bench.table import bench_lines, summary_lines
+    from design.benchmarking.comparison import compared, lines, read_earlier
+    from design.benchmarking.suite import run_benches
+    from design.benchmarking.table import bench_lines, summary_lines
 
     before = read_earlier(against) if against else {}
     chosen = names or [name for name in BENCHES if not before or name in before]
@@ -176,7 +177,7 @@ def _check_ahead(spec: "Spec", out: Path) -> None:
 
     from design.settings import Pad
     from fabricate import Settings
-    from sense.calibration import split_presses
+    from sense.localizer.calibration.calibration import split_presses
     from sense.settings import Localizer, Rig
 
     for model in _sections().values():
@@ -193,9 +194,9 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     from design.cli import summary as design_summary
     from fabricate import Settings, build
     from fabricate.cli import summary as mould_summary
-    from sense.cli import run_calibration
-    from sense.cli import summary as calibration_summary
-    from sense.rig.cli import run_recording
+    from sense.cli.calibration import run_calibration
+    from sense.cli.calibration import summary as calibration_summary
+    from sense.cli.rig import run_recording
 
     seeds = {"seed": seed}
     _, found = run_search(spec, out, seeds)
@@ -218,8 +219,8 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
 
 def _require_replaceable(recorded: Path) -> None:
     """Refuse to run over a recording, unless it is a simulated one, which the same seed gives again."""
-    from design.files import read_json
-    from sense.recorder import FILES, FORMAT, START
+    from design.common.files import read_json
+    from sense.recordings.recorder import FILES, FORMAT, START
 
     if not recorded.exists() or (recorded.is_dir() and not any(recorded.iterdir())):
         return
@@ -238,11 +239,11 @@ def write_report(folder: Path) -> Path:
     Raises:
         InputError: no stage has left anything, or a file is damaged.
     """
-    from design.files import read_json, write_text
-    from design.page import Section, page
-    from design.report import design_sections, origin, provenance_section
-    from fabricate.report import fabrication_sections
-    from sense import report as sensed
+    from design.common.files import read_json, write_text
+    from design.common.page.elements import Section, page
+    from design.report.sections import design_sections, origin, provenance_section
+    from fabricate.report.sections import fabrication_sections
+    from sense.report import sections as sensed
 
     stages = (
         ("design", folder / "design.json", design_sections),

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .console import (
+from design.common.command_line import (
+    INTERRUPTED,
     json_option,
     load_spec,
     out_option,
@@ -18,13 +19,12 @@ from .console import (
     show_result,
     spec_option,
 )
-from .endings import INTERRUPTED
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from .search import SearchResult
-    from .settings import Spec
+    from design.common.settings import Spec
+    from design.optimisers.search import SearchResult
 
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 
@@ -72,7 +72,7 @@ def design(
     """
     if context.invoked_subcommand is not None:
         return
-    from .output import claimed
+    from design.common.files import claimed
 
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with claimed(out), cluster(scheduler) as executor:
@@ -92,11 +92,13 @@ def run_search(
         origin: "random", "straight" or the file of a morphology to start from, which also says how many knots a fibre
             has unless `overrides` does. how: more arguments of `search`.
     """
-    from .files import provenance, write_json
-    from .morphology import Morphology
-    from .plan import draw_plan, save_figure
-    from .profiling import stage
-    from .search import search
+    from design.common.figures import save_figure
+    from design.common.files import provenance, write_json
+    from design.common.profiling import stage
+    from design.optimisers.search import search
+    from design.pad.morphology import Morphology
+    from design.report.plan_drawing import draw_plan
+
     from .settings import Contact, Pad, Rules, Search
 
     pad, contact, rules = spec.section(Pad), spec.section(Contact), spec.section(Rules)
@@ -149,7 +151,7 @@ def cluster(address: str | None) -> "Iterator[Executor | None]":
     if address is None:
         yield None
         return
-    from .errors import InputError
+    from design.common.errors import InputError
 
     try:
         from distributed import Client
@@ -188,10 +190,12 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     \b
     padforge design show out/pad/morphology.json --out plan.png
     """
-    from .errors import InputError
-    from .morphology import Morphology
-    from .plan import draw_plan, save_figure
-    from .rules import check as check_rules
+    from design.common.errors import InputError
+    from design.common.figures import save_figure
+    from design.criteria.rules import check as check_rules
+    from design.pad.morphology import Morphology
+    from design.report.plan_drawing import draw_plan
+
     from .settings import Contact, Rules
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
@@ -213,8 +217,9 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     \b
     padforge design check out/pad/morphology.json
     """
-    from .morphology import Morphology
-    from .rules import check as check_rules
+    from design.criteria.rules import check as check_rules
+    from design.pad.morphology import Morphology
+
     from .settings import Rules
 
     found = check_rules(Morphology.load(morphology), load_spec(spec).section(Rules))
@@ -232,9 +237,10 @@ def score(morphology: Path, spec: Path | None) -> None:
     \b
     padforge design score out/pad/morphology.json
     """
-    from .morphology import Morphology
-    from .rules import check as check_rules
-    from .score import score as score_terms
+    from design.criteria.rules import check as check_rules
+    from design.criteria.score import score as score_terms
+    from design.pad.morphology import Morphology
+
     from .settings import Contact, Rules, Search
 
     settings, pad = load_spec(spec), Morphology.load(morphology)

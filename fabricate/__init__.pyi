@@ -1,9 +1,9 @@
+from .checks.findings import Finding as Finding
+from .checks.mesh_checks import check_mesh as check_mesh
+from .checks.plan_checks import check as check
 from .export import build as build
-from .findings import Finding as Finding
-from .mould import build_mould as build_mould
-from .outlines import Plan as Plan
-from .printability import check as check
+from .mould.assembly import build_mould as build_mould
+from .mould.plan import Plan as Plan
 from .settings import Mould as Mould
 from .settings import Printer as Printer
 from .settings import Settings as Settings
-from .soundness import check_mesh as check_mesh

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from design.console import json_option, load_spec, profile_option, show_result, spec_option
+from design.common.command_line import json_option, load_spec, profile_option, show_result, spec_option
 
 MESHES = (".stl", ".3mf")
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
@@ -55,8 +55,8 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
 
     The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
     """
-    from design.morphology import Morphology
-    from design.output import claimed
+    from design.common.files import claimed
+    from design.pad.morphology import Morphology
 
     from .export import build as build_files
     from .settings import Settings
@@ -99,12 +99,13 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     padforge fabricate check out/pad/mould.stl
     padforge fabricate check out/pad/morphology.json --picture found.png
     """
-    from design.files import atomic
-    from design.morphology import Morphology
+    from design.common.files import atomic
+    from design.pad.morphology import Morphology
+    from fabricate.checks import mesh_checks as soundness
+    from fabricate.checks.plan_checks import meshed
+    from fabricate.mould.plan import Plan
+    from fabricate.report import pictures as drawings
 
-    from . import drawings, soundness
-    from .outlines import Plan
-    from .printability import meshed
     from .settings import Settings
 
     settings = Settings.from_spec(load_spec(spec))

@@ -12,17 +12,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from design import profiling
-from design.arguments import instance, path, shown
-from design.errors import InputError
-from design.files import atomic, provenance, require_file, write_json, write_text
-from design.morphology import Morphology
+from design.common import profiling
+from design.common.errors import InputError, instance, path, shown
+from design.common.files import atomic, provenance, require_file, write_json, write_text
+from design.pad.morphology import Morphology
+from fabricate.checks import mesh_checks as soundness
+from fabricate.checks import plan_checks as printability
+from fabricate.checks.findings import Finding
+from fabricate.mould.assembly import (
+    conductive_body,
+    conductive_plan,
+    lid_body,
+    lid_holes,
+    mould_body,
+    sizes,
+    valid_solid,
+)
+from fabricate.mould.plan import Plan
+from fabricate.mould.prisms import Body
+from fabricate.report import laying_guide as laying
+from fabricate.report import pictures as drawings
+from fabricate.report import track_drawings as tracks
 
-from . import drawings, laying, printability, soundness, tracks, writers
-from .bodies import Body
-from .findings import Finding
-from .mould import conductive_body, conductive_plan, lid_body, lid_holes, mould_body, sizes, valid_solid
-from .outlines import Plan
+from . import mesh_files as writers
 from .settings import DEFAULTS, Settings
 
 if TYPE_CHECKING:
@@ -113,7 +125,7 @@ def _bodies(plan: Plan) -> list[tuple[str, Body]]:
 
 
 def _meshed(name: str, body: Body) -> Printed:
-    from .meshes import arrays, mesh
+    from fabricate.mould.mesh import arrays, mesh
 
     solid = mesh(body)
     return Printed(name, solid, *arrays(solid))

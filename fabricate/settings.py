@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from design.arguments import instance
-from design.errors import InputError
-from design.settings import Pad, Rules, Section, Spec
+from design.common.errors import InputError, instance
+from design.common.settings import Section, Spec
+from design.settings import Pad, Rules
 
 
 class Mould(Section):

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer
 
-from design.settings import Section
+from design.common.settings import Section
 
 Features = Literal["full", "causal", "early", "published"]
 Method = Literal["masked", "published"]

@@ -9,7 +9,9 @@ from importlib.machinery import PathFinder
 import numpy as np
 import pytest
 
-from design import Contact, Morphology, profiling, search, signals, signals_sparse
+from design import Contact, Morphology, signals, signals_sparse
+from design.common import profiling
+from design.optimisers.search import search
 from design.settings import Pad, Rules, Search
 from fabricate import build
 from sense import Rig, calibrate, simulate
@@ -117,7 +119,7 @@ def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     with profiling.profiled() as profile:
         search(*asked, keep_in=tmp_path / "search")
     assert profile.counts["starts"] == [2, 2]
-    monkeypatch.setattr("design.checkpoint.Checkpoints.clear", lambda self: None)
+    monkeypatch.setattr("design.common.checkpoints.Checkpoints.clear", lambda self: None)
     first = search(*asked, keep_in=tmp_path / "search")
     with profiling.profiled() as profile:
         again = search(*asked, keep_in=tmp_path / "search", resume=True)

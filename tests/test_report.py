@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from design.errors import InputError
-from design.files import provenance
-from design.morphology import Morphology
-from design.plan import draw_plan, save_figure
+from design.common.errors import InputError
+from design.common.figures import save_figure
+from design.common.files import provenance
+from design.pad.morphology import Morphology
+from design.report.plan_drawing import draw_plan
 from design.settings import Contact, Pad, Rules, Search
 from fabricate import build
-from fabricate.mould_view import Packed, packed
+from fabricate.report.mould_view import Packed, packed
 from padforge import write_report
-
-from .chromium import CHROMIUM, SOFTWARE_GL, Chromium
+from tests.chromium import CHROMIUM, SOFTWARE_GL, Chromium
 
 HOSTILE = '</script><img src="x" onerror="document.title=1"> & <b>'
 PAD = Morphology.random(2, 2, seed=1)
@@ -165,7 +165,7 @@ def test_a_mesh_that_is_too_large_is_made_coarser_or_left_out(made: Path, pad: P
     assert coarse.nbytes <= whole.nbytes * 4 // 5
     assert volume(coarse) == pytest.approx(volume(whole), rel=0.01)
     assert packed(made / "mould.stl", most_bytes=1000) is None
-    monkeypatch.setattr("fabricate.report.packed", lambda path: None)
+    monkeypatch.setattr("fabricate.report.sections.packed", lambda path: None)
     text = write_report(pad).read_text()
     assert "mould.stl is too large to be turned" in text
     assert "<canvas" not in text

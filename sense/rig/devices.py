@@ -11,14 +11,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from design.errors import Fault
+from design.common.errors import Fault
 
 Array = NDArray[np.float64]
+
 Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""
-
-STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
-"""Columns of a row of `Arm.drain`; force is NaN where the arm has no sensor, safety 1 normal, 0 stopped."""
 
 Cause = Literal["refused", "lost", "stale", "protective_stop", "emergency_stop", "deadline", "force", "data", "disk"]
 

@@ -7,7 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import NoReturn
 
-from ..settings import Rig
+from sense.settings import Rig
+
 from .devices import Arm, ArmState, RigFault
 
 Vector = tuple[float, float, float]

@@ -9,12 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.console import json_option, load_spec, out_option, progress, show_result, spec_option
-from design.endings import INTERRUPTED
-from design.errors import InputError
+from design.common.command_line import (
+    INTERRUPTED,
+    json_option,
+    load_spec,
+    out_option,
+    progress,
+    show_result,
+    spec_option,
+)
+from design.common.errors import InputError
 
 if TYPE_CHECKING:
-    from design.morphology import Morphology
+    from design.pad.morphology import Morphology
 
     from .study import Study
 
@@ -45,7 +52,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
         def command(
             names: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
         ) -> None:
-            from design.output import refuse_unwritable
+            from design.common.files import refuse_unwritable
 
             from .study import lines, run
 
@@ -156,7 +163,7 @@ def force(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study force square random-5
     """
-    from .force import force_study
+    from sense.studies.indentation.force import force_study
 
     return force_study(_pads(names, seed), seed=seed)
 
@@ -168,7 +175,7 @@ def shape(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study shape random-5
     """
-    from .shape import shape_study
+    from sense.studies.indentation.shape import shape_study
 
     return shape_study(_pads(names, seed), seed=seed)
 
@@ -180,11 +187,13 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study drift out/pad/recording
     """
-    from .drift import drift_study
-    from .pads import is_recording, load_pads, load_recordings
+    from sense.recordings.import_export import is_recording
+    from sense.studies.drift.study import drift_study
+
+    from .pads import load_pads, load_recordings
 
     names = names or DEFAULT_PADS
-    recordings = [name for name in names if is_recording(name)]
+    recordings = [name for name in names if is_recording(Path(name))]
     pads = [name for name in names if name not in recordings]
     return drift_study(load_pads(pads, seed), load_recordings(recordings), seed=seed)
 
@@ -196,6 +205,6 @@ def multicontact(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study multicontact square
     """
-    from .multicontact import multicontact_study
+    from sense.studies.multicontact.study import multicontact_study
 
     return multicontact_study(_pads(names, seed), seed=seed)

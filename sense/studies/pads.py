@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from design.errors import InputError
-from design.morphology import Morphology
+from design.common.errors import InputError
+from design.pad.morphology import Morphology
 
 if TYPE_CHECKING:
-    from ..recording import Recording
+    from sense.recordings.recording import Recording
 
 NAMED = re.compile(r"(square|optimised|random-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
 """Straight fibres, random ones of N knots, and what a short search finds; their grid after an @."""
@@ -30,25 +30,13 @@ def load_pads(names: Sequence[str], seed: int) -> dict[str, Morphology]:
 
 
 def load_recordings(names: Sequence[str]) -> "dict[str, Recording]":
-    """Recordings by label, as `Recording.open` reads them; raises InputError as it does, and for a label met twice."""
-    from ..recording import Recording
+    """Recordings by label, as `open_recording` reads them; raises InputError as it does, and for a label met twice."""
+    from sense.recordings.import_export import open_recording
 
     def label(path: Path) -> str:
         return path.resolve().parent.name if path.name == "recording" else path.stem
 
-    return _labelled([(name, label(Path(name)), Recording.open(name)) for name in names])
-
-
-def is_recording(name: str) -> bool:
-    """Whether a path is that of a recording: a folder, or a file that holds readings."""
-    from ..recording import FILES
-
-    path = Path(name)
-    if path.suffix.lower() == ".mat" and path.is_file():
-        from design.published import load_mat
-
-        return "voltage" in load_mat(path, ())
-    return path.is_dir() or path.suffix.lower() in FILES
+    return _labelled([(name, label(Path(name)), open_recording(name)) for name in names])
 
 
 def _labelled(parts: list[tuple[str, str, Any]]) -> dict[str, Any]:
@@ -81,7 +69,7 @@ def _load(name: str, seed: int) -> tuple[str, Morphology]:
 
 def _optimised(grid: int, seed: int) -> Morphology:
     """What the default search finds from a single start, under the default rules."""
-    from design.search import search
+    from design.optimisers.search import search
     from design.settings import Contact, Pad, Rules, Search
 
     return search(Pad(grid=grid), Contact(), Search(starts=1, seed=seed), Rules()).morphology

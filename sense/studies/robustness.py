@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from design.checkpoint import State
-from design.contact import signals, signals_quantized
-from design.errors import InputError
-from design.evaluation import Loss, Trial, batches
-from design.losses import lost_subsets
-from design.morphology import Morphology
+from design.common.checkpoints import State
+from design.common.errors import InputError
+from design.criteria.fibre_loss import lost_subsets
+from design.evaluation.localisation_error import Loss, Trial, batches
+from design.pad.contact import signals, signals_quantized
+from design.pad.morphology import Morphology
 from design.settings import Contact
 
 from .pads import described
@@ -203,9 +203,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     """Errors by number of lost fibres, and maps of them before a loss and after the worst ones."""
     from matplotlib.figure import Figure
 
-    from design.palette import CURVES, FAINT, INK
-
-    from ..figures import tidy
+    from design.common.figures import CURVES, FAINT, INK, tidy
 
     labels = list(document["settings"]["pads"])
     levels = 1 + max(row["lost"] for row in document["rows"])

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from design.checkpoint import State
-from design.contact import signals
-from design.errors import InputError
-from design.evaluation import fresh_presses, training_presses
-from design.levenberg_marquardt import fit
-from design.morphology import Morphology
+from design.common.checkpoints import State
+from design.common.errors import InputError
+from design.evaluation.levenberg_marquardt import fit
+from design.evaluation.localisation_error import fresh_presses, training_presses
+from design.pad.contact import signals
+from design.pad.morphology import Morphology
 
 from .pads import described
 from .study import Findings, Study, Task
@@ -218,9 +218,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     """Errors and their share of the side by the grid, and maps of errors on fresh presses."""
     from matplotlib.figure import Figure
 
-    from design.palette import CURVES, FAINT, INK
-
-    from ..figures import tidy
+    from design.common.figures import CURVES, FAINT, INK, tidy
 
     grids, labels = document["settings"]["grids"], list(document["settings"]["pads"])
     figure = Figure(figsize=(max(7.2, 1.45 * len(grids)), 3.4 + 1.6 * len(labels)), layout="constrained")

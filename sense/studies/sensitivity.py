@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from design.checkpoint import State
-from design.contact import signals
-from design.evaluation import Trial
-from design.levenberg_marquardt import fit_many
-from design.morphology import Morphology
+from design.common.checkpoints import State
+from design.evaluation.levenberg_marquardt import fit_many
+from design.evaluation.localisation_error import Trial
+from design.pad.contact import signals
+from design.pad.morphology import Morphology
 from design.settings import Contact
 
 from .pads import described
@@ -137,9 +137,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
     """Errors by size of the object for every shape, and errors on objects that were not trained with."""
     from matplotlib.figure import Figure
 
-    from design.palette import CURVES, FAINT, INK
-
-    from ..figures import tidy
+    from design.common.figures import CURVES, FAINT, INK, tidy
 
     rows, settings = document["rows"], document["settings"]
     labels, radii, sides = list(settings["pads"]), settings["radii"], settings["sides"]

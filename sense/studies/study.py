@@ -12,9 +12,9 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from design.checkpoint import Checkpoints, State
-from design.files import provenance, write_json, write_text
-from design.threads import one_torch_thread
+from design.common.checkpoints import Checkpoints, State
+from design.common.computing import one_torch_thread
+from design.common.files import provenance, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,8 +91,8 @@ def run(
         InputError: tasks to go on from that belong to other settings, a folder that cannot be written, or in which the
             same study is at work.
     """
-    from design.output import refuse_unwritable, staged
-    from design.plan import save_figure
+    from design.common.figures import save_figure
+    from design.common.files import refuse_unwritable, staged
 
     refuse_unwritable(out)
     # What is kept goes by the number of a task, so the tasks and their order count as much as the settings.
@@ -113,7 +113,7 @@ def run(
 @contextmanager
 def _alone(out: Path, name: str) -> Iterator[None]:
     """Keep other runs of a study out of its folder; InputError where one is there."""
-    from design.output import lock
+    from design.common.files import lock
 
     out.mkdir(parents=True, exist_ok=True)
     path = out / f".{name}.lock"

@@ -5,9 +5,9 @@ import tomllib
 import pytest
 
 from design import Contact, InputError, Spec
-from design.settings import MODELS, Pad, Rules, Search, commented_toml
-
-from ..limits import require_ends
+from design.common.settings import commented_toml
+from design.settings import MODELS, Pad, Rules, Search
+from tests.limits import require_ends
 
 
 def test_the_written_defaults_read_back_as_the_defaults():

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from design.morphology import Morphology, assemble
+from design.pad.knots import assemble
+from design.pad.morphology import Morphology
 from design.settings import Pad, Rules
 from fabricate.settings import DEFAULTS, Mould, Printer, Settings
 

@@ -6,11 +6,10 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from design.errors import InputError
-from design.morphology import Morphology
+from design.common.errors import InputError
+from design.pad.morphology import Morphology
 from fabricate.cli import fabricate
-
-from .planted import level_pad
+from tests.fabricate.planted import level_pad
 
 FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md"}
 

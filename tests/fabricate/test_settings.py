@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from design.errors import InputError
-from design.settings import Spec, commented_toml
+from design.common.errors import InputError
+from design.common.settings import Spec, commented_toml
 from fabricate.settings import DEFAULTS, MODELS, Mould, Printer, Settings
 
 

@@ -5,7 +5,7 @@ import pytest
 from design import Morphology
 from sense import Localizer, Recording, calibrate
 from sense import settings as sense_settings
-from sense.rig.simulated import simulate
+from sense.recordings.simulation import simulate
 
 QUICK = sense_settings.Localizer(members=2, hidden=48, layers=2, epochs=100, batch=64)
 

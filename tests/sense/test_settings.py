@@ -3,8 +3,7 @@
 import pytest
 
 from sense.settings import Localizer, Rig
-
-from ..limits import require_ends
+from tests.limits import require_ends
 
 
 def test_the_defaults_are_those_of_the_published_bench() -> None:

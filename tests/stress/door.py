@@ -12,9 +12,8 @@ from unittest.mock import patch
 import pytest
 
 import padforge
-from design.errors import InputError
-
-from .clock import LIMIT_S, ends_in_time
+from design.common.errors import InputError
+from tests.stress.clock import LIMIT_S, ends_in_time
 
 CHEAP = """
 [pad]

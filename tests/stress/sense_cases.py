@@ -9,11 +9,10 @@ from unittest import mock
 import numpy as np
 from hypothesis import strategies as st
 
-from design.errors import InputError
+from design.common.errors import InputError
 from sense import HealthModel, Localizer, Recording, calibrate
 from sense import settings as sense_settings
-
-from .clock import LIMIT_S, ends_in_time
+from tests.stress.clock import LIMIT_S, ends_in_time
 
 TINY = sense_settings.Localizer(members=1, hidden=8, layers=1, epochs=2, batch=64, lost=2)
 """Learns next to nothing, in a moment."""
@@ -55,7 +54,7 @@ def learnt(features: str = "full", method: str = "masked") -> Localizer:
 def watched() -> HealthModel:
     """The health of that pad, learnt in a moment."""
     one = recorded()
-    with mock.patch("sense.residuals.STEPS", 30):
+    with mock.patch("sense.health.fibre_prediction.STEPS", 30):
         return HealthModel.fit(one.readings, one.times_s, one.begun, one.lifted, rng=np.random.default_rng(0))
 
 

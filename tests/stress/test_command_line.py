@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from .clock import few
-from .door import SPECIAL, Workshop
+from tests.stress.clock import few
+from tests.stress.door import SPECIAL, Workshop
 
 LONG = "x" * 300
 HOSTILE = (

@@ -16,18 +16,18 @@ import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design.checkpoint import Checkpoints
-from design.errors import InputError
-from design.morphology import Morphology
-from design.rules import check as check_rules
-from design.search import search
+from design.common.checkpoints import Checkpoints
+from design.common.errors import InputError
+from design.criteria.rules import check as check_rules
+from design.optimisers.search import search
+from design.pad.morphology import Morphology
 from design.settings import Contact, Pad, Rules, Search
+from fabricate.checks.mesh_checks import inspect_mesh
 from fabricate.export import build
-from fabricate.soundness import inspect_mesh, read_mesh
+from fabricate.mesh_files import read_mesh
 from padforge import write_report
-
-from .clock import ends_in_time, few
-from .door import require_one_line
+from tests.stress.clock import ends_in_time, few
+from tests.stress.door import require_one_line
 
 SEARCH = Search(knots=1, starts=1, steps=30, lost=1, population=4, generations=4)
 PAD, RULES = Pad(grid=1), Rules(enforce=False)

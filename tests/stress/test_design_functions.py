@@ -20,19 +20,18 @@ from design import (
     flatten,
     indented_signals,
     published_objective,
-    search,
     signals,
     signals_quantized,
     signals_sparse,
 )
-from design.evaluation import evaluate
-from design.plan import draw_plan
-from design.rules import check
-from design.score import score
+from design.criteria.rules import check
+from design.criteria.score import score
+from design.evaluation.localisation_error import evaluate
+from design.optimisers.search import search
+from design.report.plan_drawing import draw_plan
 from design.settings import Pad, Rules, Search
-
-from .clock import ends_in_time, few
-from .values import LAX, call_spoiled, contacts, pads, presses
+from tests.stress.clock import ends_in_time, few
+from tests.stress.values import LAX, call_spoiled, contacts, pads, presses
 
 Arguments = dict[str, Any]
 PAD = Morphology.random(2, 3, seed=1)

@@ -21,24 +21,31 @@ from design import (
     signals_quantized,
     signals_sparse,
 )
-from design.bends import bend_radius, fold_gap, trace
-from design.contact import fibre_axes, press_shape
-from design.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
-from design.fibres import Fibres
-from design.information import disorder, disorder_area, idle_share, information, joint_entropy, quantize, sharpness
-from design.kernels.gradient import signals_gradient
-from design.kernels.pchip import population_slopes
-from design.kernels.reach import family_strays
-from design.kernels.roots import SCRATCH, roots_in_unit
-from design.levenberg_marquardt import fit_many
-from design.morphology import assemble
-from design.objective import published_terms
-from design.penalties import penalties
-from design.rules import check
+from design.criteria.information import (
+    disorder,
+    disorder_area,
+    idle_share,
+    information,
+    joint_entropy,
+    quantize,
+    sharpness,
+)
+from design.criteria.penalties import penalties
+from design.criteria.published_objective import published_terms
+from design.criteria.rules import check
+from design.evaluation.levenberg_marquardt import fit_many
+from design.optimisers.parametrization import Fibres
+from design.pad.bending import bend_radius, fold_gap, trace
+from design.pad.contact import fibre_axes, press_shape
+from design.pad.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
+from design.pad.kernels.exact_gradient import signals_gradient
+from design.pad.kernels.pchip import population_slopes
+from design.pad.kernels.press import family_strays
+from design.pad.kernels.roots import SCRATCH, roots_in_unit
+from design.pad.knots import assemble
 from design.settings import Pad, Rules
-
-from .clock import ends_in_time, few
-from .values import LAX, Array, contacts, pads, presses, seeds, wild_knots
+from tests.stress.clock import ends_in_time, few
+from tests.stress.values import LAX, Array, contacts, pads, presses, seeds, wild_knots
 
 KINDS = ["random", "steps", "lattice", "border", "alike", "edge", "needles", "level"]
 
@@ -233,7 +240,7 @@ def test_gradients_are_finite_differences(seed, weight, length):
     shape, strays = press_shape(contact), np.array([2.0, 2.0])
 
     def total(v: Array) -> float:
-        from design.kernels.exact import exact_signals
+        from design.pad.kernels.exact_signals import exact_signals
 
         out, none = np.zeros(2), np.empty(0, np.int64)
         exact_signals(travel[None], v[None], slope[None], strays[None], place, *shape, 0, 1, none, none, out)

@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from design.files import atomic, write_json
-from design.morphology import Morphology
-from fabricate.soundness import read_mesh
-
-from .clock import few
-from .door import CHEAP, contents
+from design.common.files import atomic, write_json
+from design.pad.morphology import Morphology
+from fabricate.mesh_files import read_mesh
+from tests.stress.clock import few
+from tests.stress.door import CHEAP, contents
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")
 

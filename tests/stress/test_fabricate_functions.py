@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from design import InputError, Morphology
 from design.settings import Pad
 from fabricate import Finding, Mould, Plan, Printer, Settings, build, build_mould, check, check_mesh
-from fabricate.drawings import draw_findings
-from fabricate.printability import meshed
-from fabricate.soundness import SOUND, inspect_mesh, read_mesh, sound
-from fabricate.writers import write_3mf, write_stl
-
-from .clock import ends_in_time, few
-from .values import LAX, Array, call_spoiled, pads
+from fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
+from fabricate.checks.plan_checks import meshed
+from fabricate.mesh_files import read_mesh, write_3mf, write_stl
+from fabricate.report.pictures import draw_findings
+from tests.stress.clock import ends_in_time, few
+from tests.stress.values import LAX, Array, call_spoiled, pads
 
 Arguments = dict[str, Any]
 Verify = Callable[[Any, Arguments], None]

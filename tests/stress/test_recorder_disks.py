@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 
 import padforge
 import sense
-from design.errors import InputError
-
-from .clock import ends_in_time, few
-from .sense_cases import TINY, made, right_or_refused
+from design.common.errors import InputError
+from tests.stress.clock import ends_in_time, few
+from tests.stress.sense_cases import TINY, made, right_or_refused
 
 NOBODY = 65_534
 PRESSES, CYCLE, FIBRES = 12, 40, 4
@@ -278,7 +277,7 @@ def test_commands_on_a_full_disk_leave_all_or_nothing(bench: Path, name: str, li
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands_in_a_folder_of_somebody_else_are_one_line(bench: Path, name: str) -> None:
-    for module in ("encodings.utf_8_sig", "matplotlib.font_manager", "sense.figures"):
+    for module in ("encodings.utf_8_sig", "matplotlib.font_manager", "sense.report.calibration_figures"):
         import_module(module)  # where Python lies in a home, a child of another user cannot look there
     out = bench / f"closed_{name}"
     out.mkdir(mode=0o755, exist_ok=True)

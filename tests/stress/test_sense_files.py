@@ -19,11 +19,10 @@ from hypothesis import given
 
 import padforge
 import sense
-from sense.hdf5 import export_hdf5, import_hdf5
-from sense.rig.plan import read_plan
-
-from .clock import few
-from .sense_cases import TINY, learnt, made, recorded, right_or_refused, seeds, watched
+from sense.recordings.hdf5 import export_hdf5, import_hdf5
+from sense.rig.planning.press_plan import read_plan
+from tests.stress.clock import few
+from tests.stress.sense_cases import TINY, learnt, made, recorded, right_or_refused, seeds, watched
 
 SMALL = made(3, presses=12)
 NUMBERS = (

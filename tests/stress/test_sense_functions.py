@@ -10,10 +10,20 @@ from hypothesis import given
 import sense
 from design import Morphology
 from sense import settings as sense_settings
-from sense.rig.plan import PressPlan
-
-from .clock import few
-from .sense_cases import EXTREMES, ODD, TINY, learnt, made, recorded, right_or_refused, seeds, spoiled, watched
+from sense.rig.planning.press_plan import PressPlan
+from tests.stress.clock import few
+from tests.stress.sense_cases import (
+    EXTREMES,
+    ODD,
+    TINY,
+    learnt,
+    made,
+    recorded,
+    right_or_refused,
+    seeds,
+    spoiled,
+    watched,
+)
 
 SMALL = made(2, presses=12)
 

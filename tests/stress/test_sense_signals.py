@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given
 
 import sense
-from design.errors import InputError
-from sense.presses import FEATURES, press_inputs
-from sense.response import Response
-from sense.scaling import Scaling
-
-from .clock import ends_in_time, few
-from .sense_cases import EXTREMES, RATE_HZ, TINY, learnt, made, recorded, right_or_refused, seeds, watched
+from design.common.errors import InputError
+from sense.localizer.features import FEATURES, press_inputs
+from sense.localizer.normalization import Scaling
+from sense.localizer.response_model import Response
+from tests.stress.clock import ends_in_time, few
+from tests.stress.sense_cases import EXTREMES, RATE_HZ, TINY, learnt, made, recorded, right_or_refused, seeds, watched
 
 
 def _faulty(rng: np.random.Generator, readings: np.ndarray) -> np.ndarray:
@@ -181,7 +180,7 @@ def test_health_is_learnt_from_the_worst_or_refused(
 @pytest.fixture(scope="module")
 def few_steps():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sense.residuals.STEPS", 20)
+        patch.setattr("sense.health.fibre_prediction.STEPS", 20)
         yield
 
 

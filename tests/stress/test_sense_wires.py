@@ -10,11 +10,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.rig import framing, ur5_wire, ur_frames
-from sense.rig.ur_reader import VARIABLES, RtdeReader
-
-from .clock import ends_in_time, few
-from .sense_cases import seeds
+from sense.rig.arduino import framing
+from sense.rig.ur5 import messages as ur5_wire
+from sense.rig.ur5 import rtde_frames as ur_frames
+from sense.rig.ur5.rtde_reader import VARIABLES, RtdeReader
+from tests.stress.clock import ends_in_time, few
+from tests.stress.sense_cases import seeds
 
 SETTINGS = framing.Settings(1_000_000, 0b1111, 4)
 FRAMES = (

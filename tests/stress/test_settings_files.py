@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design.errors import InputError
-from design.morphology import Morphology
-from design.rules import check as check_rules
-from design.settings import Contact, Pad, Rules, Section, Spec, commented_toml
-from fabricate import printability
+from design.common.errors import InputError
+from design.common.settings import Section, Spec, commented_toml
+from design.criteria.rules import check as check_rules
+from design.pad.morphology import Morphology
+from design.settings import Contact, Pad, Rules
 from fabricate import settings as fabricate
+from fabricate.checks import plan_checks as printability
 from padforge import _check_ahead, _sections
-
-from .clock import ends_in_time, few
-from .door import require_one_line
+from tests.stress.clock import ends_in_time, few
+from tests.stress.door import require_one_line
 
 MODELS = _sections()
 DEFAULTS = commented_toml(MODELS).encode()

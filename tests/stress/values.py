@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from design import Contact, InputError, Morphology
-from design.morphology import assemble
-
-from .clock import ends_in_time
+from design.pad.knots import assemble
+from tests.stress.clock import ends_in_time
 
 Array = NDArray[np.float64]
 LAX = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much, HealthCheck.large_base_example]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sense.rig.devices import ArmState, Pose, RigFault
+from sense.rig.emulators.ur import HOME, UrEmulator
+from sense.rig.emulators.ur_controller import Series
 from sense.rig.safety import Limits, wait_until_still
-from sense.rig.ur5 import UR5
-from sense.rig.ur_controller import Series
-from sense.rig.ur_emulator import HOME, UrEmulator
+from sense.rig.ur5.driver import UR5
 
 HOST = "127.1"
 """127.0.0.1 by a name for which ur-rtde asks whether the arm is in remote control."""

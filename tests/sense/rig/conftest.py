@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sense.rig.ur5 import UR5
-from sense.rig.ur_controller import Series
-from sense.rig.ur_emulator import UrEmulator
-
-from .arms import HOST, Robots
+from sense.rig.emulators.ur import UrEmulator
+from sense.rig.emulators.ur_controller import Series
+from sense.rig.ur5.driver import UR5
+from tests.sense.rig.arms import HOST, Robots
 
 WAIT_S = 180.0
 

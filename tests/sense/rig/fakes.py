@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design import Contact, Morphology
-from sense.rig.devices import STATE_COLUMNS, ArmState, Pose, RigFault, Samples
-from sense.rig.frame import Frame
-from sense.rig.pad_model import LivePad
+from sense.recordings.pad_model import LivePad
+from sense.recordings.recorder import STATE_COLUMNS
+from sense.rig.devices import ArmState, Pose, RigFault, Samples
+from sense.rig.session.pad_frame import Frame
 from sense.settings import Rig
 
 PAD = Morphology.straight(2)

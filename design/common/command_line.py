@@ -1,0 +1,138 @@
+"""What every stage's command line shares: the settings file, progress on stderr, results on stdout."""
+
+import functools
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .errors import Fault, InputError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from .settings import Spec
+
+spec_option = click.option(
+    "--spec",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Settings file (default: pad.toml in the current folder, if there is one).",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
+seed_option = click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice.")
+
+
+def out_option(default: str) -> Callable[..., Any]:
+    """`--out DIR`, the folder results go to."""
+    return click.option(
+        "--out",
+        type=click.Path(file_okay=False, path_type=Path),
+        default=default,
+        show_default=True,
+        help="Folder for the results.",
+    )
+
+
+def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--profile`: at the command's end, say on stderr where time went and what was skipped."""
+
+    @click.option("--profile", is_flag=True, help="Say on stderr where time went and what was skipped.")
+    @functools.wraps(command)
+    def noted(*arguments: Any, profile: bool, **options: Any) -> Any:
+        if not profile:
+            return command(*arguments, **options)
+        from .profiling import profiled
+
+        with profiled() as found:
+            try:
+                return command(*arguments, **options)
+            finally:
+                click.echo("\n".join(found.lines()), err=True)
+
+    return noted
+
+
+def load_spec(path: Path | None) -> "Spec":
+    """The settings file named, else `pad.toml` here if there is one, else the defaults."""
+    from .settings import Spec
+
+    here = Path("pad.toml")
+    return Spec.load(path or (here if here.exists() else None))
+
+
+@contextmanager
+def progress() -> Iterator["Progress"]:
+    """A progress display on stderr; silent where stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    err = Console(stderr=True)
+    name, note = TextColumn("{task.description:<12}"), TextColumn("{task.fields[note]}")
+    with Progress(name, BarColumn(), note, TimeElapsedColumn(), console=err, disable=not err.is_terminal) as bar:
+        yield bar
+
+
+def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> None:
+    """Print the machine-readable result or its summary for people, both on stdout."""
+    click.echo(json.dumps(document, indent=1) if as_json else "\n".join(lines))
+
+
+INTERRUPTED = 130
+
+
+def run_to_end(command: click.Command, name: str) -> int:
+    """Run a command line on the arguments of this process; its exit code, with one line on stderr where it failed."""
+    _prepare()
+    try:
+        _require_words(sys.argv[1:])
+        return command.main(standalone_mode=False, prog_name=name) or 0
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        return 2
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        return _fail(name, "interrupted; what was finished is kept", INTERRUPTED)
+    except click.ClickException as error:
+        return _fail(name, error.format_message(), 2)
+    except InputError as error:
+        return _fail(name, str(error), 2)
+    except Fault as fault:
+        return _fail(name, str(fault), fault.exit_code)
+    except OSError as error:
+        return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
+    except MemoryError as error:
+        return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})", 2)
+
+
+def _prepare() -> None:
+    """Let names that are no text be printed, and an end from outside clear up as Ctrl-C does."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    for ending in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
+        number = getattr(signal, ending)
+        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
+            signal.signal(number, signal.default_int_handler)
+
+
+def _require_words(words: list[str]) -> None:
+    """Refuse what no shell can hand over, but a caller from Python can: such names would trip whatever opens them."""
+    for word in words:
+        try:
+            odd = b"\0" in os.fsencode(word)
+        except UnicodeEncodeError:
+            odd = True
+        if odd:
+            raise InputError(f"{word!r}: holds characters that no argument can have")
+
+
+def _fail(name: str, message: str, code: int) -> int:
+    with suppress(OSError):  # of a disk that is full: the exit code says the same
+        print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
+    return code

@@ -1,0 +1,100 @@
+"""The fibres and their exact signals in torch: what the gradient search differentiates."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from design.common import profiling
+from design.pad.contact import note_reach, press_shape
+from design.pad.kernels.exact_gradient import signals_gradient
+from design.pad.kernels.exact_signals import exact_signals
+from design.pad.kernels.press import family_strays
+from design.settings import Contact
+
+
+def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
+    """PCHIP slopes (..., n) of values v at ascending t, both (..., n); differentiable almost everywhere.
+
+    The same rule as `kernels.pchip.pchip_slopes`, to rounding.
+    """
+    h = t.diff(dim=-1)
+    m = v.diff(dim=-1) / h
+    if t.shape[-1] == 2:
+        return m.expand(*m.shape[:-1], 2)
+    h0, h1, m0, m1 = h[..., :-1], h[..., 1:], m[..., :-1], m[..., 1:]
+    w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+    alike = m0 * m1 > 0
+    safe0, safe1 = torch.where(alike, m0, 1.0), torch.where(alike, m1, 1.0)
+    inner = torch.where(alike, (w0 + w1) / (w0 / safe0 + w1 / safe1), 0.0)
+    first = _end_slope(h[..., 0], h[..., 1], m[..., 0], m[..., 1])
+    last = _end_slope(h[..., -1], h[..., -2], m[..., -1], m[..., -2])
+    return torch.cat([first[..., None], inner, last[..., None]], dim=-1)
+
+
+def _end_slope(h0: Tensor, h1: Tensor, m0: Tensor, m1: Tensor) -> Tensor:
+    d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
+    limited = torch.where((m0 * m1 <= 0) & (d.abs() > 3 * m0.abs()), 3 * m0, d)
+    return torch.where(d * m0 <= 0, torch.zeros_like(d), limited)
+
+
+def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Values and slopes, both (..., F), of the PCHIP curves through (t, v), (..., n), at the points `at` (F,)."""
+    d = pchip_slopes(t, v)
+    inner = t[..., 1:-1].detach().contiguous()
+    j = torch.searchsorted(inner, at.expand(*t.shape[:-1], -1).contiguous(), right=True)
+    t0, v0, d0 = (x.gather(-1, j) for x in (t, v, d))
+    t1, v1, d1 = (x.gather(-1, j + 1) for x in (t, v, d))
+    h = t1 - t0
+    m = (v1 - v0) / h
+    s = (at - t0) / h
+    c2, c3 = 3 * m - 2 * d0 - d1, d0 + d1 - 2 * m
+    return v0 + h * s * (d0 + s * (c2 + s * c3)), d0 + s * (2 * c2 + 3 * s * c3)
+
+
+def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
+    """Places (..., P, 2) and slopes (..., P) of the PCHIP curves through (t, v), (..., n), P = (n - 1) per_span + 1.
+
+    Every span gets as many samples, closer to its ends, since that is where a steep one bends.
+    """
+    d = pchip_slopes(t, v)
+    t0, v0, d0, d1 = (x[..., None] for x in (t[..., :-1], v[..., :-1], d[..., :-1], d[..., 1:]))
+    h = t.diff(dim=-1)[..., None]
+    m = v.diff(dim=-1)[..., None] / h
+    s = (1 - torch.cos(torch.arange(per_span, dtype=t.dtype) * (math.pi / per_span))) / 2
+    c2, c3 = 3 * m - 2 * d0 - d1, d0 + d1 - 2 * m
+    columns = t0 + h * s, v0 + h * s * (d0 + s * (c2 + s * c3)), d0 + s * (2 * c2 + 3 * s * c3)
+    at, value, slope = (
+        torch.cat([x.flatten(-2), y[..., -1:]], dim=-1) for x, y in zip(columns, (t, v, d), strict=True)
+    )
+    return torch.stack([at, value], dim=-1), slope
+
+
+class ExactSignals(torch.autograd.Function):
+    """The exact signals of one pad as a torch function of its knots and slopes, with their analytic gradient.
+
+    `ExactSignals.apply(travel, cross, slope, presses, contact)`: travel, cross, slope (2M, n) float64, presses (Q, 2)
+    numpy; gives (2M, Q).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Any, contact: Contact) -> Tensor:
+        """Signals (2M, Q) in grid units."""
+        t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
+        shape, strays, none = press_shape(contact), family_strays(v[None]), np.empty(0, np.int64)
+        ctx.inputs = (t, v, d, strays[0], presses, shape)
+        out = np.zeros(len(presses) * len(t))
+        begin, end = 0, len(presses)
+        visited = exact_signals(t[None], v[None], d[None], strays, presses, *shape, begin, end, none, none, out)
+        if profiling.asked():
+            note_reach(t[None], strays, presses, shape[1], visited)
+        return torch.from_numpy(out.reshape(-1, len(t)).T)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient by travel, cross and slope."""
+        t, v, d, strays, presses, shape = ctx.inputs
+        found = signals_gradient(t, v, d, strays, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
+        return (*torch.from_numpy(found), None, None)

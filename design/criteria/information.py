@@ -1,0 +1,123 @@
+"""Information measures of a pad's signals (paper, section II-C): quantisation, joint entropy, sharpness, disorder."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.pad.contact import fibre_axes, signals
+from design.pad.kernels import information as kernels
+from design.pad.kernels.pchip import population_slopes, sample_curves
+from design.pad.morphology import Morphology
+from design.settings import Contact
+
+LEVELS = 4096
+"""Levels of the published 12-bit converter."""
+
+Array = NDArray[np.float64]
+
+
+def quantize(signals: Array, levels: int = LEVELS) -> Array:
+    """Signals (Q, C) as converter levels 0..levels: each column scaled to its range, then rounded up.
+
+    A column without range, such as a fibre no press touches, is 0 throughout.
+    """
+    out = np.zeros(signals.shape)
+    if len(signals):
+        kernels.to_levels(np.asarray(signals, dtype=np.float64), levels, out)
+    return out
+
+
+def joint_entropy(levels: Array) -> float:
+    """Joint entropy in bits of the rows of (Q, C), whole numbers: at most log2 Q, reached where all rows differ."""
+    return float(kernels.row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
+
+
+def sharpness(levels: Array) -> float:
+    """Z of formula (4): sum over columns of |second difference| along the press order."""
+    return float(kernels.second_differences(np.asarray(levels, dtype=np.float64)))
+
+
+def disorder(knots: Array, samples: int = 2000) -> float:
+    """C: how much fibres of a family stand in the wrong order, as the published code counts it.
+
+    For every pair i < j of a family the negative parts of curve_j - curve_i are summed over `samples` points, so C
+    grows with `samples`; `disorder_area` is what it samples.
+
+    Args:
+        knots: (2M, N+2, 2).
+
+    Returns:
+        The sum, in grid units.
+    """
+    return float(kernels.disorder(sample_curves(knots[None], samples)[0]))
+
+
+def disorder_area(pad: Morphology) -> float:
+    """Area, in squared grid units, by which fibres of a family stand in the wrong order: C without its sampling.
+
+    The sum over pairs i < j of a family of the integral of max(curve_i - curve_j, 0), exact on the PCHIP curves;
+    `disorder` approaches it times (samples - 1) / (M + 1).
+    """
+    travel, cross, _ = fibre_axes(pad)
+    return max(0.0, float(kernels.disorder_area(travel[0], cross[0], population_slopes(travel, cross)[0])))
+
+
+def idle_share(signals: Array, threshold: float = 0.0) -> float:
+    """Share of presses in which a fibre is idle, over fibres and presses (paper, table III).
+
+    Args:
+        signals: (Q, C) changes from rest. threshold: share of a fibre's range over all presses that its change must
+            exceed to count as active: 0 in simulation, 0.02 in the paper's experiment.
+    """
+    if signals.size == 0:
+        return 0.0
+    return float((np.abs(signals) <= threshold * np.ptp(signals, axis=0)).mean())
+
+
+def information(pad: Morphology, contact: Contact | None = None, noise: float = 1.0, side: int = 20) -> float:
+    """Mutual information, in bits, between the place of a press and the pad's noisy signals: a lower bound.
+
+    The place is uniform over 1..M squared, each signal carries Gaussian noise of `noise` counts of a converter whose
+    LEVELS span the largest signal. The square is cut into side x side cells; within a cell signals are linear in the
+    place, so the signals of a cell are Gaussian with covariance C = sigma^2 I + J S J^T (J the signals' derivative, S
+    the spread of a place in its cell) and those of the pad a mixture. With D the Bhattacharyya distance,
+
+        I >= mean_a [ln det(C_a / sigma^2) / 2] - mean_a ln mean_b exp(-D_ab)    (in nats)
+
+    (pairwise bound on the entropy of a mixture: Kolchinsky and Tracey, Entropy 2017, equation (10)).
+
+    How it relates to the published measure: without the spread in a cell and without noise the second term alone is
+    the joint entropy of the presses' signals, at most log2 of their number; the first term goes on where that ends.
+    Two cells the pad cannot tell apart cost the same in both.
+
+    Args:
+        noise: converter counts, > 0. side: cells a side, at least 2.
+    """
+    centres = (np.arange(side) + 0.5) / side * max(pad.grid - 1, 1) + (1 if pad.grid > 1 else 0.5)
+    places = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
+    step = 1e-4
+    around = (places[:, None] + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
+    found = signals(pad, around, contact).reshape(len(places), 5, -1)
+    if not found.any():
+        return 0.0
+    sigma = noise * found.max() / LEVELS
+    mean = found[:, 0] / sigma
+    cell = (centres[1] - centres[0]) / np.sqrt(12)
+    spread = cell / (2 * step * sigma) * (found[:, 1::2] - found[:, 2::2]).transpose(0, 2, 1)  # (Q, 2M, 2)
+    own = np.linalg.slogdet(np.eye(2) + np.einsum("aki,akj->aij", spread, spread))[1]
+    blocks = [_mean_exponential(mean, spread, own, part) for part in np.array_split(np.arange(len(mean)), side)]
+    return float((own.mean() / 2 - np.log(np.concatenate(blocks)).mean()) / np.log(2))
+
+
+def _mean_exponential(mean: Array, spread: Array, own: Array, rows: NDArray[np.int64]) -> Array:
+    """mean_b exp(-D_ab) for the cells a in `rows`: means (Q, C) and covariances I + spread spread^T, noise units.
+
+    The mean covariance of two cells is I + W W^T with W = [spread_a, spread_b] / sqrt 2, four columns, so its
+    determinant and inverse are those of a 4 x 4 matrix.
+    """
+    both = np.concatenate(np.broadcast_arrays(spread[rows, None], spread[None]), axis=-1) / np.sqrt(2)
+    gap = mean[rows, None] - mean[None]
+    inner = np.eye(4) + np.einsum("abki,abkj->abij", both, both)
+    along = np.einsum("abki,abk->abi", both, gap)
+    square = (gap**2).sum(axis=-1) - (along * np.linalg.solve(inner, along[..., None])[..., 0]).sum(axis=-1)
+    distance = square / 8 + (np.linalg.slogdet(inner)[1] - (own[rows, None] + own[None]) / 2) / 2
+    return np.exp(-distance).mean(axis=1)

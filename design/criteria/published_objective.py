@@ -1,0 +1,90 @@
+"""What a search minimises: the published objective, for the genetic search and for comparison."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from design.common.computing import in_chunks
+from design.common.errors import InputError, instance, reals
+from design.common.settings import section
+from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
+from design.pad.kernels.information import published_terms as terms_kernel
+from design.pad.morphology import Morphology
+from design.settings import Contact
+
+from .information import LEVELS
+
+
+@dataclass(frozen=True)
+class PublishedTerms:
+    """The published objective and what it is made of.
+
+    Attributes:
+        entropy: joint entropy of the horizontals' signals plus that of the verticals', bits.
+        sharpness: Z, sum of |second difference| of the converter levels along the press order.
+        disorder: C, how much fibres of a family stand in the wrong order.
+        objective: alpha / (1 + entropy) + beta Z + gamma C, to be minimised.
+    """
+
+    entropy: float
+    sharpness: float
+    disorder: float
+    objective: float
+
+
+@lru_cache(maxsize=16)
+def published_presses(grid: int, side: int = 7) -> NDArray[np.float64]:
+    """The (side^2, 2) presses the published search samples: a serpentine over 1..M, jittered by U(0, 2/49)."""
+    places = boustrophedon(grid, side, jitter=2 / 49)
+    places.setflags(write=False)
+    return places
+
+
+def published_terms(
+    pads: Morphology | NDArray[np.float64],
+    contact: Contact | None = None,
+    presses: ArrayLike | None = None,
+    samples: int = 2000,
+    weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
+) -> list[PublishedTerms]:
+    """Terms of formula (5), as the published code computes them, for every pad of a population.
+
+    Args:
+        pads: a morphology, or knots (P, 2M, N+2, 2) of a population.
+        presses: (Q, 2) in an order of neighbours; the 49 published ones if None.
+        samples: points per fibre of the quantised signals and of C.
+        weights: alpha, beta, gamma.
+    """
+    alpha, beta, gamma = _weights(weights)
+    travel, cross, _ = fibre_axes(pads)
+    samples = as_samples(samples, travel.shape[1])
+    grid = travel.shape[1] // 2
+    places = as_presses(published_presses(grid) if presses is None else presses)[0]
+    shape = press_shape(section("contact", contact, Contact))
+    found = np.zeros((len(travel), 3))
+
+    def work(begin: int, end: int) -> None:
+        terms_kernel(travel, cross, places, *shape, samples, LEVELS, begin, end, found)
+
+    in_chunks(work, len(travel), grain=8)
+    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
+
+
+def published_objective(
+    pad: Morphology,
+    contact: Contact | None = None,
+    presses: ArrayLike | None = None,
+    samples: int = 2000,
+    weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
+) -> float:
+    """Formula (5) for one pad: alpha / (1 + entropy) + beta Z + gamma C; arguments as in `published_terms`."""
+    return published_terms(instance("pad", pad, Morphology), contact, presses, samples, weights)[0].objective
+
+
+def _weights(weights: tuple[float, float, float]) -> list[float]:
+    found = reals("weights", weights, 1e12)
+    if found.shape != (3,):
+        raise InputError(f"weights have shape {found.shape}, expected three numbers: alpha, beta, gamma")
+    return found.tolist()

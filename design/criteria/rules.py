@@ -1,0 +1,184 @@
+"""Rules that make a pad buildable, checked exactly on the finished curves, each finding with place and amount.
+
+The search has a differentiable penalty for some of them (`descent`); what counts is the check here.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from design.common.errors import instance
+from design.pad.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, trace
+from design.pad.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
+from design.pad.morphology import Morphology
+from design.settings import Rules
+
+Array = NDArray[np.float64]
+
+_TOLERANCE_MM = 1e-3
+_FOLD_TOLERANCE = 1e-4  # of the gap where that is more: all points within a gap of each other are compared
+
+_FINEST_TURN = 1e-4
+"""Radians between the points at which bends are looked at, at least: matters for radii far beyond the pad's size."""
+
+_CROSSING_TOLERANCE = 1e-6
+"""Grid units; places a crossing so well that, at the default pitch, the angle of two fibres of 1 mm radius that cross
+at 10 degrees is right to 0.01 degrees."""
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One broken rule.
+
+    Attributes:
+        rule: the setting's name in `[rules]`.
+        fibres: the fibres concerned, 1..2M (horizontals bottom to top, then verticals left to right); none where the
+            finding is about the whole pad.
+        measured, limit: what was found and what is allowed, mm (or degrees, or a count).
+        place_mm: where, from the pad's centre; None where the finding has no single place.
+    """
+
+    rule: str
+    fibres: tuple[int, ...]
+    measured: float
+    limit: float
+    place_mm: tuple[float, float] | None = None
+
+    def __str__(self) -> str:
+        names = " and ".join(f"fibre {f}" for f in self.fibres) or "pad"
+        place = "" if self.place_mm is None else f" at ({self.place_mm[0]:.1f}, {self.place_mm[1]:.1f}) mm"
+        return f"{self.rule}: {names}{place}: {_amount(self.measured)}, limit {_amount(self.limit)}"
+
+
+def check(pad: Morphology, rules: Rules) -> list[Violation]:
+    """Every rule of `[rules]` that `pad` breaks, worst place per fibre or pair of fibres.
+
+    - `min_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left and
+      right added up; the radius found is R / 2 divided by the greatest such angle. So a bend that keeps on is as wide
+      as R, while a kink of up to half a radian (29 degrees) passes where R / 2 around it is straight.
+    - `min_gap_mm` g: two fibres of a family keep the distance g; and so do any two points of one fibre that lie at
+      least pi g / 2 apart along it, which is half a turn around a circle of diameter g.
+    - `same_family_crossings`: the number of places at which fibres of one family meet, in the whole pad.
+    - `max_crossings`: the number of places at which horizontals meet verticals, in the whole pad.
+    - `min_crossing_angle_deg`: the angle, 0 to 90, between the tangents where a horizontal meets a vertical; 0 where
+      they run on each other, and next to 0 where they touch.
+    - `border_mm`: the distance of every fibre to the two sides of the pad that it runs along.
+    - `max_length_mm`: the arc length of a fibre.
+
+    Distances are right to twice the 1e-3 mm to which curves are flattened, those of a fibre to itself to 2e-4 g if that
+    is more; bend radii below R to 0.5 %.
+    """
+    pad, rules = instance("pad", pad, Morphology), instance("rules", rules, Rules)
+    lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.pitch_mm)]
+    return [
+        *tight_bends(pad, rules.min_bend_radius_mm),
+        *_gaps(lines, rules.min_gap_mm),
+        *_folds(pad, lines, rules.min_gap_mm),
+        *_crossings(pad, rules),
+        *_borders(pad, lines, rules.border_mm),
+        *_lengths(pad, rules.max_length_mm),
+    ]
+
+
+def tight_bends(pad: Morphology, limit: float) -> list[Violation]:
+    """The tightest bend of every fibre that breaks `min_bend_radius_mm` = `limit`."""
+    if limit == 0:
+        return []
+    window = min(limit / 2, pad.size_mm)  # no fibre is shorter than the pad
+    angle = window / limit
+    spans, slopes = beziers(pad), slope_beziers(pad)
+    turned = np.abs(np.diff(extreme_headings(slopes))).sum(axis=1)
+    found = []
+    for fibre in np.flatnonzero(turned > angle):
+        # An end of the window that falls between two points is off by less than the turn from one to the other.
+        points, headings = trace(spans[fibre], slopes[fibre], step=max(angle / 200, _FINEST_TURN))
+        radius, place = bend_radius(pad.to_mm(points), headings, window)
+        if radius < limit:
+            found.append(Violation("min_bend_radius_mm", (int(fibre) + 1,), radius, limit, _place(place)))
+    return found
+
+
+def _gaps(lines: list[Array], limit: float) -> list[Violation]:
+    shapes = np.array([shapely.LineString(line) for line in lines])
+    shapely.prepare(shapes)  # a tenth of the time where fibres are tangled
+    grid = len(shapes) // 2
+    found = []
+    for offset, family in ((0, shapes[:grid]), (grid, shapes[grid:])):
+        near = shapely.STRtree(family).query(family, predicate="dwithin", distance=limit).T
+        for first, second in sorted((int(i), int(j)) for i, j in near if i < j):
+            between = shapely.shortest_line(family[first], family[second])
+            gap = float(between.length)
+            if gap < limit:
+                place = np.mean(between.coords, axis=0)
+                fibres = (offset + first + 1, offset + second + 1)
+                found.append(Violation("min_gap_mm", fibres, gap, limit, _place(place)))
+    return found
+
+
+def _folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
+    if limit == 0:
+        return []
+    if _FOLD_TOLERANCE * limit > _TOLERANCE_MM:
+        lines = [pad.to_mm(points) for points in flatten(pad, _FOLD_TOLERANCE * limit / pad.pitch_mm)]
+    found = []
+    for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
+        fold = fold_gap(lines[fibre], limit)
+        if fold is not None:
+            found.append(Violation("min_gap_mm", (int(fibre) + 1,), fold[0], limit, _place(fold[1])))
+    return found
+
+
+def _crossings(pad: Morphology, rules: Rules) -> list[Violation]:
+    most, least_angle = rules.max_crossings, rules.min_crossing_angle_deg
+    met = crossings(pad, _CROSSING_TOLERANCE, across=most is not None or least_angle > 0)
+    across = [c for c in met if c.first < pad.grid <= c.second]
+    same = [c for c in met if (c.first < pad.grid) == (c.second < pad.grid)]
+    found = []
+    if len(same) > rules.same_family_crossings:
+        count, limit = len(same), rules.same_family_crossings
+        found += [Violation("same_family_crossings", _pair(c), count, limit, _place(pad.to_mm(c.place))) for c in same]
+    if most is not None and len(across) > most:
+        found.append(Violation("max_crossings", (), len(across), most))
+    return found + (_angles(pad, across, least_angle) if least_angle > 0 else [])
+
+
+def _angles(pad: Morphology, across: list[Crossing], limit: float) -> list[Violation]:
+    angles = crossing_angles(pad, across)
+    worst: dict[tuple[int, int], Violation] = {}
+    for i in np.argsort(angles, kind="stable")[: np.count_nonzero(angles < limit)]:  # a pair's least angle comes first
+        place = _place(pad.to_mm(across[i].place))
+        worst.setdefault(
+            _pair(across[i]), Violation("min_crossing_angle_deg", _pair(across[i]), float(angles[i]), limit, place)
+        )
+    return [worst[pair] for pair in sorted(worst)]
+
+
+def _borders(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
+    found = []
+    for fibre, line in enumerate(lines):
+        cross = line[:, 1] if fibre < pad.grid else line[:, 0]
+        distance = pad.size_mm / 2 - np.abs(cross)
+        worst = int(np.argmin(distance))
+        if distance[worst] < limit:
+            found.append(Violation("border_mm", (fibre + 1,), float(distance[worst]), limit, _place(line[worst])))
+    return found
+
+
+def _lengths(pad: Morphology, limit: float) -> list[Violation]:
+    long = lengths(pad) * pad.pitch_mm
+    return [Violation("max_length_mm", (int(f) + 1,), float(long[f]), limit) for f in np.flatnonzero(long > limit)]
+
+
+def _pair(crossing: Crossing) -> tuple[int, int]:
+    return crossing.first + 1, crossing.second + 1
+
+
+def _place(point: Array) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
+def _amount(value: float) -> str:
+    """Three digits, but no fewer than a count has."""
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

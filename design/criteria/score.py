@@ -1,0 +1,87 @@
+"""Every term of a pad by name: what the searches minimise, and what the literature reports."""
+
+from dataclasses import asdict
+
+import numpy as np
+
+from design.common.errors import InputError, instance
+from design.common.settings import section
+from design.pad.contact import boustrophedon, signals
+from design.pad.morphology import Morphology
+from design.settings import Contact, Pad, Rules, Search
+
+from .fibre_loss import loss_shares, lost_subsets
+from .information import idle_share, information
+from .published_objective import published_terms
+
+SIDE, MOST_LOSSES = 20, 64
+MOST_PAIRS = 2**29
+"""Most pairs of points of one fibre, over all fibres, that are looked at for folds: 2 GiB of distances."""
+
+
+def ambiguities(pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float) -> list[float]:
+    """Localisation ambiguity (formula of `ambiguity`) with 0, 1, ... fibres lost, grid units, on a grid of presses.
+
+    Args:
+        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
+    """
+    import torch
+
+    from .ambiguity import ambiguity, full_scale
+
+    line = np.linspace(1, pad.grid, SIDE) if pad.grid > 1 else np.linspace(0.5, 1.5, SIDE)
+    presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
+    places = torch.tensor(presses, dtype=torch.float32)
+    fibres = 2 * pad.grid
+    spread = []
+    for k in range(min(len(loss_shares(lost)), fibres)):
+        losses = lost_subsets(fibres, k, MOST_LOSSES)
+        kept = torch.ones(len(losses), fibres)
+        for row, loss in enumerate(losses):
+            kept[row, list(loss)] = 0
+        equal = torch.full((len(losses),), 1 / len(losses))
+        spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
+    return spread
+
+
+def score(
+    pad: Morphology,
+    contact: Contact | None = None,
+    lost: int | tuple[float, ...] = 3,
+    noise: float = 0.11,
+    rules: Rules | None = None,
+) -> dict[str, float]:
+    """Every term of a pad, by name.
+
+    `ambiguity_lost_k` is the expected localisation error in grid units over losses of k fibres under the given noise
+    (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
+    far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
+    (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
+    (`objective`).
+
+    Raises:
+        InputError: arguments out of range, or a pad of too many fibres or knots.
+    """
+    import torch
+
+    from design.pad.contact import fibre_axes
+
+    from .ambiguity import sharpness
+    from .penalties import PER_SPAN, penalties
+
+    contact, rules = section("contact", contact, Contact), section("rules", rules, Rules)
+    size = Pad(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm)
+    asked = Search(lost=lost, noise=noise)
+    pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
+    if pairs > MOST_PAIRS:
+        raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
+    terms = {f"ambiguity_lost_{k}": value for k, value in enumerate(ambiguities(pad, contact, asked.lost, asked.noise))}
+    serpentine = boustrophedon(pad.grid, 32, 5 / 49)
+    found = signals(pad, serpentine, contact)
+    terms |= {"information": information(pad, contact), "idle_share": idle_share(found)}
+    terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
+    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
+    broken = penalties(travel, cross, size, rules)
+    terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
+    return terms | {f"published_{name}": value for name, value in asdict(published_terms(pad, contact)[0]).items()}

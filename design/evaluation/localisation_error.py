@@ -1,0 +1,167 @@
+"""The paper's evaluation by simulation: how far off a freshly trained localizer finds presses, fibres lost or not."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.computing import one_torch_thread
+from design.common.errors import InputError, instance, shown, whole
+from design.common.settings import section
+from design.criteria.fibre_loss import lost_subsets
+from design.pad.contact import boustrophedon, signals
+from design.pad.morphology import MOST_GRID, Morphology
+from design.settings import Contact
+
+from .levenberg_marquardt import Network, best_device, fit_many
+
+Array = NDArray[np.float64]
+Loss = tuple[int, ...]
+"""Fibres that are lost, by index."""
+
+JITTER = 5 / 49
+"""Greatest shift of a press off its serpentine, grid units, as published."""
+MOST_PRESSES, MOST_NETWORKS = 2**20, 2**20
+BATCH = 14
+"""Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
+
+
+@dataclass(frozen=True)
+class LossError:
+    """Localisation error with some fibres lost, in grid units, over the sets of fibres that may be lost.
+
+    Attributes:
+        lost: how many fibres. subsets: how many sets of them were lost in turn.
+        mean, std, max: of the sets' mean Euclidean distances.
+    """
+
+    lost: int
+    subsets: int
+    mean: float
+    std: float
+    max: float
+
+
+def evaluate(
+    pad: Morphology,
+    contact: Contact | None = None,
+    lost: Sequence[int] = (0, 1, 2, 3),
+    seed: int = 0,
+    hidden: int = 50,
+    presses: int = 1024,
+    test: int = 2000,
+    subsets: int | None = None,
+) -> list[LossError]:
+    """The error of the published localizer, trained afresh for every set of lost fibres (paper, evaluation).
+
+    It is taken over presses that were never trained on; the paper's own figures are over all presses, those trained on
+    included, and so are lower. Networks are trained side by side, one thread a core, and do not depend on how many.
+
+    Args:
+        contact: the published default if None.
+        lost: numbers of lost fibres; those that would leave no fibre are left out.
+        seed: of the jitter, the test presses, the splits and the networks' first weights.
+        hidden: neurons of a network.
+        presses: to train on, a square number: a serpentine over 1..M (over 0.5..1.5 for a grid of 1).
+        test: fresh presses, drawn uniformly over the same square.
+        subsets: at most so many sets of a number of lost fibres, always the same; all if None.
+
+    Raises:
+        InputError: `presses` is no square of a number from 2, there is nothing to test on, or too much to do.
+    """
+    presses = whole("presses", presses, 4, MOST_PRESSES)
+    side = math.isqrt(presses)
+    if side**2 != presses:
+        raise InputError(f"presses is {presses}, allowed is a square number from 4")
+    test, hidden = whole("test", test, 1, MOST_PRESSES), whole("hidden", hidden, 1, 1000)
+    seed, contact = whole("seed", seed, 0, 2**64 - 1), section("contact", contact, Contact)
+    fibres = 2 * instance("pad", pad, Morphology).grid
+    if not isinstance(lost, Sequence) or isinstance(lost, str):
+        raise InputError(f"lost is {shown(lost)}, expected numbers of lost fibres")
+    levels = [number for number in lost if whole("lost", number, 0, 2 * MOST_GRID) < fibres]
+    sets = [math.comb(fibres, number) for number in levels]
+    if subsets is not None:
+        sets = [min(all_of_them, whole("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]
+    if sum(sets) > MOST_NETWORKS:
+        raise InputError(f"subsets is {subsets}: that takes {sum(sets)} networks, allowed are {MOST_NETWORKS}")
+    losses = [lost_subsets(fibres, number, most) for number, most in zip(levels, sets, strict=True)]
+    trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
+
+    def means(batch: list[Loss]) -> Array:
+        networks = trial.learn(batch, hidden)
+        return np.array([trial.errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
+
+    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = [pool.map(means, batches(level)) for level in losses]
+        by_level = [np.concatenate(list(parts)) for parts in found]
+    return [
+        LossError(number, len(level), float(level.mean()), float(level.std()), float(level.max()))
+        for number, level in zip(levels, by_level, strict=True)
+    ]
+
+
+def batches(losses: Sequence[Loss]) -> list[list[Loss]]:
+    """Losses in parts that are trained at once."""
+    size = BATCH if best_device() == "cpu" else len(losses)
+    return [list(losses[begin : begin + size]) for begin in range(0, len(losses), size)]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Presses to learn from and fresh ones to test on, with what a pad signals for them.
+
+    Attributes:
+        learned: (Q, 2) places, grid units, and recorded: (Q, C) their signals. fresh: (T, 2) and found: (T, C) alike.
+        seed: of the networks, besides the fibres they are to do without.
+    """
+
+    learned: Array
+    recorded: Array
+    fresh: Array
+    found: Array
+    seed: int
+
+    @classmethod
+    def of(cls, pad: Morphology, side: int, test: int, seed: int, answer: Callable[[Array], Array]) -> "Trial":
+        """A serpentine of side^2 presses to learn from and `test` fresh ones; `answer` gives signals for places."""
+        learned, fresh = training_presses(pad.grid, side, seed), fresh_presses(pad.grid, test, seed)
+        return cls(learned, answer(learned), fresh, answer(fresh), seed)
+
+    def learn(self, losses: Sequence[Loss], hidden: int, repeat: int = 0) -> list[Network]:
+        """A network for each of some losses of the same size, trained on the fibres that are left.
+
+        Args:
+            repeat: networks of another one start from other weights and split the presses otherwise.
+        """
+        kept = [self._kept(loss) for loss in losses]
+        rngs = [np.random.default_rng([2, self.seed, len(loss), *loss, repeat]) for loss in losses]
+        return fit_many(np.stack([self.recorded[:, own] for own in kept]), self.learned, rngs, hidden)
+
+    def errors(self, network: Network, loss: Loss) -> Array:
+        """(T,) distances at which a network that does without some fibres finds the fresh presses."""
+        return self.distances(network, loss, self.found, self.fresh)
+
+    def distances(self, network: Network, loss: Loss, signals: Array, places: Array) -> Array:
+        """(Q,) distances of where a network finds presses by their signals (Q, C) to their places (Q, 2)."""
+        return np.linalg.norm(network(signals[:, self._kept(loss)]) - places, axis=1)
+
+    def _kept(self, loss: Loss) -> NDArray[np.int64]:
+        return np.setdiff1d(np.arange(self.recorded.shape[1]), loss)
+
+
+def training_presses(grid: int, side: int, seed: int) -> Array:
+    """(side^2, 2) presses of a jittered serpentine over the square that is evaluated, grid units."""
+    jitter_seed = int(np.random.default_rng([0, seed]).integers(2**32))
+    if grid == 1:
+        return boustrophedon(2, side, JITTER, jitter_seed) - 0.5
+    return boustrophedon(grid, side, JITTER, jitter_seed)
+
+
+def fresh_presses(grid: int, count: int, seed: int) -> Array:
+    """(count, 2) presses drawn uniformly over the square that is evaluated, grid units."""
+    low, high = (1, grid) if grid > 1 else (0.5, 1.5)
+    return np.random.default_rng([1, seed]).uniform(low, high, (count, 2))

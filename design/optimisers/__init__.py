@@ -1,0 +1,1 @@
+"""How fibres are found."""

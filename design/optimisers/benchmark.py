@@ -1,0 +1,69 @@
+"""Error of the pads found against the time spent on finding them: the published search beside the gradient search."""
+
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, Future
+from functools import partial
+from typing import Any
+
+from design.benchmarking.harness import Bench, Trial
+from design.criteria.rules import check
+from design.evaluation.localisation_error import evaluate
+from design.settings import Contact, Pad, Rules, Search
+
+from .search import SearchResult, search
+
+KNOTS = (5, 20)
+SEEDS = (0, 1)
+GENERATIONS = (5, 20)
+STEPS = (50, 150)
+SUBSETS = 2
+"""Sets of fibres lost of each number, of up to 56: enough to tell the ways apart, and the bench takes minutes."""
+
+
+class InThisThread(Executor):
+    """Does at once what is submitted: the trials have one start, and time is told by the thread that is timed."""
+
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """What is done already."""
+        done: Future[Any] = Future()
+        done.set_result(work(*arguments, **named))
+        return done
+
+
+def trials() -> Iterator[Trial]:
+    """Every way at every budget, for N of KNOTS and each of SEEDS.
+
+    The genetic search minimises the published objective; the gradient search runs without design rules, as the genetic
+    one does, and with them.
+    """
+    ways = [
+        ("genetic", generations, Search(method="genetic", generations=generations), Rules(enforce=False))
+        for generations in GENERATIONS
+    ]
+    for steps in STEPS:
+        descent = Search(method="descent", starts=1, steps=steps)
+        ways += [("descent", steps, descent, Rules(enforce=False)), ("with rules", steps, descent, Rules())]
+    for knots in KNOTS:
+        for way, size, settings, rules in ways:
+            for seed in SEEDS:
+                chosen = settings.model_copy(update={"knots": knots, "seed": seed})
+                work = partial(search, Pad(), Contact(), chosen, rules, executor=InThisThread())
+                yield Trial(f"N={knots}", way, size, work, judge, repetition=seed)
+
+
+def judge(found: SearchResult) -> Mapping[str, float]:
+    """How well a pad serves: localisation errors with up to three fibres lost, their mean, and the rules it breaks."""
+    errors = [level.mean for level in evaluate(found.morphology, Contact(), subsets=SUBSETS)]
+    broken = len(check(found.morphology, Rules()))
+    lost = {f"lost_{number}": error for number, error in enumerate(errors)}
+    return {"error": sum(errors) / len(errors), "violations": broken, **lost}
+
+
+BENCH = Bench(
+    "search",
+    trials,
+    "localisation error (grid units)",
+    ("genetic", GENERATIONS[-1]),
+    ("descent", STEPS[0]),
+    plain=(),
+)

@@ -1,0 +1,194 @@
+"""Gradient search on the localisation ambiguity under noise and fibre loss, within the rules.
+
+One start is a `Descent`: it advances by any number of steps, tells its state as plain arrays and goes on from them to
+the same bits, so that it can run in slices on any thread or machine and survive being killed.
+"""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from design.common.checkpoints import State
+from design.criteria.ambiguity import ambiguity, full_scale, sharpness
+from design.criteria.differentiable import ExactSignals, pchip_slopes
+from design.criteria.fibre_loss import draw_losses, loss_shares
+from design.criteria.penalties import penalties
+from design.criteria.rules import check
+from design.pad.contact import boustrophedon, signals
+from design.pad.morphology import Morphology
+
+from .parametrization import Fibres, border_of, first_course
+from .problem import Problem
+
+SIDE = 14  # presses per row and column of the stratified sample a step looks at
+SCALE_SIDE = 24  # presses per row and column by which full scale is known
+WINDOW = 5.0  # side of the part of the pad a step looks at, grid units: presses further apart are seldom confused
+LOUDER = 2.0  # noise of the first step as a multiple of the last one's
+RATE = 0.02
+PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
+MARGIN = 1.05  # on the limits of the rules
+NOTED_STEPS = 10  # between entries of the history
+REPAIR_STEPS, REPAIR_CHECKS = 600, 20  # after the last step, until the exact check passes; steps between checks
+REPAIR_MARGIN = 0.01  # added to the margin at each check that does not pass
+REPAIR_RATE, REPAIR_FASTER, REPAIR_FASTEST = 0.002, 1.15, 0.01  # gentle at first, and faster with each such check
+
+
+class Descent:
+    """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of what is broken.
+
+    The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
+
+    Attributes:
+        step: steps done. objective: ambiguity and sharpness at the last step. done: whether nothing is left to do.
+        scale: full scale of the signals, grid units.
+    """
+
+    def __init__(self, problem: Problem, start: int, state: State | None = None) -> None:
+        self.problem = problem
+        self.rng = np.random.default_rng([problem.search.seed, start])
+        self.step, self.objective, self.done = 0, math.inf, False
+        self._history: list[tuple[int, float]] = []
+        pad, search, rules = problem.pad, problem.search, problem.rules
+        if state is None:
+            course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
+            self.fibres = Fibres.through(course, border_of(pad, rules))
+            # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
+            presses = boustrophedon(pad.grid, SCALE_SIDE)
+            self.scale = full_scale(torch.tensor(signals(self.fibres.knots()[None], presses, problem.contacts[0])[0].T))
+            self._optimiser = self._adam()
+        else:
+            self._restore(state)
+
+    def advance(self, steps: int) -> None:
+        """Take up to `steps` steps, fewer if it is done before."""
+        for _ in range(steps):
+            if self.done:
+                return
+            if self.step < self.problem.search.steps:
+                self._step()
+            else:
+                self._repair()
+
+    def finish(self) -> None:
+        """Leave out what is left of the search, so that the next steps repair what is broken."""
+        if self.step < self.problem.search.steps:
+            self._begin_repair()
+
+    def morphology(self) -> Morphology:
+        """The fibres as they are."""
+        return Morphology(self.fibres.knots(), self.problem.pad.pitch_mm)
+
+    def state(self) -> State:
+        """Everything the rest of the search depends on, as arrays."""
+        adam = self._optimiser.state_dict()["state"]
+        generator = json.dumps(self.rng.bit_generator.state).encode()
+        state = {
+            "spans": self.fibres.spans.detach().numpy().copy(),
+            "cross": self.fibres.cross.detach().numpy().copy(),
+            "fixed": np.array([self.fibres.floor, self.fibres.border, self.scale]),
+            "progress": np.array([self.step, self.objective]),
+            "done": np.array(self.done),
+            "history": np.array(self._history).reshape(-1, 2),
+            "generator": np.frombuffer(generator, np.uint8).copy(),
+        }
+        for variable, moments in adam.items():
+            state |= {f"adam_{variable}_{name}": value.numpy().copy() for name, value in moments.items()}
+        return state
+
+    def _restore(self, state: State) -> None:
+        floor, border, self.scale = state["fixed"].tolist()
+        self.fibres = Fibres(torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border)
+        step, self.objective = state["progress"].tolist()
+        self.step, self.done = int(step), bool(state["done"])
+        self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
+        self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
+        self._optimiser = self._adam()
+        moments: dict[int, dict[str, Any]] = {}
+        for name, value in state.items():
+            if name.startswith("adam_"):
+                _, variable, moment = name.split("_", 2)
+                moments.setdefault(int(variable), {})[moment] = torch.tensor(value)
+        self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
+
+    def _step(self) -> None:
+        """One step on the ambiguity and the rules."""
+        search, rules = self.problem.search, self.problem.rules
+        progress = self.step / max(1, search.steps - 1)
+        rate = RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
+        travel, cross = self.fibres.axes()
+        total = self._spread(travel, cross, search.noise * LOUDER ** (1 - progress))
+        self.objective = total.item()
+        if rules.enforce:
+            total = total + PENALTY[0] * (PENALTY[1] / PENALTY[0]) ** progress * self._penalty(travel, cross, MARGIN)
+        self._follow(total, rate)
+        self.step += 1
+        if self.step % NOTED_STEPS == 0 or self.step == search.steps:
+            self._history.append((self.step, self.objective))
+        if self.step == search.steps:
+            self._begin_repair()
+
+    def _begin_repair(self) -> None:
+        """What comes after the last step: nothing, if the exact check finds nothing."""
+        self.step = self.problem.search.steps
+        self.done = not self._broken()
+        self._optimiser = self._adam()
+
+    def _repair(self) -> None:
+        """One step on the rules alone, which moves only what breaks them, with a margin that grows until they hold."""
+        repairs = self.step - self.problem.search.steps
+        checks = repairs // REPAIR_CHECKS
+        rate = min(REPAIR_RATE * REPAIR_FASTER**checks, REPAIR_FASTEST)
+        self._follow(self._penalty(*self.fibres.axes(), MARGIN + REPAIR_MARGIN * checks), rate)
+        self.step += 1
+        if (repairs + 1) % REPAIR_CHECKS == 0:
+            self.done = repairs + 1 >= REPAIR_STEPS or not self._broken()
+
+    def _follow(self, total: Tensor, rate: float) -> None:
+        for group in self._optimiser.param_groups:
+            group["lr"] = rate
+        self._optimiser.zero_grad()
+        total.backward()
+        for variable in (self.fibres.spans, self.fibres.cross):
+            if variable.grad is not None:  # where all presses are told apart beyond doubt, or none are, it may be NaN
+                variable.grad.nan_to_num_(0.0, 0.0, 0.0)
+        self._optimiser.step()
+
+    def _penalty(self, travel: Tensor, cross: Tensor, margin: float) -> Tensor:
+        found = penalties(travel, cross, self.problem.pad, self.problem.rules, margin)
+        return torch.stack(list(found.values())).sum()
+
+    def _adam(self) -> torch.optim.Adam:
+        return torch.optim.Adam([self.fibres.spans, self.fibres.cross], lr=RATE)
+
+    def _spread(self, travel: Tensor, cross: Tensor, noise: float) -> Tensor:
+        """Ambiguity, and sharpness where it is asked for, averaged over the contacts."""
+        search, grid = self.problem.search, self.problem.pad.grid
+        slope, device = pchip_slopes(travel, cross), torch.device(search.device)
+        places = stratified(grid, self.rng)
+        kept, weight = draw_losses(2 * grid, loss_shares(search.lost), self.rng)
+        there, losses, shares = (torch.tensor(x, dtype=torch.float32, device=device) for x in (places, kept, weight))
+        total = torch.zeros((), device=device)
+        for contact in self.problem.contacts:
+            found: Tensor = ExactSignals.apply(travel, cross, slope, places, contact)  # pyright: ignore[reportAssignmentType]
+            total = total + ambiguity(found.float().to(device), there, losses, shares, noise * self.scale)
+            if search.sharpness > 0:
+                in_order = ExactSignals.apply(travel, cross, slope, boustrophedon(grid, SIDE), contact)
+                total = total + search.sharpness * sharpness(in_order.float().to(device))
+        return total.cpu() / len(self.problem.contacts)
+
+    def _broken(self) -> bool:
+        rules = self.problem.rules
+        return rules.enforce and bool(check(self.morphology(), rules))
+
+
+def stratified(grid: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """One press in each of SIDE x SIDE cells over a part of the pad, (SIDE^2, 2): all of 1..M unless it is large."""
+    low, size = (1.0, min(grid - 1.0, WINDOW)) if grid > 1 else (0.5, 1.0)
+    corner = low + rng.random(2) * (max(grid - 1.0, size) - size)
+    cell = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+    return corner + size * (cell + rng.random(cell.shape)) / SIDE

@@ -1,0 +1,267 @@
+"""One face for both searches: settings in, the best morphology with its scores and its history out.
+
+A search is a number of starts, each a task that advances in slices from one plain state to the next. Slices run on any
+executor of the `concurrent.futures` kind, here or on a cluster; between them a start can be noted, kept on disk, or
+stopped, and nothing of that changes what it finds.
+"""
+
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from design.common import profiling
+from design.common.checkpoints import Checkpoints, State
+from design.common.errors import MOST_VALUES, InputError, instance, real, shown
+from design.common.errors import path as as_path
+from design.common.settings import section
+from design.criteria.fibre_loss import loss_shares
+from design.criteria.rules import Violation, check
+from design.criteria.score import ambiguities, score
+from design.pad.morphology import Morphology
+from design.settings import Contact, Pad, Rules, Search
+
+from .problem import Problem
+from .start import Slice, advance, finish
+
+Report = Callable[[str, int, int, float], None]
+"""Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
+
+MOST_SECONDS = 1e9
+"""Longest time budget: some thirty years."""
+RESERVE = 0.15  # share of a time budget kept for repairing
+MENDING_S = 3.0  # of repair after Ctrl-C
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """What a search found.
+
+    Attributes:
+        morphology: the best pad: fewest broken rules first, then least mean ambiguity over the losses.
+        terms: every term of `score` for it.
+        violations: the rules it breaks; empty where rules are not enforced.
+        history: one entry per noted step: {"run", "step", "objective"}.
+        enforced: whether it was to keep to the rules.
+        seconds: wall time.
+        stopped: why it ended early with the best so far: "interrupted", "out of time", or "" if it did not.
+    """
+
+    morphology: Morphology
+    terms: dict[str, float]
+    violations: list[Violation]
+    enforced: bool = True
+    history: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+    stopped: str = ""
+
+
+def search(
+    pad: Pad | None = None,
+    contact: Contact | None = None,
+    settings: Search | None = None,
+    rules: Rules | None = None,
+    *,
+    origin: Morphology | None = None,
+    report: Report = lambda run, done, total, objective: None,
+    keep_in: Path | None = None,
+    resume: bool = False,
+    time_budget: float | None = None,
+    executor: Executor | None = None,
+) -> SearchResult:
+    """Find the fibres of a pad by the method `settings` names; None stands for the defaults of `pad.toml`.
+
+    The same settings give the same morphology, wherever the starts run and however often they are broken off and
+    resumed; only a time budget or Ctrl-C that cuts a search short changes what it finds.
+
+    Args:
+        origin: morphology to start from, of the pad's grid and at most `settings.knots` knots a fibre; random if None.
+        report: hears of each start's progress, in this thread.
+        keep_in: folder for the states of the starts, from which `resume` goes on; removed when the search completes.
+        time_budget: seconds after which it ends with the best so far.
+        executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None,
+            since torch and the kernels let go of the interpreter while they work.
+
+    Raises:
+        InputError: an origin that does not fit, a device that is not there, or states of other settings.
+    """
+    begin = time.perf_counter()
+    sections = (section("pad", pad, Pad), section("contact", contact, Contact))
+    problem = _problem(*sections, section("settings", settings, Search), section("rules", rules, Rules), origin)
+    checkpoints = None if keep_in is None else Checkpoints(as_path("keep_in", keep_in), problem.settings())
+    time_budget = None if time_budget is None else real("time_budget", time_budget, 0, MOST_SECONDS)
+    if not callable(report):
+        raise InputError(f"report is {shown(report)}, expected a function")
+    if executor is not None:
+        instance("executor", executor, Executor)
+    instance("resume", resume, bool)
+    states = checkpoints.begin(resume) if checkpoints else {}
+    stop = _Stop(begin, time_budget)
+    kept = sum(bool(state["done"]) for state in states.values())
+    profiling.looked_at("starts", len(problem.starts) - kept, len(problem.starts))
+    with profiling.stage("search"), _stopped_by_interrupt(stop), _threads(executor) as pool:
+        _run(problem, states, pool, stop, report, checkpoints)
+        found = _candidates(problem, states, pool, stop)
+    with profiling.stage("check and score"):
+        best, violations = _choose(found if origin is None else [*found, origin], problem)
+        terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
+    if checkpoints and not stop.reason:
+        checkpoints.clear()
+    history, seconds = _history(problem, states), time.perf_counter() - begin
+    return SearchResult(best, terms, violations, problem.rules.enforce, history, seconds, stop.reason)
+
+
+def _problem(pad: Pad, contact: Contact, settings: Search, rules: Rules, origin: Morphology | None) -> Problem:
+    if settings.device == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            raise InputError("device is 'cuda', but no such device is found; allowed here is 'cpu'")
+    if settings.method == "genetic":
+        # Offspring are compared with all pads of the generation, and all their knots are held several times over.
+        room = settings.population * max(settings.population, 4 * pad.grid * settings.knots)
+        if room > MOST_VALUES // 4:
+            raise InputError(
+                f"population is {settings.population}: that takes {room} numbers for {2 * pad.grid} fibres of "
+                f"{settings.knots} knots, allowed are {MOST_VALUES // 4}"
+            )
+    if not any(loss_shares(settings.lost)[: 2 * pad.grid]):
+        raise InputError(f"lost is {settings.lost}, allowed is what leaves some of the {2 * pad.grid} fibres")
+    if origin is not None:
+        instance("origin", origin, Morphology)
+        knots = origin.knots.shape[1] - 2
+        if origin.grid != pad.grid:
+            raise InputError(
+                f"the morphology to start from has grid {origin.grid}, allowed is that of the pad, {pad.grid}"
+            )
+        if knots > settings.knots:
+            raise InputError(
+                f"knots is {settings.knots}, allowed is at least the {knots} of the morphology to start from"
+            )
+    return Problem(pad, (contact, *settings.contacts), settings, rules, origin)
+
+
+class _Stop:
+    """Whether to go on: until Ctrl-C or a deadline of `time.perf_counter`."""
+
+    def __init__(self, begin: float, time_budget: float | None) -> None:
+        self.deadline = None if time_budget is None else begin + (1 - RESERVE) * time_budget
+        self.end = None if time_budget is None else begin + time_budget
+        self.reason = ""
+
+    def interrupt(self) -> None:
+        self.reason = "interrupted"
+
+    def mend_until(self) -> float:
+        """When to end the repair of the best so far."""
+        return self.end if self.reason == "out of time" and self.end else time.perf_counter() + MENDING_S
+
+    def __bool__(self) -> bool:
+        if not self.reason and self.deadline is not None and time.perf_counter() > self.deadline:
+            self.reason = "out of time"
+        return bool(self.reason)
+
+
+@contextmanager
+def _stopped_by_interrupt(stop: _Stop) -> Iterator[None]:
+    """Let Ctrl-C set `stop` instead of tearing down threads; outside the main thread, where none arrives, nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda number, frame: stop.interrupt())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _threads(executor: Executor | None) -> Iterator[Executor]:
+    """The executor given, or one thread a core; slices set torch to one thread each, which is undone here."""
+    import torch
+
+    if executor is not None:
+        yield executor
+        return
+    threads = torch.get_num_threads()
+    try:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(
+    problem: Problem,
+    states: dict[int, State],
+    pool: Executor,
+    stop: _Stop,
+    report: Report,
+    checkpoints: Checkpoints | None,
+) -> None:
+    """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
+    waiting = [start for start in problem.starts if start not in states or not states[start]["done"]]
+    running: dict[Future[Slice], int] = {}
+    while running or (waiting and not stop):
+        while waiting and not stop and len(running) < _width(pool):
+            start = waiting.pop(0)
+            running[pool.submit(advance, problem, start, states.get(start))] = start
+        for future in wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done:
+            start, reached = running.pop(future), future.result()
+            states[start] = reached.state
+            if checkpoints:
+                checkpoints.save(start, reached.state)
+            report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
+            if not reached.done and not stop:
+                running[pool.submit(advance, problem, start, reached.state)] = start
+
+
+def _width(pool: Executor) -> int:
+    """How many starts run at once: as many as threads here, all on a cluster."""
+    return (os.cpu_count() or 1) if isinstance(pool, ThreadPoolExecutor) else 10_000
+
+
+def _candidates(problem: Problem, states: dict[int, State], pool: Executor, stop: _Stop) -> list[Morphology]:
+    """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
+    if not states:
+        return [finish(problem, 0, None)]
+    if not stop:
+        return [finish(problem, start, state) for start, state in sorted(states.items())]
+    # a start with nothing noted yet has only just begun
+    noted = {start: state["history"][-1, 1] if len(state["history"]) else math.inf for start, state in states.items()}
+    best = min(noted, key=lambda start: noted[start])
+    return [finish(problem, best, states[best], stop.mend_until())]
+
+
+def _choose(found: list[Morphology], problem: Problem) -> tuple[Morphology, list[Violation]]:
+    """The pad with fewest broken rules, then least mean ambiguity, and what it breaks."""
+    search, enforce = problem.search, problem.rules.enforce
+
+    def rank(pad: Morphology) -> tuple[int, float]:
+        spread = [np.mean(ambiguities(pad, contact, search.lost, search.noise)) for contact in problem.contacts]
+        return len(broken[id(pad)]), float(np.mean(spread))
+
+    broken = {id(pad): check(pad, problem.rules) if enforce else [] for pad in found}
+    best = found[0] if len(found) == 1 else min(found, key=rank)
+    return best, broken[id(best)]
+
+
+def _name(problem: Problem, start: int) -> str:
+    return "genetic" if problem.search.method == "genetic" else f"start {start + 1}"
+
+
+def _history(problem: Problem, states: dict[int, State]) -> list[dict[str, Any]]:
+    return [
+        {"run": _name(problem, start), "step": int(step), "objective": value}
+        for start, state in sorted(states.items())
+        for step, value in state["history"].tolist()
+    ]

@@ -1,0 +1,59 @@
+"""A start of either search as a chain of pure steps from state to state, to run on any executor."""
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from design.common.checkpoints import State
+from design.pad.morphology import Morphology
+
+from .problem import Problem
+
+if TYPE_CHECKING:
+    from .genetic_search import Breeding
+    from .gradient_search import Descent
+
+SLICE = {"descent": 25, "genetic": 2}  # steps or generations between two looks: about a third of a second
+SLICE_S = 1.0  # where steps are slow a slice ends after this, so that a time budget holds
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Where a start has got to: its state, steps done, objective of the last one, and whether nothing is left to do."""
+
+    state: State
+    step: int
+    objective: float
+    done: bool
+
+
+def advance(problem: Problem, start: int, state: State | None) -> Slice:
+    """The next slice of a start, from its beginning if `state` is None."""
+    run, until = _open(problem, start, state), time.perf_counter() + SLICE_S
+    for _ in range(SLICE[problem.search.method]):
+        run.advance(1)
+        if run.done or time.perf_counter() > until:
+            break
+    return Slice(run.state(), run.step, run.objective, run.done)
+
+
+def finish(problem: Problem, start: int, state: State | None, until: float = 0.0) -> Morphology:
+    """The fibres of a start as they are, what is broken being repaired `until` then by `time.perf_counter`."""
+    run = _open(problem, start, state)
+    run.finish()
+    while not run.done and time.perf_counter() < until:
+        run.advance(1)
+    return run.morphology()
+
+
+def _open(problem: Problem, start: int, state: State | None) -> "Descent | Breeding":
+    if problem.search.method == "genetic":
+        from .genetic_search import Breeding
+
+        return Breeding(problem, state)
+    import torch
+
+    from .gradient_search import Descent
+
+    torch.set_num_threads(1)  # starts run beside each other, and sums in another order would give another result
+    return Descent(problem, start, state)

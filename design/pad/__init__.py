@@ -1,0 +1,1 @@
+"""The pad: fibres as curves, and what they signal for a press."""

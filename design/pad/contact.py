@@ -1,0 +1,234 @@
+"""The contact model: what each fibre signals for a press (paper, section II-B).
+
+A press deforms a regular polygon around its centre; a fibre signals the weighted length it has inside.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from design.common import profiling
+from design.common.computing import in_chunks
+from design.common.errors import MOST_VALUES, InputError, instance, reals, whole
+from design.common.settings import section
+from design.pad.kernels.exact_signals import exact_signals
+from design.pad.kernels.pchip import population_slopes
+from design.pad.kernels.press import (
+    EUCLIDEAN,
+    INVERSE,
+    INVERSE_SQUARE,
+    MANHATTAN,
+    UNIFORM,
+    count_touched,
+    family_strays,
+    frames,
+)
+from design.pad.kernels.sampled_signals import quantized_signals
+from design.settings import Contact
+
+from .knots import FARTHEST, LEAST_SPAN, axes
+from .morphology import Morphology
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+Array = NDArray[np.float64]
+
+MOST_SAMPLES = 2**20
+"""Most points a fibre is sampled at."""
+
+_WEIGHTS = {"uniform": UNIFORM, "inverse_square": INVERSE_SQUARE, "inverse": INVERSE}
+
+_LENGTHS = {"manhattan": MANHATTAN, "euclidean": EUCLIDEAN}
+
+
+def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None) -> Array:
+    """Exact signals: the weighted length of each fibre's PCHIP curve inside the press, no sampling.
+
+    The boundary belongs to the press: a straight fibre that runs along an edge counts with its whole length there.
+
+    Args:
+        pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
+        presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, whose signals add; where their
+            shapes overlap a fibre counts once for each.
+        contact: shape, weight and length; the published default if None.
+
+    Returns:
+        (Q, 2M) signals, or (..., Q, 2M) for a population; with the default weight and length in grid units. Uniform
+        Manhattan signals are a closed form between roots found to rounding, others Gauss-Kronrod integrals to 1e-11.
+
+    Raises:
+        InputError: presses of the wrong shape or not finite.
+    """
+    return exact(pad, presses, section("contact", contact, Contact))[0]
+
+
+def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
+    """`signals`, and the number of spans that were looked at for them."""
+    travel, cross, batch = fibre_axes(pad)
+    flat, places = as_presses(presses, several=True)
+    fibres = travel.shape[1]
+    require_room(len(travel) * len(flat) * fibres)
+    out = np.zeros(len(travel) * len(flat) * fibres)
+    visited = _run_exact(travel, cross, family_strays(cross), flat, contact, _NONE, _NONE, out)
+    return _summed(out, (*batch, *places, fibres)), visited
+
+
+def require_room(values: int) -> None:
+    """Refuse more signals than fit into memory."""
+    if values > MOST_VALUES:
+        raise InputError(f"these are {values} signals, allowed at once are {MOST_VALUES}; signals_sparse takes less")
+
+
+def _summed(signals: Array, shape: tuple[int, ...]) -> Array:
+    """Signals in the shape (..., Q, C, 2M), summed over the C presses that were made at once."""
+    whole = signals.reshape(shape)
+    return whole[..., 0, :] if shape[-2] == 1 else whole.sum(axis=-2)
+
+
+def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
+    """`signals` of one pad as a sparse (Q, 2M) matrix: time and memory follow what is touched, not the pad's size.
+
+    Args:
+        pad, contact: as in `signals`. presses: (Q, 2) centres in grid units.
+    """
+    from scipy.sparse import csr_array
+
+    contact = section("contact", contact, Contact)
+    travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
+    places, strays = as_presses(presses)[0], family_strays(cross)
+    starts = count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
+    require_room(int(starts[-1]))
+    fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
+    _run_exact(travel, cross, strays, places, contact, starts, fibre, signal)
+    found = csr_array((signal, fibre, starts), shape=(len(places), 2 * pad.grid))
+    found.eliminate_zeros()
+    return found
+
+
+_NONE = np.empty(0, np.int64)
+
+
+def _run_exact(
+    travel: Array,
+    cross: Array,
+    strays: Array,
+    places: Array,
+    contact: Contact,
+    starts: NDArray[np.int64],
+    fibre: NDArray[np.int64],
+    signal: Array,
+) -> int:
+    """`exact_signals` over the cores."""
+    slope, shape = population_slopes(travel, cross), press_shape(contact)
+
+    def work(begin: int, end: int) -> int:
+        return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, signal)
+
+    visited = sum(in_chunks(work, len(travel) * len(places), grain=2000))
+    if profiling.asked():
+        note_reach(travel, strays, places, shape[1], visited)
+    return visited
+
+
+def note_reach(travel: Array, strays: Array, places: Array, reach: Array, visited: int) -> None:
+    """Tell the profile how many fibres and spans were looked at, press by press."""
+    pads, fibres, knots = travel.shape
+    within = sum(int(count_touched(each, places, reach, fibres // 2)[-1]) for each in strays)
+    profiling.looked_at("fibres, press by press", within, pads * len(places) * fibres)
+    profiling.looked_at("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
+
+
+def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
+    """Travel and cross coordinates (P, 2M, n) of a pad or a population, and the population's own shape.
+
+    Raises:
+        InputError: knots that are no (..., 2M, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
+    """
+    knots = pad.knots if isinstance(pad, Morphology) else reals("knots", pad, FARTHEST)
+    if knots.ndim < 3 or knots.shape[-1] != 2 or knots.shape[-2] < 2 or knots.shape[-3] % 2 or not knots.shape[-3]:
+        raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
+    # in C order, else the kernels would be compiled anew for the order of a caller's array, which takes many seconds
+    travel, cross = axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]))
+    if not isinstance(pad, Morphology) and not (np.diff(travel) >= LEAST_SPAN).all():
+        raise InputError(f"knots do not ascend by {LEAST_SPAN:g} or more along the travel axis")
+    return travel, cross, knots.shape[:-3]
+
+
+def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, float, int, int]:
+    """A contact as the kernels take it: chains and extents in the frame of each family, radius, weight, length."""
+    chains, reach = frames(contact.radius, contact.sides)
+    return chains, reach, contact.radius, _WEIGHTS[contact.weight], _LENGTHS[contact.length]
+
+
+def signals_quantized(
+    pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None, samples: int = 2000
+) -> Array:
+    """Signals by the published rule: segments of a sampled fibre count whole if they start inside the press.
+
+    Args:
+        pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
+        presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, as in `signals`.
+        contact: shape and weight; the published default if None.
+        samples: points per fibre, uniform along the travel axis, at least 2 (published: 2000).
+
+    Returns:
+        (Q, 2M) signals, or (..., Q, 2M) for a population; with the default weight and length in grid units.
+
+    Raises:
+        InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
+    """
+    return quantized(pad, presses, section("contact", contact, Contact), samples)[0]
+
+
+def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int) -> tuple[Array, int]:
+    """`signals_quantized`, and the number of samples that were looked at for them."""
+    shape = press_shape(contact)
+    travel, cross, batch = fibre_axes(pad)
+    samples = as_samples(samples, travel.shape[1])
+    places, shape_of_presses = as_presses(presses, several=True)
+    require_room(len(travel) * len(places) * travel.shape[1])
+    out = np.zeros((len(travel), len(places), travel.shape[1]))
+
+    def work(begin: int, end: int) -> int:
+        return quantized_signals(travel, cross, places, *shape, samples, begin, end, out)
+
+    looked_at = sum(in_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
+    return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
+
+
+def as_samples(samples: int, fibres: int) -> int:
+    """Points a fibre is sampled at, as far as they may be so many."""
+    return whole("samples", samples, 2, min(MOST_SAMPLES, MOST_VALUES // max(fibres, 1)))
+
+
+def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
+    """`presses` as contiguous, finite (Q C, 2) grid units, and (Q, C): C is 1 for (Q, 2).
+
+    Raises:
+        InputError: presses that are no (Q, 2), or (Q, C, 2) where `several` are allowed at once, or not finite.
+    """
+    places = reals("presses", presses, FARTHEST)
+    if places.shape == (0,):
+        places = places.reshape(0, 2)
+    if places.ndim not in ((2, 3) if several else (2,)) or places.shape[-1] != 2:
+        raise InputError(f"presses have shape {places.shape}, expected (Q, 2)" + (" or (Q, C, 2)" if several else ""))
+    return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
+
+
+def boustrophedon(grid: int, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
+    """A serpentine of side x side presses over 1..M, each moved by U(0, jitter) along both axes.
+
+    Args:
+        grid: M. side: presses per row and rows, Q = side^2. jitter: grid units.
+        seed: of numpy's legacy RandomState, by which the published values are stated.
+
+    Returns:
+        (Q, 2) presses; x runs forth on even rows and back on odd ones, so that neighbours in order are neighbours
+        in place.
+    """
+    line = np.linspace(1, grid, side)
+    x = np.where(np.arange(side)[:, None] % 2 == 0, line, line[::-1])
+    places = np.column_stack([x.ravel(), np.repeat(line, side)])
+    return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter

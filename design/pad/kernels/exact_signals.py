@@ -1,0 +1,296 @@
+"""The exact contact rule: integrals along PCHIP spans inside the press, no sampling.
+
+Frame: a fibre travels along t and moves across along v; both are taken from the press centre. A span is the cubic
+t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 in a parameter s whose zero is the point of the span abreast of the
+centre, so that small presses keep their relative accuracy.
+
+A polygon is two chains over t, upper and lower, linear between shared breakpoints; a circle is its own chain. PCHIP
+spans are monotone, so most pieces are taken or left whole by comparing ends; only where the fibre and a chain may
+meet are roots sought.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from .press import EPS, INVERSE, touched_range
+from .quadrature import HALVINGS, across, measure
+from .roots import SCRATCH, roots_in_unit
+
+_PROBES = (0.5, 0.22, 0.78)
+_CLEAR = 1e6  # tolerances a value must be away from zero to be believed without a second look
+
+
+@njit(cache=True, error_model="numpy")
+def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: int, work: Any, p: Any) -> int:
+    """Append to out[count:] where the span crosses the circle of `radius` in (a, b), as parameters s."""
+    w = b - a
+    t0, t1 = span[0] + span[1] * a, span[1] * w
+    v0, v3 = across(span, a), span[5] * w**3
+    v1, v2 = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w, (span[4] + 3 * a * span[5]) * w * w
+    p[0] = (t0 - radius) * (t0 + radius) + v0 * v0
+    p[1] = 2 * (t0 * t1 + v0 * v1)
+    p[2] = t1 * t1 + v1 * v1 + 2 * v0 * v2
+    p[3] = 2 * (v0 * v3 + v1 * v2)
+    p[4] = v2 * v2 + 2 * v1 * v3
+    p[5] = 2 * v2 * v3
+    p[6] = v3 * v3
+    end = roots_in_unit(p, 6, 16 * EPS * radius * radius, out, count, work)
+    for i in range(count, end):
+        out[i] = a + w * out[i]
+    return end
+
+
+@njit(cache=True, error_model="numpy")
+def _line_roots(
+    span: Any, a: float, b: float, at_a: float, at_b: float, tolerance: float, out: Any, count: int, work: Any, p: Any
+) -> int:
+    """Append to out[count:] where the span crosses a line that runs from `at_a` at s = a to `at_b` at s = b."""
+    w = b - a
+    p[0] = across(span, a) - at_a
+    p[1] = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w - (at_b - at_a)
+    p[2] = (span[4] + 3 * a * span[5]) * w * w
+    p[3] = span[5] * w**3
+    end = roots_in_unit(p, 3, tolerance, out, count, work)
+    for i in range(count, end):
+        out[i] = a + w * out[i]
+    return end
+
+
+@njit(cache=True, error_model="numpy")
+def _keep(stretches: Any, count: int, begin: float, end: float) -> int:
+    """Append [begin, end] to stretches[:count], joined to the last one where they meet; returns the new count."""
+    if count > 0 and stretches[count - 1, 1] == begin:
+        stretches[count - 1, 1] = end
+        return count
+    stretches[count, 0], stretches[count, 1] = begin, end
+    return count + 1
+
+
+@njit(cache=True, error_model="numpy")
+def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> int:
+    """`stretches_inside` of a circle."""
+    roots, work, p, _, stretches = scratch
+    count = circle_roots(span, a, b, radius, roots, 0, work, p)
+    found, begin = 0, a
+    for i in range(count + 1):
+        end = b if i == count else roots[i]
+        # no sign changes between roots, but a touch may lie there: the largest of three values has the sign
+        largest = 0.0
+        for share in _PROBES:
+            s = begin + share * (end - begin)
+            t, v = span[0] + span[1] * s, across(span, s)
+            depth = radius * radius - t * t - v * v
+            if abs(depth) > abs(largest):
+                largest = depth
+            if abs(largest) > _CLEAR * radius * tolerance:
+                break
+        if largest >= -2 * radius * tolerance:
+            found = _keep(stretches, found, begin, end)
+        begin = end
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, tolerance: float, scratch: Any) -> int:
+    """Stretches of [a, b] on which the span lies inside the press, ascending, into the last of `scratch`.
+
+    Args:
+        span: (6,) r, h, e0..e3. chains: (3, B) breakpoints t, upper v, lower v of a polygon; B = 0 for a circle.
+        tolerance: how far outside still counts as on the boundary.
+        scratch: of `make_scratch`.
+
+    Returns:
+        How many stretches there are.
+    """
+    roots, work, p, _, stretches = scratch
+    r, h = span[0], span[1]
+    breaks, upper, lower = chains
+    last = len(breaks) - 1
+    a = max(a, ((-radius if last < 0 else breaks[0]) - r) / h)
+    b = min(b, ((radius if last < 0 else breaks[last]) - r) / h)
+    if b <= a:
+        return 0
+    if last < 0:
+        return _inside_circle(span, a, b, radius, tolerance, scratch)
+    found, here, v = 0, a, across(span, a)
+    k = min(max(np.searchsorted(breaks, r + h * a, side="right") - 1, 0), last - 1)
+    while here < b:
+        after = b if k == last - 1 else min(b, (breaks[k + 1] - r) / h)
+        if after <= here:
+            k += 1
+            continue
+        v_after = across(span, after)
+        width = breaks[k + 1] - breaks[k]
+        x0, x1 = (r + h * here - breaks[k]) / width, (r + h * after - breaks[k]) / width
+        u0, u1 = upper[k] + (upper[k + 1] - upper[k]) * x0, upper[k] + (upper[k + 1] - upper[k]) * x1
+        l0, l1 = lower[k] + (lower[k + 1] - lower[k]) * x0, lower[k] + (lower[k + 1] - lower[k]) * x1
+        least, most = min(v, v_after), max(v, v_after)
+        if most <= min(u0, u1) and least >= max(l0, l1):
+            found = _keep(stretches, found, here, after)
+        elif least <= max(u0, u1) + tolerance and most >= min(l0, l1) - tolerance:
+            count = _line_roots(span, here, after, u0, u1, tolerance, roots, 0, work, p)
+            count = _line_roots(span, here, after, l0, l1, tolerance, roots, count, work, p)
+            roots[:count].sort()
+            begin = here
+            for i in range(count + 1):
+                end = after if i == count else roots[i]
+                above, below = 0.0, 0.0
+                for share in _PROBES:
+                    s = begin + share * (end - begin)
+                    x, at = (s - here) / (after - here), across(span, s)
+                    to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
+                    above = to_upper if abs(to_upper) > abs(above) else above
+                    below = to_lower if abs(to_lower) > abs(below) else below
+                    if min(abs(above), abs(below)) > _CLEAR * tolerance:
+                        break
+                if above >= -tolerance and below >= -tolerance:
+                    found = _keep(stretches, found, begin, end)
+                begin = end
+        here, v = after, v_after
+        k += 1
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _stretch_signal(span: Any, a: float, b: float, radius: float, weight: int, length: int, scratch: Any) -> float:
+    """Signal of a stretch inside the press; the 1/d weight has a kink where it is cut off, which is split at."""
+    roots, work, p, stack, _ = scratch
+    if weight != INVERSE:
+        return measure(span, a, b, radius, weight, length, stack)
+    count = circle_roots(span, a, b, radius / 100, roots, 0, work, p)
+    total, begin = 0.0, a
+    for i in range(count):
+        total += measure(span, begin, roots[i], radius, weight, length, stack)
+        begin = roots[i]
+    return total + measure(span, begin, b, radius, weight, length, stack)
+
+
+@njit(cache=True, error_model="numpy")
+def local_cubic(
+    t0: float, t1: float, v0: float, v1: float, d0: float, d1: float, ct: float, cv: float, out: Any
+) -> float:
+    """The span from knot (t0, v0) to (t1, v1) with end slopes d0, d1 about its point abreast of the centre (ct, cv).
+
+    Writes r, h, e0..e3 to out (6,) and returns the share s0 of the span before that point: s runs from -s0 to 1 - s0.
+    """
+    h, rise = t1 - t0, v1 - v0
+    s0 = min(max((ct - t0) / h, 0.0), 1.0)
+    a1, a2, a3 = h * d0, 3 * rise - h * (2 * d0 + d1), h * (d0 + d1) - 2 * rise
+    out[0] = 0.0 if 0 < s0 < 1 else (t0 - ct if s0 == 0 else t1 - ct)
+    out[1] = h
+    out[2] = (v0 - cv) + s0 * (a1 + s0 * (a2 + s0 * a3)) if s0 < 1 else v1 - cv
+    out[3] = a1 + s0 * (2 * a2 + 3 * s0 * a3)
+    out[4] = a2 + 3 * s0 * a3
+    out[5] = a3
+    return s0
+
+
+@njit(cache=True, error_model="numpy")
+def fibre_signal(
+    t: Any,
+    v: Any,
+    d: Any,
+    ct: float,
+    cv: float,
+    chains: Any,
+    reach: Any,
+    radius: float,
+    weight: int,
+    length: int,
+    span: Any,
+    scratch: Any,
+) -> tuple[float, int]:
+    """Signal of one fibre for the press at (ct, cv), and how many spans were looked at.
+
+    Args:
+        t, v, d: (n,) knots and slopes.
+        reach: (5,) of the shape: least and greatest t, least and greatest v, radius of the circle inside.
+    """
+    n = len(t)
+    begin, end = ct + reach[0], ct + reach[1]
+    if end <= t[0] or begin >= t[n - 1]:
+        return 0.0, 0
+    tolerance = 4 * EPS * (abs(cv) + radius)
+    total, visited = 0.0, 0
+    j = max(np.searchsorted(t, begin, side="right") - 1, 0)
+    while j < n - 1 and t[j] < end:
+        if min(v[j], v[j + 1]) <= cv + reach[3] + tolerance and max(v[j], v[j + 1]) >= cv + reach[2] - tolerance:
+            s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
+            for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
+                total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], radius, weight, length, scratch)
+            visited += 1
+        j += 1
+    return total, visited
+
+
+@njit(cache=True, error_model="numpy")
+def make_scratch(breaks: int) -> Any:
+    """Work arrays of one thread: roots, root finder's stack, polynomial, quadrature's stack, stretches inside.
+
+    Each of the pieces between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it in 7 parts.
+    """
+    return np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((HALVINGS + 2, 2)), np.empty((4 * breaks + 8, 2))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def exact_signals(
+    travel: Any,
+    cross: Any,
+    slope: Any,
+    strays: Any,
+    presses: Any,
+    chains: tuple[Any, Any],
+    reach: Any,
+    radius: float,
+    weight: int,
+    length: int,
+    begin: int,
+    end: int,
+    starts: Any,
+    fibre: Any,
+    signal: Any,
+) -> int:
+    """Signals of pads for presses, only of fibres a press can touch; returns how many spans were looked at.
+
+    Args:
+        travel, cross, slope: (P, 2M, n) knots and slopes. strays: (P, 2) of `family_strays`.
+        presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
+        chains: two (3, B), reach: (2, 5): the shape in the frame of each family.
+        starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
+            `signal`; or empty for dense signals (P Q 2M,), zeros before.
+    """
+    fibres = travel.shape[1]
+    grid = fibres // 2
+    span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
+    visited = 0
+    for index in range(begin, end):
+        p, q = index // len(presses), index % len(presses)
+        slot = starts[q] if len(starts) else 0
+        for family in range(2):
+            ct, cv = presses[q, family], presses[q, 1 - family]
+            shape = chains[0] if family == 0 else chains[1]
+            first, last = touched_range(cv, reach[family], strays[p, family], grid)
+            for f in range(family * grid + first, family * grid + last):
+                value, spans = fibre_signal(
+                    travel[p, f],
+                    cross[p, f],
+                    slope[p, f],
+                    ct,
+                    cv,
+                    shape,
+                    reach[family],
+                    radius,
+                    weight,
+                    length,
+                    span,
+                    scratch,
+                )
+                visited += spans
+                if len(starts):
+                    fibre[slot], signal[slot] = f, value
+                    slot += 1
+                else:
+                    signal[index * fibres + f] = value
+    return visited

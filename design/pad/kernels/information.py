@@ -1,0 +1,172 @@
+"""Information measures on a pad's signals, and the published objective made of them, for whole populations."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from .pchip import pchip_sample
+from .roots import SCRATCH, roots_in_unit
+from .sampled_signals import fibre_quantized
+
+
+@njit(cache=True, error_model="numpy")
+def to_levels(signals: Any, levels: int, out: Any) -> None:
+    """Converter levels of signals (Q, C) into out: each column scaled to 0..levels, rounded up; 0 without range."""
+    for c in range(signals.shape[1]):
+        low, high = signals[0, c], signals[0, c]
+        for q in range(len(signals)):
+            low, high = min(low, signals[q, c]), max(high, signals[q, c])
+        span = high - low
+        for q in range(len(signals)):
+            out[q, c] = math.ceil((signals[q, c] - low) / span * levels) if span > 0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def row_entropy(rows: Any, first: int, end: int) -> float:
+    """Joint entropy in bits of the rows of (Q, C), columns first..end: equal rows are counted by sorted hash."""
+    count = len(rows)
+    if count == 0:
+        return 0.0
+    hashes = np.empty(count, np.uint64)
+    for q in range(count):
+        code = np.uint64(1469598103934665603)
+        for c in range(first, end):
+            code = (code ^ np.uint64(np.int64(rows[q, c]))) * np.uint64(1099511628211)
+            code ^= code >> np.uint64(29)
+        hashes[q] = code
+    hashes.sort()
+    entropy, run = 0.0, 0
+    for q in range(count):
+        run += 1
+        if q == count - 1 or hashes[q + 1] != hashes[q]:
+            entropy += run * math.log2(count / run)
+            run = 0
+    return entropy / count
+
+
+@njit(cache=True, error_model="numpy")
+def second_differences(levels: Any) -> float:
+    """Sum over the columns of (Q, C) of |second difference|."""
+    total = 0.0
+    for q in range(1, len(levels) - 1):
+        for c in range(levels.shape[1]):
+            total += abs(levels[q + 1, c] - 2 * levels[q, c] + levels[q - 1, c])
+    return total
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
+def disorder(curves: Any) -> float:
+    """Sum over pairs i < j of each family of the negative parts of curve_j - curve_i, curves (2M, F)."""
+    grid = len(curves) // 2
+    total = 0.0
+    for family in range(2):
+        for i in range(family * grid, (family + 1) * grid):
+            for j in range(i + 1, (family + 1) * grid):
+                upper, lower = curves[i], curves[j]
+                for k in range(len(upper)):
+                    gap = upper[k] - lower[k]
+                    total += gap if gap > 0 else 0.0
+    return total
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def published_terms(
+    travel: Any,
+    cross: Any,
+    presses: Any,
+    chains: tuple[Any, Any],
+    reach: Any,
+    radius: float,
+    weight: int,
+    length: int,
+    samples: int,
+    levels: int,
+    begin: int,
+    end: int,
+    out: Any,
+) -> None:
+    """Entropy (sum of the families' joint entropies), sharpness and disorder of pads begin..end into out (P, 3)."""
+    fibres = travel.shape[1]
+    grid = fibres // 2
+    step = (grid + 1) / (samples - 1)
+    curves = np.empty((fibres, samples))
+    signals = np.empty((fibres, len(presses))).T
+    scaled = np.empty((len(presses), fibres))
+    for p in range(begin, end):
+        for f in range(fibres):
+            family = f // grid
+            shape = chains[0] if family == 0 else chains[1]
+            pchip_sample(travel[p, f], cross[p, f], step, curves[f])
+            fibre_quantized(
+                travel[p, f],
+                cross[p, f],
+                curves[f],
+                step,
+                presses,
+                family,
+                shape,
+                reach[family],
+                radius,
+                weight,
+                length,
+                signals[:, f],
+            )
+        to_levels(signals, levels, scaled)
+        out[p, 0] = row_entropy(scaled, 0, grid) + row_entropy(scaled, grid, fibres)
+        out[p, 1] = second_differences(scaled)
+        out[p, 2] = disorder(curves)
+
+
+@njit(cache=True, error_model="numpy")
+def _cubic_on(t: Any, v: Any, d: Any, k: int, a: float, width: float, sign: float, p: Any) -> None:
+    """Add sign times span k of a fibre on [a, a + width] to p (4,), powers of u in [0, 1]."""
+    h, rise = t[k + 1] - t[k], v[k + 1] - v[k]
+    a1, a2, a3 = h * d[k], 3 * rise - h * (2 * d[k] + d[k + 1]), h * (d[k] + d[k + 1]) - 2 * rise
+    s, w = (a - t[k]) / h, width / h
+    p[0] += sign * (v[k] + s * (a1 + s * (a2 + s * a3)))
+    p[1] += sign * w * (a1 + s * (2 * a2 + 3 * s * a3))
+    p[2] += sign * w * w * (a2 + 3 * s * a3)
+    p[3] += sign * w**3 * a3
+
+
+@njit(cache=True, error_model="numpy")
+def area_above(t: Any, v: Any, d: Any, other_t: Any, other_v: Any, other_d: Any) -> float:
+    """Integral over the travel axis of max(curve - other, 0): PCHIP curves by knots and slopes, exact."""
+    roots, work, p = np.empty(4), np.empty(SCRATCH), np.empty(4)
+    i, j, total, a = 0, 0, 0.0, t[0]
+    while i < len(t) - 1 and j < len(other_t) - 1:
+        b = min(t[i + 1], other_t[j + 1])
+        if b > a:
+            p[:] = 0.0
+            _cubic_on(t, v, d, i, a, b - a, 1.0, p)
+            _cubic_on(other_t, other_v, other_d, j, a, b - a, -1.0, p)
+            count = roots_in_unit(p, 3, 1e-15 * (abs(v[i]) + abs(v[i + 1])), roots, 0, work)
+            roots[count] = 1.0
+            start, before = 0.0, 0.0
+            for r in range(count + 1):
+                u = roots[r]
+                after = u * (p[0] + u * (p[1] / 2 + u * (p[2] / 3 + u * p[3] / 4)))
+                u = 0.5 * (start + roots[r])
+                if p[0] + u * (p[1] + u * (p[2] + u * p[3])) > 0:
+                    total += (b - a) * (after - before)
+                start, before = roots[r], after
+        a = b
+        if t[i + 1] <= b:
+            i += 1
+        if other_t[j + 1] <= b:
+            j += 1
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def disorder_area(travel: Any, cross: Any, slope: Any) -> float:
+    """Sum of `area_above` over pairs i < j of each family of a pad, knots and slopes (2M, n)."""
+    grid = len(travel) // 2
+    total = 0.0
+    for family in range(2):
+        for i in range(family * grid, (family + 1) * grid):
+            for j in range(i + 1, (family + 1) * grid):
+                total += area_above(travel[i], cross[i], slope[i], travel[j], cross[j], slope[j])
+    return total

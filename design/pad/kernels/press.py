@@ -1,0 +1,92 @@
+"""The press: its shape, what a fibre element in it weighs, and which fibres it can touch.
+
+These are an index range, since a family's fibres keep to their levels within its stray.
+"""
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+EPS = 2.0**-52
+
+UNIFORM, INVERSE_SQUARE, INVERSE = 0, 1, 2
+MANHATTAN, EUCLIDEAN = 0, 1
+
+
+@njit(cache=True, error_model="numpy")
+def weigh(square: float, radius: float, weight: int) -> float:
+    """Weight of a fibre element at squared distance `square` from the press centre."""
+    if weight == UNIFORM:
+        return 1.0
+    if weight == INVERSE_SQUARE:
+        return 1 / (radius + square)
+    return 1 / max(math.sqrt(square), radius / 100)
+
+
+@lru_cache(maxsize=64)
+def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
+    """The press's shape in the frame of each family: chains (3, B) of breakpoints t, upper v, lower v; extents (2, 5).
+
+    A circle has no breakpoints. At t a polygon reaches up to the lowest of its upper edges' lines and down to the
+    highest of its lower ones.
+    """
+    if sides is None:
+        empty = np.empty((3, 0))
+        return (empty, empty), radius * np.tile([-1.0, 1.0, -1.0, 1.0, 1.0], (2, 1))
+    corner = 2 * np.pi * np.arange(sides) / sides
+    normal = corner + np.pi / sides
+    apothem = np.cos(np.pi / sides)
+    chains, reach = [], []
+    for to_frame in ((np.cos, np.sin), (np.sin, np.cos)):
+        t = np.sort(to_frame[0](corner))
+        t = t[np.append(True, np.diff(t) > 1e-12)]
+        along, across = to_frame[0](normal), to_frame[1](normal)
+        edge = (apothem - np.outer(t, along)) / np.where(np.abs(across) < 1e-12, 1, across)
+        upper = np.where(across > 1e-12, edge, np.inf).min(axis=1)
+        lower = np.where(across < -1e-12, edge, -np.inf).max(axis=1)
+        chains.append(radius * np.stack([t, upper, lower]))
+        reach.append([t[0], t[-1], lower.min(), upper.max(), apothem])
+    return (chains[0], chains[1]), radius * np.array(reach)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def family_strays(cross: Any) -> Any:
+    """(P, 2) how far the fibres of each family stray from their own level, from knots' cross (P, 2M, n)."""
+    population, fibres, _ = cross.shape
+    grid = fibres // 2
+    out = np.zeros((population, 2))
+    for p in range(population):
+        for f in range(fibres):
+            level = f % grid + 1
+            out[p, f // grid] = max(out[p, f // grid], level - cross[p, f].min(), cross[p, f].max() - level)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def touched_range(cv: float, reach: Any, stray: float, grid: int) -> tuple[int, int]:
+    """Fibres [first, end) of a family, by index, that a press at cross coordinate cv can touch.
+
+    Fibre i (from 0) keeps to level i + 1 within the family's stray.
+    """
+    slack = 8 * EPS * (abs(cv) + reach[3])  # a fibre on the boundary is touched, whichever way rounding goes
+    first = min(max(math.ceil(cv + reach[2] - stray - slack) - 1, 0.0), float(grid))
+    end = min(max(math.floor(cv + reach[3] + stray + slack), 0.0), float(grid))
+    return int(first), int(end)
+
+
+@njit(cache=True, error_model="numpy")
+def count_touched(strays: Any, presses: Any, reach: Any, grid: int) -> Any:
+    """(Q + 1,) running number of fibres that presses (Q, 2) can touch on one pad with strays (2,)."""
+    starts = np.zeros(len(presses) + 1, np.int64)
+    for q in range(len(presses)):
+        starts[q + 1] = starts[q]
+        for family in range(2):
+            first, end = touched_range(presses[q, 1 - family], reach[family], strays[family], grid)
+            starts[q + 1] += max(end - first, 0)
+    return starts

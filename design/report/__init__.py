@@ -1,0 +1,1 @@
+"""The design on paper: the plan, and its part of the report."""

@@ -1,0 +1,61 @@
+"""The plan of a pad as a picture: fibres, crossings, broken rules and the contact, to scale in mm."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon, Rectangle
+
+from design.common.errors import InputError, instance, shown
+from design.common.figures import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
+from design.criteria.rules import Violation
+from design.pad.curves import crossings, flatten
+from design.pad.morphology import Morphology
+from design.settings import Contact
+
+
+def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation] = ()) -> Figure:
+    """The plan as a matplotlib figure; axes in mm from the pad's centre.
+
+    Same-family crossings are ringed, places of broken rules crossed out in red, the contact drawn at the centre.
+    """
+    pad, contact = instance("pad", pad, Morphology), instance("contact", contact, Contact)
+    if not isinstance(violations, Sequence) or not all(isinstance(found, Violation) for found in violations):
+        raise InputError(f"violations is {shown(violations)}, expected what rules.check found")
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    axes = figure.add_subplot(aspect="equal")
+    half = pad.size_mm / 2
+    axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor=PAPER, edgecolor=FAINT))
+    for fibre, points in enumerate(flatten(pad, 1e-3)):
+        horizontal = fibre < pad.grid
+        x, y = pad.to_mm(points).T
+        axes.plot(x, y, color=HORIZONTAL if horizontal else VERTICAL, linewidth=1.6, solid_capstyle="round")
+        ha, va, dx, dy = ("left", "center", 0.02, 0) if horizontal else ("center", "bottom", 0, 0.02)
+        color = HORIZONTAL if horizontal else VERTICAL
+        axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
+    places = [(pad.to_mm(c.place), (c.first < pad.grid) == (c.second < pad.grid)) for c in crossings(pad)]
+    for same, size, color in ((False, 10, INK), (True, 40, ALARM)):
+        chosen = np.array([place for place, family in places if family == same]).reshape(-1, 2)
+        axes.scatter(*chosen.T, s=size, facecolor="none" if same else color, edgecolor=color, linewidth=0.8, zorder=3)
+    axes.add_patch(_contact_shape(contact, pad.pitch_mm))
+    broken = np.array([v.place_mm for v in violations if v.place_mm is not None]).reshape(-1, 2)
+    axes.scatter(*broken.T, marker="x", s=50, color=ALARM, linewidth=1.8, zorder=4)
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", xlim=(-1.08 * half, 1.08 * half), ylim=(-1.08 * half, 1.08 * half))
+    axes.spines[["top", "right"]].set_visible(False)
+    across = sum(not family for _, family in places)
+    axes.set_title(
+        f"{pad.grid} + {pad.grid} fibres, pitch {pad.pitch_mm:g} mm, {len(places)} crossings"
+        + (f", {len(places) - across} within a family" if len(places) > across else "")
+        + (f", {len(violations)} rules broken" if violations else ""),
+        fontsize=10,
+        color=ALARM if violations else INK,
+    )
+    return figure
+
+
+def _contact_shape(contact: Contact, pitch_mm: float) -> Circle | Polygon:
+    radius = contact.radius * pitch_mm
+    if contact.sides is None:
+        return Circle((0, 0), radius, color=INK, alpha=0.15, linewidth=0)
+    angle = 2 * np.pi * np.arange(contact.sides) / contact.sides
+    return Polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]), color=INK, alpha=0.15, linewidth=0)

@@ -1,0 +1,1 @@
+"""What could go wrong in print, told before plastic is spent."""

@@ -1,0 +1,236 @@
+"""Whether a mould prints, demoulds and lets the fibres be laid: each check one finding with its places.
+
+Nothing here changes a mould or stops its making: a pass, warn or fail with what was measured is all there is. The
+checks here need the plan; those that a mesh of any origin goes through are in `soundness`.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import ops
+from shapely.geometry.base import BaseGeometry
+
+from design.criteria.rules import tight_bends
+from design.pad.morphology import Morphology
+from fabricate.mould.assembly import plan_mesh
+from fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
+from fabricate.settings import DEFAULTS, Settings
+
+from . import mesh_checks as soundness
+from .findings import Finding, Status, as_places, graded, verdict
+from .thickness import least_line_mm
+
+_SPECK_MM2 = 0.01
+"""Silicone too thin over less than this area is a corner, not a wall."""
+
+_SLENDER, _TOO_SLENDER = 5.0, 10.0
+"""Ridges taller than so many times their width may break off in demoulding, or do not print upright at all."""
+
+
+_NAMED = 8
+"""More fibres than this are counted instead of named."""
+
+
+def check(pad: Morphology, settings: Settings = DEFAULTS) -> list[Finding]:
+    """Every check on the mould of a pad.
+
+    Raises:
+        InputError: settings that contradict each other.
+    """
+    return meshed(Plan(pad, settings))[-1]
+
+
+def meshed(plan: Plan) -> tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]:
+    """The mesh of a plan, vertices (n, 3) mm and triangles (m, 3) vertex numbers, and every check on both."""
+    from fabricate.mould.mesh import arrays
+
+    vertices, triangles = arrays(plan_mesh(plan))
+    return vertices, triangles, inspect(plan, vertices, triangles)
+
+
+def inspect(plan: Plan, vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> list[Finding]:
+    """Every check on a plan and its mesh: vertices (n, 3) mm, triangles (m, 3) vertex numbers."""
+    of_mesh = soundness.inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, unplanned=False)
+    return [*of_mesh, *check_plan(plan)]
+
+
+def check_plan(plan: Plan) -> list[Finding]:
+    """The checks that need no mesh."""
+    return [
+        _ridge_width(plan),
+        _track_size(plan.settings),
+        _layers(plan),
+        _slenderness(plan),
+        _crossing_gap(plan),
+        _same_family_crossings(plan),
+        _silicone_wall(plan),
+        _tray_wall(plan),
+        _cover(plan),
+        _fibre_bend(plan),
+        _numbers(plan),
+    ]
+
+
+def _ridge_width(plan: Plan) -> Finding:
+    """A printer draws nothing narrower than its nozzle, or than two pixels of its screen."""
+    width, least = plan.settings.mould.ridge_width_mm, least_line_mm(plan.settings.printer)
+    reason = "two pixels" if plan.settings.printer.resin else "the nozzle"
+    message = f"ridges are {width:g} mm wide, {reason} {least:g} mm"
+    wide = width >= least - 1e-9
+    places = [] if wide else [place for level in range(len(plan.heights_mm)) for place in _middles(plan, level)]
+    return verdict("ridge_width", wide, width, least, message, places)
+
+
+def _track_size(settings: Settings) -> Finding:
+    """A fibre must lie within its track, neither pinched nor standing out."""
+    room = min(settings.mould.ridge_width_mm, settings.mould.shallow_ridge_height_mm)
+    fibre = settings.pad.fibre_diameter_mm
+    message = f"the tightest track is {room:g} mm, the fibre {fibre:g} mm"
+    return verdict("track_size", room >= fibre, room, fibre, message)
+
+
+def _layers(plan: Plan) -> Finding:
+    """Ridges of less than two layers do not print; heights between layers come out rounded."""
+    layer, mould = plan.settings.printer.layer_mm, plan.settings.mould
+    heights = {
+        "floor_mm": mould.floor_mm,
+        "shallow_ridge_height_mm": mould.shallow_ridge_height_mm,
+        "deep_ridge_height_mm": mould.deep_ridge_height_mm,
+    }
+    uneven = [key for key, height in heights.items() if abs(height / layer - round(height / layer)) > 1e-6]
+    least = min(heights.values()) / layer
+    if least < 2 - 1e-6:
+        return Finding("layers", "fail", least, 2.0, f"the lowest step has {least:.2f} layers of {layer:g} mm")
+    if uneven:
+        return Finding("layers", "warn", least, 2.0, f"{', '.join(uneven)}: not a whole number of {layer:g} mm layers")
+    return Finding("layers", "pass", least, 2.0, f"every step is a whole number of {layer:g} mm layers")
+
+
+def _slenderness(plan: Plan) -> Finding:
+    """A thin and tall ridge bends when it is printed and breaks when the casting is pulled off."""
+    tallest, width = plan.heights_mm[-1], plan.settings.mould.ridge_width_mm
+    ratio = tallest / width
+    status: Status = "pass" if ratio <= _SLENDER + 1e-9 else "warn" if ratio <= _TOO_SLENDER + 1e-9 else "fail"
+    message = f"the tallest ridges, {tallest:g} mm, are {ratio:.1f} times as tall as wide"
+    places = [] if status == "pass" else _middles(plan, len(plan.heights_mm) - 1)
+    return Finding("slenderness", status, ratio, _SLENDER, message, as_places(places))
+
+
+def _crossing_gap(plan: Plan) -> Finding:
+    """Where fibres cross, silicone or adhesive between them keeps them from shorting."""
+    mould = plan.settings.mould
+    gap = mould.level_step_mm - plan.settings.pad.fibre_diameter_mm
+    message = f"{gap:.3f} mm lie between fibres of neighbouring depths where they cross"
+    return Finding("crossing_gap", graded(gap, mould.min_silicone_mm), gap, mould.min_silicone_mm, message)
+
+
+def _same_family_crossings(plan: Plan) -> Finding:
+    """Tracks of one depth that cross become one, and the fibres in them touch; each further depth is more work."""
+    places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
+    message = f"{len(places)} crossings of fibres of one family"
+    if plan.settings.mould.levels == "two":
+        status: Status = "fail" if len(places) else "pass"
+        message += ", whose tracks merge" if len(places) else ""
+    else:
+        status = "warn" if len(places) else "pass"
+        message += f", kept apart by {len(plan.heights_mm)} depths instead of 2" if len(places) else ""
+    return Finding("same_family_crossings", status, len(places), 0, message, as_places(places))
+
+
+def _silicone_wall(plan: Plan) -> Finding:
+    """The thinnest silicone between tracks of equal depth, of two fibres or of one that turns back.
+
+    Silicone beside the tray's walls is left to the check of those. Found by bisection to 2 % or 10 µm.
+    """
+    limit, pitch = plan.settings.mould.min_silicone_mm, plan.pad.pitch_mm
+    around = plan.cavity.buffer(2 * pitch, join_style="mitre")
+    silicones = [without(around, plan.outline(level, foot)) for level, foot in enumerate(plan.heights_mm)]
+    patches = [_thinner(silicone, limit, plan.cavity) for silicone in silicones]
+    within: list[BaseGeometry] = [plan.cavity] * len(silicones)
+    low, high = limit, pitch
+    if any(patches):  # the thinnest place lies in one of them: look no further than their surroundings
+        low, high = 0.0, limit
+        thin = [level for level, found in enumerate(patches) if found]
+        within = [shapely.union_all(patches[level]) for level in thin]
+        silicones = [overlap(silicones[level], own.buffer(2 * limit)) for level, own in zip(thin, within, strict=True)]
+    while high - low > max(0.01, 0.02 * low):
+        middle = (low + high) / 2
+        thinner = any(_thinner(silicone, middle, own) for silicone, own in zip(silicones, within, strict=True))
+        low, high = (low, middle) if thinner else (middle, high)
+    message = f"the thinnest silicone between tracks of one depth is {high:.2f} mm"
+    places = [patch.representative_point().coords[0] for found in patches for patch in found]
+    status = graded(low, limit) if places else "pass"
+    return Finding("silicone_wall", status, high, limit, message, as_places(places))
+
+
+def _thinner(area: BaseGeometry, width: float, within: BaseGeometry) -> list[BaseGeometry]:
+    """Patches of `area` that vanish when it shrinks and grows again by half of `width`, corners kept sharp."""
+    opened = area.buffer(-width / 2, join_style="mitre").buffer(width / 2, join_style="mitre")
+    if not opened.is_valid:  # sharp corners that grow past each other
+        opened = areas(shapely.make_valid(opened))
+    lost = overlap(without(area, opened), within)
+    return [patch for patch in shapely.get_parts(lost) if patch.area > _SPECK_MM2]
+
+
+def _tray_wall(plan: Plan) -> Finding:
+    """Between its ends a fibre must keep off the tray's wall, or its track opens to the pad's side.
+
+    The first stretch at each end is left out: long enough for fibres that leave the wall at 30 degrees or more.
+    """
+    half, limit = plan.settings.mould.ridge_width_mm / 2, plan.settings.mould.min_silicone_mm
+    reach, wall = half + limit, plan.cavity.boundary
+    beside = plan.cavity.difference(plan.cavity.buffer(-reach, join_style="mitre"))
+    end = INTO_WALL_MM + plan.settings.mould.exit_mm + 2 * reach
+    middles = [ops.substring(line, end, line.length - end) for line in plan.lines]
+    near = [part for middle in middles for part in shapely.get_parts(middle.intersection(beside)) if part.length]
+    gaps = [part.distance(wall) - half for part in near]
+    least = min(gaps, default=min(middle.distance(wall) - half for middle in middles))
+    places = [ops.nearest_points(part, wall)[0].coords[0] for part in near]
+    message = f"ridges between their ends come within {least:.2f} mm of the tray's wall"
+    return Finding("tray_wall", graded(least, limit), least, limit, message, as_places(places))
+
+
+def _cover(plan: Plan) -> Finding:
+    """The silicone that is left beyond the deepest tracks carries the pad."""
+    thickness, wanted = plan.silicone_mm, plan.settings.mould.silicone_mm
+    cover = thickness - plan.heights_mm[-1]
+    message = f"{cover:g} mm of silicone lie beyond the deepest tracks"
+    if thickness > wanted:
+        message += f"; for {len(plan.heights_mm)} depths the pad is {thickness:g} mm thick, not {wanted:g}"
+    thin = cover < COVER_MM - 1e-9
+    return Finding("cover", "warn" if thin or thickness > wanted else "pass", cover, COVER_MM, message)
+
+
+def _fibre_bend(plan: Plan) -> Finding:
+    """A fibre cannot follow a bend tighter than the rules allow for: it lifts out of its track or breaks."""
+    limit = plan.settings.rules.min_bend_radius_mm
+    tight = tight_bends(plan.pad, limit)
+    least = min((bend.measured for bend in tight), default=limit)
+    names = _listed("fibre", [bend.fibres[0] for bend in tight])
+    message = f"{names} bent as tightly as {least:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
+    places = [bend.place_mm for bend in tight if bend.place_mm is not None]
+    return verdict("fibre_bend", not tight, least, limit, message, places)
+
+
+def _numbers(plan: Plan) -> Finding:
+    """A track without its number is easily taken for another."""
+    missing = [fibre for fibre, number in enumerate(plan.numbers) if number is None]
+    names = _listed("number", [fibre + 1 for fibre in missing])
+    message = f"no room beside the fibre's start for {names}" if missing else "every number has room"
+    places = [plan.lines[fibre].coords[0] for fibre in missing]
+    count = len(plan.numbers) - len(missing)
+    return Finding("numbers", "warn" if missing else "pass", count, len(plan.numbers), message, as_places(places))
+
+
+def _listed(noun: str, numbers: Sequence[int]) -> str:
+    """The numbers by name, or how many they are."""
+    plural = noun if len(numbers) == 1 else f"{noun}s"
+    return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= _NAMED else f"{len(numbers)} {plural}"
+
+
+def _middles(plan: Plan, level: int) -> list[tuple[float, ...]]:
+    """The middle of the course of every ridge of a level."""
+    lines = [line for line, own in zip(plan.lines, plan.levels, strict=True) if own == level]
+    return [line.interpolate(0.5, normalized=True).coords[0] for line in lines]

@@ -1,0 +1,164 @@
+"""Files of a solid: STL, 3MF and STEP, the same bytes for the same solid."""
+
+import logging
+import zipfile
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError
+from design.common.errors import path as as_path
+from design.common.files import require_file
+
+if TYPE_CHECKING:
+    from build123d import Solid
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+LARGEST_MM = 1e6
+"""Greatest coordinate of a vertex, by amount."""
+
+MOST_BYTES = 2**27
+"""Unpacked; a model of a million triangles takes half of it."""
+
+MOST_COPIES = 1000
+"""Objects that are built, each counted as often as it is used."""
+
+MOST_DEPTH = 16
+"""Objects within objects within objects."""
+
+_EPOCH = "2000-01-01T00:00:00"
+"""The time written into STEP files, which must carry one."""
+
+
+def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
+    """Write a binary STL, mm: vertices (n, 3), triangles (m, 3) vertex numbers."""
+    corners = vertices[triangles].astype("<f4")
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    records = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    records["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    records["corners"] = corners
+    header = b"padforge, mm".ljust(80)
+    path.write_bytes(header + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
+
+
+def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
+    """Write a 3MF, mm: vertices (n, 3), triangles (m, 3) vertex numbers; same digits as the STL's floats."""
+    points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
+    faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
+    package = "http://schemas.openxmlformats.org/package/2006"
+    core = "http://schemas.microsoft.com/3dmanufacturing"
+    declaration = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    parts = {
+        "[Content_Types].xml": f'<Types xmlns="{package}/content-types">'
+        '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+        '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>',
+        "_rels/.rels": f'<Relationships xmlns="{package}/relationships">'
+        f'<Relationship Id="model" Target="/3D/3dmodel.model" Type="{core}/2013/01/3dmodel"/></Relationships>',
+        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{core}/core/2015/02"><resources>'
+        f'<object id="1" type="model"><mesh><vertices>{points}</vertices><triangles>{faces}</triangles></mesh></object>'
+        '</resources><build><item objectid="1"/></build></model>',
+    }
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, text in parts.items():
+            entry = zipfile.ZipInfo(name)  # a fixed date, unlike what writestr makes of a name
+            archive.writestr(entry, declaration + text, zipfile.ZIP_DEFLATED)
+
+
+def write_step(path: Path, solid: "Solid") -> None:
+    """Write a STEP file; its faces are plane, so the curves in face coordinates would only treble its size."""
+    from build123d import export_step
+
+    if not export_step(solid, path, write_pcurves=False, timestamp=_EPOCH):
+        raise InputError(f"{path}: the CAD kernel could not write it")
+
+
+def write_utf8(path: Path, text: str) -> None:
+    """Write text; line ends as they are, so that the bytes do not depend on the system."""
+    path.write_bytes(text.encode("utf-8"))
+
+
+def read_mesh(path: Path) -> tuple[Array, Numbers]:
+    """Vertices (n, 3) mm and triangles (m, 3), m > 0, of a mesh file (.stl, .3mf), all objects of a 3MF together.
+
+    Args:
+        path: an STL counts as mm; a 3MF says its unit.
+
+    Raises:
+        InputError: the file is missing or holds no triangles.
+    """
+    import trimesh
+
+    path = as_path("path", path)
+    require_file(path)
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it says on top of raising
+    try:
+        if path.suffix.lower() == ".3mf":
+            refuse_swollen(path)
+        with np.errstate(all="ignore"):
+            scene = trimesh.load_scene(path, process=False)  # which would drop triangles with NaN
+            if scene.units:
+                scene = scene.convert_units("millimeters")
+            mesh = scene.to_mesh()
+        vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except Exception as error:  # readers of broken files raise whatever comes
+        missing = isinstance(error, KeyError)
+        reason = f"{error} is missing in it" if missing else " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
+    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise InputError(f"{path}: holds no triangles that can be read, or is torn")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max() > LARGEST_MM:
+        raise InputError(f"{path}: vertices hold NaN, infinity or more than {LARGEST_MM:g}")
+    return vertices, triangles
+
+
+def refuse_swollen(path: Path) -> None:
+    """Refuse a 3MF that unpacks to too much, or whose objects are made of too many objects, or of themselves.
+
+    Raises:
+        ValueError: says what there is too much of. zipfile.BadZipFile, expat.ExpatError: no such file.
+    """
+    built: list[str] = []
+    parts: dict[str, list[str]] = {}
+    with zipfile.ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+        if size > MOST_BYTES:
+            raise ValueError(f"it unpacks to {size} bytes, allowed are {MOST_BYTES}")
+        for name in archive.namelist():
+            if name.lower().endswith(".model"):
+                _read_parts(archive.read(name), built, parts)
+
+    @cache
+    def copies(name: str, depth: int) -> int:
+        if depth > MOST_DEPTH:
+            raise ValueError(f"its objects are made of others more than {MOST_DEPTH} deep, or of themselves")
+        return 1 + sum(copies(part, depth + 1) for part in parts.get(name, []))
+
+    count = sum(copies(name, 0) for name in built)
+    if count > MOST_COPIES:
+        raise ValueError(f"it is built of {count} objects, allowed are {MOST_COPIES}")
+
+
+def _read_parts(content: bytes, built: list[str], parts: dict[str, list[str]]) -> None:
+    """Add the objects that a model builds, and those that each of its objects is made of."""
+    within = ""
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal within
+        match tag.rpartition(":")[2]:
+            case "object":
+                within = attributes.get("id", "")
+            case "component":
+                parts.setdefault(within, []).append(attributes.get("objectid", ""))
+            case "item":
+                built.append(attributes.get("objectid", ""))
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    parser.Parse(content, True)

@@ -1,0 +1,1 @@
+"""The mould, from the plan to solids and meshes."""

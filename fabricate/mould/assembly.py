@@ -1,0 +1,192 @@
+"""The bodies of a mould, put together from their parts, and the mould as a CAD solid.
+
+z = 0 is the underside of a body, which lies on the print bed; the tray's floor has its top at `floor_mm`. Lengths
+are mm.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from shapely.geometry.base import BaseGeometry
+
+from design.common.errors import InputError
+from design.pad.morphology import Morphology
+from fabricate.settings import DEFAULTS, Settings
+
+from . import parts
+from .plan import Plan
+from .prisms import Body
+
+if TYPE_CHECKING:
+    from build123d import Solid
+    from manifold3d import Manifold
+
+WELL_MM = 3.0
+"""Diameter of the wells for conductive material."""
+
+_WELL_RIM_MM = 1.0
+"""Silicone around a well."""
+
+_VENT_INSET_MM = 3.0
+"""How far from the cavity's rim the lid's vents lie."""
+
+LID_MM = 3.0
+"""Thickness of the lid."""
+
+
+def build_mould(pad: Morphology, settings: Settings = DEFAULTS) -> "Solid":
+    """The mould as a build123d solid, ready for CAD and STEP.
+
+    Args:
+        pad: the fibres.
+        settings: tray, ridges and fibre.
+
+    Returns:
+        One closed solid, mm.
+
+    Raises:
+        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out.
+    """
+    plan = Plan(pad, settings)
+    plan.require_levels()
+    return valid_solid(plan_mesh(plan))
+
+
+def valid_solid(mesh: "Manifold", name: str = "mould") -> "Solid":
+    """The CAD solid of a mesh; raises InputError where the CAD kernel finds it invalid."""
+    from .cad_solid import faceted_solid
+
+    solid = faceted_solid(mesh)
+    if not solid.is_valid:
+        raise InputError(f"{name}: the CAD kernel finds the solid invalid; try another [mould] tolerance_mm")
+    return solid
+
+
+def plan_mesh(plan: Plan) -> "Manifold":
+    """The mould of a plan as a manifold3d mesh."""
+    from .mesh import mesh
+
+    return mesh(mould_body(plan))
+
+
+def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
+    """The inverse mould: tray, ridges, exits, numbers and pins.
+
+    Args:
+        wells: outlines that belong to the ridges of each level, mm; none for a pad whose fibres are laid.
+
+    Raises:
+        InputError: pins that find no room on the walls.
+    """
+    mould = plan.settings.mould
+    floor, hollows = mould.floor_mm, [plan.cavity, *plan.exits]
+    body = parts.tray(plan.tray, hollows, floor_mm=floor, depth_mm=plan.silicone_mm, flare_mm=plan.flare_mm)
+    for level, height in enumerate(plan.heights_mm):
+
+        def outline(below: float, level: int = level) -> BaseGeometry:
+            if below:
+                return plan.outline(level, below)
+            return plan.ridges[level] | wells[level] if wells else plan.ridges[level]
+
+        ridges = parts.ridge(outline, floor_mm=floor, height_mm=height, terrace_mm=plan.settings.terrace_mm)
+        body = body.with_adds(ridges)
+    written = [outline for outline in plan.numbers if outline is not None]
+    body = body.with_adds(parts.numbers(written, floor_mm=floor, height_mm=mould.shallow_ridge_height_mm))
+    if mould.pins:
+        top = floor + plan.silicone_mm
+        body = body.with_adds(parts.pins(_pin_places(plan), top_mm=top, diameter_mm=_pin_mm(plan)))
+    return body
+
+
+def sizes(plan: Plan) -> dict[str, float]:
+    """What the parts came out as, mm: where the settings leave it open or the pad needs more than they say."""
+    mould = plan.settings.mould
+    _, _, edge, _ = plan.cavity.bounds
+    achieved = {
+        "pad_mm": 2 * edge,
+        "pad_thickness_mm": plan.silicone_mm,
+        "rim_mm": 2 * (edge + plan.flare_mm),
+        "tray_mm": 2 * plan.tray.bounds[2],
+        "tray_height_mm": mould.floor_mm + plan.silicone_mm,
+        "ridge_foot_mm": mould.ridge_width_mm + 2 * plan.heights_mm[-1] * plan.settings.ridge_slope,
+    }
+    if mould.pins:
+        achieved["pin_mm"] = _pin_mm(plan)
+    if mould.lid:
+        achieved["lid_mm"] = LID_MM
+    if mould.conductive:
+        achieved["well_mm"] = WELL_MM
+    return {name: round(size, 6) for name, size in achieved.items()}
+
+
+def lid_body(plan: Plan) -> Body:
+    """The lid that lies on the tray's walls; its holes fit the pins, if there are any.
+
+    Raises:
+        InputError: a pad too small for vents beside the spout.
+    """
+    mould, edge = plan.settings.mould, plan.cavity.bounds[2]
+    inset = edge - min(_VENT_INSET_MM, edge / 2)
+    least = (parts.spout_mm() + parts.VENT_MM) / math.sqrt(2)
+    if mould.spout and 2 * inset < least:
+        from_mm = least + 2 * _VENT_INSET_MM
+        raise InputError(f"[mould] spout: got true for a pad {2 * edge:.4g} mm wide, allowed from {from_mm:.4g} mm")
+    body = parts.lid(
+        plan.tray,
+        [(x, y) for x in (-inset, inset) for y in (-inset, inset)],
+        thickness_mm=LID_MM,
+        pin_places=_pin_places(plan) if mould.pins else (),
+        pin_mm=_pin_mm(plan) if mould.pins else 0.0,
+    )
+    return parts.spout(body, thickness_mm=LID_MM) if mould.spout else body
+
+
+def lid_holes(plan: Plan) -> int:
+    """How many holes lead through the lid: vents, those for pins, and the spout."""
+    mould = plan.settings.mould
+    return 4 + 3 * mould.pins + mould.spout
+
+
+def conductive_plan(plan: Plan) -> Plan:
+    """The plan of the second mould: exits large enough for wells, everything else alike.
+
+    Raises:
+        InputError: exits that large do not fit the pitch.
+    """
+    side = WELL_MM + 2 * _WELL_RIM_MM
+    mould = plan.settings.mould.model_copy(update={"exit_mm": side, "exit_width_mm": side})
+    return replace(plan, settings=replace(plan.settings, mould=mould))
+
+
+def conductive_body(plan: Plan) -> Body:
+    """The mould whose casting has a well at both ends of every track.
+
+    Args:
+        plan: of the second mould.
+    """
+    away = plan.cavity.bounds[2] + _WELL_RIM_MM + WELL_MM / 2
+    places: list[list[tuple[float, float]]] = [[] for _ in plan.heights_mm]
+    for fibre, line in enumerate(plan.lines):
+        for end, side in ((0, -away), (-1, away)):
+            across = line.coords[end][1 - plan.family(fibre)]
+            places[plan.levels[fibre]].append((across, side) if plan.family(fibre) else (side, across))
+    return mould_body(plan, [parts.wells(own, diameter_mm=WELL_MM) for own in places])
+
+
+def _pin_mm(plan: Plan) -> float:
+    """Diameter of the pins: half of the corner they stand on, in tenths of a millimetre."""
+    diameter = int(5 * plan.corner_mm + 1e-9) / 10
+    if diameter < 1:
+        raise InputError(
+            f"[mould] pins: the walls' corners are {plan.corner_mm:g} mm wide, allowed are 2 mm or more"
+            " (wall_mm + exit_mm)"
+        )
+    return diameter
+
+
+def _pin_places(plan: Plan) -> list[tuple[float, float]]:
+    """Three corners of the tray, so that a lid fits one way only."""
+    away = plan.tray.bounds[2] - plan.corner_mm / 2
+    return [(-away, -away), (away, -away), (-away, away)]

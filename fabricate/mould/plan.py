@@ -1,0 +1,218 @@
+"""The plan of a mould: centre lines, ridge outlines and tray in mm.
+
+The frame is the pad's own, x and y from its centre (`Morphology.to_mm`), as it lies in the tray with its tracks
+down. Turned over for laying, the tracks are the mirror image of the plan.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from design.common.errors import InputError, instance
+from design.pad.curves import Crossing, crossings, flatten
+from design.pad.morphology import Morphology
+from fabricate.settings import DEFAULTS, Settings
+
+from .depth_levels import fibre_levels
+from .numerals import number_strokes, with_room
+
+INTO_WALL_MM = 0.5
+"""How far ridges run into the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
+
+COVER_MM = 1.0
+"""Least silicone over the deepest track; a pad of many levels is made thicker for it."""
+
+SNAP_MM = 1e-4
+"""Grid that areas are snapped to where they are cut and joined, mm.
+
+No edge of the solid is shorter; and without a grid, outlines that almost coincide can defeat the cut."""
+
+_BESIDE = 5
+"""Further from a fibre's start than so many times its height a number is no longer seen to belong to it."""
+
+_CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
+"""How the tolerance is shared: most thins out the outline, which sets the size of every file."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A morphology with the settings of its mould; what is derived from them is computed when first asked for.
+
+    Raises:
+        InputError: settings that contradict each other or the pitch.
+    """
+
+    pad: Morphology
+    settings: Settings = DEFAULTS
+
+    def __post_init__(self) -> None:
+        instance("pad", self.pad, Morphology)
+        instance("settings", self.settings, Settings).require_consistent(self.pad.pitch_mm)
+
+    @cached_property
+    def lines(self) -> list[shapely.LineString]:
+        """2M centre lines, mm: each within a fifth of the tolerance, continued straight through border and wall."""
+        mould = self.settings.mould
+        tolerance = _CENTRE_SHARE * mould.tolerance_mm / self.pad.pitch_mm
+        reach = mould.border_mm + mould.exit_mm + INTO_WALL_MM
+        lines = []
+        for fibre, points in enumerate(flatten(self.pad, tolerance)):
+            places = self.pad.to_mm(points)
+            ahead = reach * np.eye(2)[self.family(fibre)]
+            lines.append(shapely.LineString(np.vstack([places[0] - ahead, places, places[-1] + ahead])))
+        return lines
+
+    @cached_property
+    def crossings(self) -> list[Crossing]:
+        """Every place where two fibres meet; `place` in grid units."""
+        return crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.pitch_mm)
+
+    @cached_property
+    def clashes(self) -> list[Crossing]:
+        """The crossings of fibres of one family."""
+        return [c for c in self.crossings if self.family(c.first) == self.family(c.second)]
+
+    def family(self, fibre: int) -> int:
+        """0 for a horizontal fibre, 1 for a vertical one."""
+        return fibre // self.pad.grid
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        """(2M,) level of every fibre, 0 the shallowest; fibres that cross differ, if the settings allow for it."""
+        clashes = self.clashes if self.settings.mould.levels == "as_needed" else []
+        return fibre_levels(self.pad.grid, clashes, self.settings.pad.deep_family == "horizontal")
+
+    def require_levels(self) -> None:
+        """Refuse a pad whose fibres need more levels than the settings grant.
+
+        Raises:
+            InputError: lists the crossings of fibres of one family.
+        """
+        if self.clashes and self.settings.mould.levels == "two":
+            places = [self.pad.to_mm(c.place) for c in self.clashes]
+            listed = ", ".join(
+                f"{c.first + 1} x {c.second + 1} at ({x:.1f}, {y:.1f}) mm"
+                for c, (x, y) in zip(self.clashes, places, strict=True)
+            )
+            raise InputError(
+                f'[mould] levels: got "two", allowed for pads without crossings of one family, or "as_needed"; '
+                f"{len(self.clashes)} crossings: fibres {listed}"
+            )
+
+    @cached_property
+    def heights_mm(self) -> tuple[float, ...]:
+        """Ridge height of every level, ascending, mm above the tray's floor."""
+        mould = self.settings.mould
+        return tuple(
+            round(mould.shallow_ridge_height_mm + level * mould.level_step_mm, 9)
+            for level in range(1 + max(self.levels))
+        )
+
+    @cached_property
+    def silicone_mm(self) -> float:
+        """Thickness of the cast pad, mm: as set, or more where many levels need it."""
+        least = self.heights_mm[-1] + COVER_MM if len(self.heights_mm) > 2 else 0
+        return max(self.settings.mould.silicone_mm, least)
+
+    def outline(self, level: int, below_mm: float = 0.0) -> BaseGeometry:
+        """Outline of the ridges of a level `below_mm` under their tops, mm, ends inside the walls."""
+        mould = self.settings.mould
+        half = mould.ridge_width_mm / 2 + below_mm * self.settings.ridge_slope
+        chord = 2 * math.acos(1 - _ARC_SHARE * mould.tolerance_mm / half)
+        lines = [line for line, own in zip(self.lines, self.levels, strict=True) if own == level]
+        bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
+        return shapely.union_all(bands).simplify(_OUTLINE_SHARE * mould.tolerance_mm)
+
+    @cached_property
+    def ridges(self) -> tuple[BaseGeometry, ...]:
+        """Outlines of the tops of the ridges of every level, mm."""
+        return tuple(map(self.outline, range(len(self.heights_mm))))
+
+    @cached_property
+    def numbers(self) -> list[BaseGeometry | None]:
+        """Strokes of every fibre's number, 1..2M, beside its start, mirrored; None without room, empty if unwanted."""
+        mould = self.settings.mould
+        if not mould.number_mm:
+            return []
+        strokes = [number_strokes(n, mould.number_mm, mould.ridge_width_mm) for n in range(1, 2 * self.pad.grid + 1)]
+        clear = mould.ridge_width_mm / 2 + self.heights_mm[-1] * self.settings.ridge_slope + mould.min_silicone_mm
+        return with_room(strokes, self.lines, self.cavity, clear, min(self.pad.pitch_mm, _BESIDE * mould.number_mm))
+
+    @cached_property
+    def cavity(self) -> shapely.Polygon:
+        """What the silicone fills on the floor but for the exits, seen from above, mm."""
+        return square(self.pad.size_mm / 2 + self.settings.mould.border_mm)
+
+    @cached_property
+    def exits(self) -> list[shapely.Polygon]:
+        """Slots in the wall around both ends of every fibre, mm: in the order of the fibres, starts first.
+
+        They begin within the cavity, so that no face of theirs coincides with one of its own.
+        """
+        mould = self.settings.mould
+        if not mould.exit_mm:
+            return []
+        edge, half = self.cavity.bounds[2], mould.exit_width_mm / 2
+        boxes = []
+        for end, outward in ((0, -1), (-1, 1)):
+            for fibre, line in enumerate(self.lines):
+                axis = self.family(fibre)
+                corners = np.empty((2, 2))
+                corners[:, axis] = outward * (edge - half), outward * (edge + mould.exit_mm)
+                corners[:, 1 - axis] = line.coords[end][1 - axis] + np.array([-half, half])
+                boxes.append(shapely.box(*corners.min(axis=0), *corners.max(axis=0)))
+        return boxes
+
+    @cached_property
+    def silicone(self) -> BaseGeometry:
+        """All that the silicone fills on the floor, exits included, seen from above, mm."""
+        return shapely.union_all([self.cavity, *self.exits])
+
+    @property
+    def flare_mm(self) -> float:
+        """How far the walls lean outwards from the floor to their top, mm."""
+        return self.silicone_mm * math.tan(math.radians(self.settings.mould.wall_draft_deg))
+
+    @property
+    def corner_mm(self) -> float:
+        """Side of the solid square between a corner of the cavity's rim and that of the tray, mm."""
+        return self.settings.mould.exit_mm + self.settings.mould.wall_mm
+
+    @cached_property
+    def tray(self) -> shapely.Polygon:
+        """The mould seen from above, walls included, mm."""
+        return square(self.cavity.bounds[2] + self.flare_mm + self.corner_mm)
+
+
+def overlap(first: BaseGeometry, second: BaseGeometry) -> BaseGeometry:
+    """The area that two areas share."""
+    return areas(shapely.intersection(first, second, grid_size=SNAP_MM))
+
+
+def without(first: BaseGeometry, second: BaseGeometry) -> BaseGeometry:
+    """What `second` leaves of the area `first`."""
+    return areas(shapely.difference(first, second, grid_size=SNAP_MM))
+
+
+def areas(shape: BaseGeometry) -> BaseGeometry:
+    """The polygons of `shape`; snapping leaves lines and points behind where areas barely touch."""
+    parts = shapely.get_parts(shape)
+    return shapely.MultiPolygon(parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON].tolist())
+
+
+def polygon_rings(area: BaseGeometry) -> list[list[np.ndarray]]:
+    """Each polygon of `area` as its rings (n, 2) without the repeated last point, outer first.
+
+    Outer rings run counter-clockwise and holes clockwise: the polygon lies to the left of every edge.
+    """
+    polygons = shapely.orient_polygons(shapely.get_parts(area))
+    return [[shapely.get_coordinates(ring)[:-1] for ring in shapely.get_rings(polygon)] for polygon in polygons]
+
+
+def square(half_mm: float) -> shapely.Polygon:
+    """A square around the pad's centre, mm."""
+    return shapely.box(-half_mm, -half_mm, half_mm, half_mm)

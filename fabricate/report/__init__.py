@@ -1,0 +1,1 @@
+"""The mould on paper: drawings, laying guide, pictures, and its part of the report."""

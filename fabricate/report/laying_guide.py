@@ -1,0 +1,232 @@
+"""What the person at the bench needs: silicone to mix, fibres to cut, the order to lay them in, and a page of it all.
+
+Places are in the frame of the plan, the pad as it lies in the tray; the page has them as on the pad turned over.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from design.pad.curves import lengths
+from fabricate.mould.plan import Plan, overlap
+
+from .fibre_layers import fibre_name, layers
+
+SILICONE = "EcoFlex 00-20"
+DENSITY_G_PER_ML = 1.07
+"""Specific gravity of EcoFlex 00-20, as its maker states it."""
+
+SURPLUS_PERCENT = 10
+"""What sticks to the cup and the stick."""
+
+PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
+"""What a filament and a resin printer commonly print, and its density, g/ml."""
+
+_LONGEST_TABLE = 24
+"""More crossings than this leave no room for them on a page."""
+
+
+def document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
+    """The sections of the fabrication document that are about casting and laying, as JSON.
+
+    Args:
+        plan: of the mould.
+        mould_mm3: volume of the mould without its pins.
+
+    Returns:
+        "silicone": to mix. "adhesive": volume of the tracks that it seals, by step of laying.
+        "fibres": one each, in the order of their numbers. "laying_order": the numbers laid in each step, deep first.
+        "crossings": all of them, with the silicone left between the fibres.
+    """
+    return {
+        "silicone": _silicone(plan, mould_mm3),
+        "adhesive": _adhesive(plan),
+        "fibres": _fibres(plan),
+        "laying_order": [[fibre + 1 for fibre in layer.fibres] for layer in layers(plan)],
+        "crossings": _crossings(plan),
+    }
+
+
+def _silicone(plan: Plan, mould_mm3: float) -> dict[str, Any]:
+    """What fills the mould to the top of its walls: the box around it without the mould itself."""
+    volume_ml = (plan.tray.area * (plan.settings.mould.floor_mm + plan.silicone_mm) - mould_mm3) / 1000
+    part_g = round(volume_ml * DENSITY_G_PER_ML * (1 + SURPLUS_PERCENT / 100) / 2, 2)
+    return {
+        "name": SILICONE,
+        "thickness_mm": plan.silicone_mm,
+        "volume_ml": round(volume_ml, 4),
+        "density_g_per_ml": DENSITY_G_PER_ML,
+        "surplus_percent": SURPLUS_PERCENT,
+        "mass_g": round(2 * part_g, 2),
+        "part_a_g": part_g,
+        "part_b_g": part_g,
+    }
+
+
+def _adhesive(plan: Plan) -> dict[str, Any]:
+    """The volume of the tracks of every step; the fibres in them, and what crossing tracks share, are left in."""
+    steps = []
+    for layer in layers(plan):
+        tapered = layer.depth_mm / 2 if plan.settings.ridge_slope else 0
+        outline = plan.outline(layer.level, tapered) if tapered else plan.ridges[layer.level]
+        steps.append(overlap(outline, plan.silicone).area * layer.depth_mm / 1000)
+    return {"name": "silicone adhesive", "volume_ml": round(sum(steps), 4), "steps_ml": [round(ml, 4) for ml in steps]}
+
+
+def _fibres(plan: Plan) -> list[dict[str, Any]]:
+    mould = plan.settings.mould
+    courses = lengths(plan.pad) * plan.pad.pitch_mm + 2 * (mould.border_mm + mould.exit_mm)
+    return [
+        {
+            "number": fibre + 1,
+            "fibre": fibre_name(plan, fibre),
+            "level": level,
+            "depth_mm": plan.heights_mm[level],
+            "in_pad_mm": round(course, 2),
+            "cut_mm": round(course + 2 * mould.lead_mm, 2),
+        }
+        for fibre, (level, course) in enumerate(zip(plan.levels, courses.tolist(), strict=True))
+    ]
+
+
+def _crossings(plan: Plan) -> dict[str, Any]:
+    """A fibre lies on the bottom of its track: between two is what lies between the bottoms, less a fibre."""
+    table: list[list[Any]] = []
+    for crossing in plan.crossings:
+        pair = crossing.first, crossing.second
+        depths = [plan.heights_mm[plan.levels[fibre]] for fibre in pair]
+        gap = abs(depths[0] - depths[1]) - plan.settings.pad.fibre_diameter_mm
+        place = [round(x, 3) for x in plan.pad.to_mm(crossing.place).tolist()]
+        table.append([*(fibre_name(plan, fibre) for fibre in pair), *place, *depths, round(gap, 3)])
+    return {
+        "total": len(table),
+        "same_family": len(plan.clashes),
+        "gap_mm": min(row[-1] for row in table),
+        "columns": ["first", "second", "x_mm", "y_mm", "depth_first_mm", "depth_second_mm", "gap_mm"],
+        "table": table,
+    }
+
+
+def page(document: Mapping[str, Any]) -> str:
+    """`laying.md` from a whole fabrication document: a page to print and take to the bench."""
+    sections = {
+        "Print": _printing(document),
+        "Mix": _mixing(document["silicone"]),
+        "Cast": _casting(document),
+        "Lay": _laying(document),
+        "Crossings": _crossing_places(document),
+        "Checks": _remarks(document["findings"]),
+    }
+    lines = [line for title, lines in sections.items() for line in ("", f"## {title}", "", *lines)]
+    return "\n".join(["# How to make the pad", *lines, ""])
+
+
+def _printing(document: Mapping[str, Any]) -> Iterator[str]:
+    size = " x ".join(f"{side:.2f}".rstrip("0").rstrip(".") for side in document["size_mm"])
+    volume_ml, mould = document["mould_volume_ml"], document["settings"]["mould"]
+    resin = document["settings"]["printer"]["resin"]
+    plastic, density = PLASTICS[resin]
+    yield f"- The mould is {size} mm and takes {volume_ml:.1f} ml, {volume_ml * density:.0f} g of {plastic} if solid."
+    yield "- Print it as it lies, open side up, without supports."
+    if resin:
+        yield "- Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."
+    if mould["lid"]:
+        yield "- Print the lid as well."
+    if mould["conductive"]:
+        yield "- The mould called `conductive` is for casting a conductive material in place of fibres."
+
+
+def _mixing(silicone: Mapping[str, Any]) -> Iterator[str]:
+    parts = [round(silicone[key], 1) for key in ("part_a_g", "part_b_g")]
+    masses = [f"{mass:.1f} g" for mass in (*parts, sum(parts))]
+    yield from _table((silicone["name"], "part A", "part B", "together"), [("mass", *masses)])
+    yield ""
+    yield (
+        f"The mould holds {silicone['volume_ml']:.1f} ml, the pad is {silicone['thickness_mm']:g} mm thick."
+        f" The masses include {silicone['surplus_percent']:g} % for what stays in the cup."
+    )
+
+
+def _casting(document: Mapping[str, Any]) -> Iterator[str]:
+    mould = document["settings"]["mould"]
+    pour = "Pour it slowly into one corner of the level mould, up to the top of the walls."
+    if mould["spout"]:
+        pour = "Lay the lid on the level mould and pour through its spout until silicone rises in the vents."
+    elif mould["lid"]:
+        pour += " Lay the lid on: air and surplus leave by its vents."
+    yield "1. Stir part A and part B together. The pot life is 30 minutes: be done with pouring by then."
+    yield "2. Degas the mix in a vacuum until its bubbles have burst."
+    yield f"3. {pour}"
+    yield "4. Leave it for 4 hours at room temperature."
+    yield "5. Free the casting all along the walls, then pull it out from a corner."
+
+
+def _laying(document: Mapping[str, Any]) -> Iterator[str]:
+    mould, adhesive, fibres = document["settings"]["mould"], document["adhesive"], document["fibres"]
+    grid = len(fibres) // 2
+    read = " The numbers on it read the right way now." if mould["number_mm"] else ""
+    yield (
+        f"1. Turn the casting over, left to right: the tracks lie on top, mirrored.{read} The horizontal fibres"
+        f" ({_span(1, grid)}) start on the right, from near to far. The vertical ones ({_span(grid + 1, 2 * grid)})"
+        " start at the near side, from right to left."
+    )
+    yield (
+        "2. Cut the fibres and lay them in steps, the deepest first. Press each down to the bottom of its track, with"
+        f" {mould['lead_mm']:g} mm out at both ends."
+    )
+    yield (
+        f"3. After each step, fill the tracks over the fibres with {adhesive['name']}. Keep the tracks that cross above"
+        " clear. Let it cure before the next step."
+    )
+    yield ""
+    rows = []
+    for step, (numbers, volume_ml) in enumerate(zip(document["laying_order"], adhesive["steps_ml"], strict=True), 1):
+        for fibre in (fibres[number - 1] for number in numbers):
+            lengths_mm = (f"{fibre[key]:.1f} mm" for key in ("in_pad_mm", "cut_mm"))
+            sealed = f"{volume_ml:.2f} ml" if fibre["number"] == numbers[-1] else ""
+            rows.append((step, fibre["number"], fibre["fibre"], f"{fibre['depth_mm']:g} mm", *lengths_mm, sealed))
+    yield from _table(("step", "number", "fibre", "depth", "in the pad", "cut to", "then seal with"), rows)
+
+
+def _crossing_places(document: Mapping[str, Any]) -> Iterator[str]:
+    crossings = document["crossings"]
+    number = {fibre["fibre"]: fibre["number"] for fibre in document["fibres"]}
+    least = f"At least {crossings['gap_mm']:g} mm lie between two fibres." if crossings["gap_mm"] > 0 else "Some touch."
+    yield f"{crossings['total']} crossings, {crossings['same_family']} of them within a family. {least}"
+    yield ""
+    if crossings["total"] <= _LONGEST_TABLE:
+        yield "Places are from the middle of the pad turned over: x to the right, y away from you."
+        yield ""
+        rows = [
+            (f"{number[one]} and {number[two]}", f"{0 - x:.1f} mm", f"{y:.1f} mm", f"{a:g} and {b:g} mm", f"{gap:g} mm")
+            for one, two, x, y, a, b, gap in crossings["table"]
+        ]
+        yield from _table(("fibres", "x", "y", "depths", "between them"), rows)
+        return
+    counts = Counter((max(a, b), min(a, b), gap) for *_, a, b, gap in crossings["table"])
+    rows = [(f"{a:g} and {b:g} mm", f"{gap:g} mm", count) for (a, b, gap), count in sorted(counts.items())[::-1]]
+    yield from _table(("depths", "between the fibres", "crossings"), rows)
+    yield ""
+    yield "`fabrication.json` has the place of each as in the tray: its x has the other sign."
+
+
+def _remarks(findings: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    remarks = [finding for finding in findings if finding["status"] != "pass"]
+    yield f"{len(findings) - len(remarks)} of {len(findings)} checks pass." + (
+        " Look at the others:" if remarks else ""
+    )
+    if remarks:
+        yield ""
+    for finding in sorted(remarks, key=lambda finding: finding["status"]):
+        count = len(finding["places_mm"])
+        places = f" ({count} {'place' if count == 1 else 'places'}, see `fabrication.json`)" if count else ""
+        yield f"- **{finding['status']}** {finding['name']}: {finding['message']}{places}"
+
+
+def _table(head: Sequence[object], rows: Sequence[Sequence[object]]) -> Iterator[str]:
+    for row in (head, ["---"] * len(head), *rows):
+        yield f"| {' | '.join(map(str, row))} |"
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first} to {last}" if last > first else f"{first}"

@@ -1,0 +1,242 @@
+"""Pictures of a mould, of the tracks it leaves, and of any mesh with what the checks found on it: PNGs.
+
+All are seen from above. The same input gives the same bytes; files are small, for some are kept in git.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from design.common.figures import ALARM, FAINT, INK, PAPER
+from fabricate.checks.findings import Finding
+from fabricate.mould.plan import INTO_WALL_MM, Plan, polygon_rings
+
+from .fibre_layers import COLOURS, FAMILIES, Layer, layers
+from .relief import RIDGE, lit, mesh_relief, mould_relief
+from .track_drawings import SCALE_MM
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CARE = "#7b3fa0"
+"""Colour of what a check warns of: unlike both families, and unlike what fails."""
+
+_NUMBER, _EDGE, _GREY = "#8a867d", "#a7a49c", "#77746c"
+"""Greys of the numbers on the floor, of outlines, and of what stands beside a picture."""
+
+_RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
+"""Colours of a mesh from its lowest visible height to its highest."""
+
+_DPI = 100
+
+_PIXELS = 900
+"""Longer side of what is shown: 14 pixels a mm for the published pad, about six for a ridge."""
+
+_NARROWEST = 600
+"""Least width in pixels: room for a title and a legend."""
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 66, 24, 44, 62
+"""Pixels around it for title, ticks and axis labels; the rows of the legend come below."""
+
+_ROW, _COLUMNS = 21, 3
+"""Height of a row of the legend in pixels, and entries in one."""
+
+_FAIL_MARKS, _CARE_MARKS = "osp8H", "D^v<>"
+"""A mark of its own for every check, as long as they last."""
+
+
+def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
+    """Write the mould from above as PNG: colour tells family and height, shade the slope.
+
+    Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
+    """
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Patch
+
+    heights, shown = mould_relief(plan, _PIXELS)
+    order = layers(plan)
+    tints = [PAPER, FAINT, _NUMBER, *[PAPER] * len(plan.heights_mm)]
+    for layer in order:
+        tints[RIDGE + layer.level] = layer.colour
+    entries = [(PAPER, "floor"), (FAINT, f"wall, {plan.silicone_mm:g} mm")]
+    if any(plan.numbers):
+        entries.append((_NUMBER, f"mirrored numbers, {plan.settings.mould.shallow_ridge_height_mm:g} mm"))
+    entries += [(layer.colour, f"{FAMILIES[layer.family]} ridges, {layer.depth_mm:g} mm") for layer in order]
+    handles = [Patch(facecolor=colour, edgecolor=_GREY, label=label) for colour, label in entries]
+
+    left, low, right, high = plan.tray.bounds
+    depth_mm = plan.settings.mould.floor_mm + plan.silicone_mm
+    title = f"Mould from above, {right - left:.4g} x {high - low:.4g} x {depth_mm:.4g} mm"
+    sheet = _sheet((left, right, low, high), title, len(handles) + len(_marked(findings)))
+    sheet.show(lit(np.array(list(map(to_rgb, tints)))[shown], heights))
+    sheet.save(path, [*handles, *sheet.mark(findings)])
+
+
+def draw_tracks(plan: Plan, path: Path) -> None:
+    """Write the plan of the fibres as PNG, as they lie in the tray, seen from above.
+
+    Where two cross, the deeper one, which is nearer to whoever looks down into the tray, interrupts the other.
+    """
+    left, low, right, high = plan.silicone.bounds
+    room = 0.06 * (right - left)
+    order = layers(plan)
+    places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
+    title = f"Fibres as they lie in the tray, from above: {2 * plan.pad.grid} fibres, {len(plan.crossings)} crossings"
+    bounds = (left - room, right + room, low - room, high + room)
+    sheet = _sheet(bounds, title, len(order) + (len(places) > 0))
+    for area in (plan.silicone, plan.cavity):
+        for ring in (ring for polygon in polygon_rings(area) for ring in polygon):
+            sheet.axes.fill(*ring.T, facecolor=PAPER, edgecolor=_EDGE, linewidth=1, zorder=1)
+    handles = [h for layer in reversed(order) for h in _draw_layer(sheet, plan, layer)][::-1]
+    if len(places):
+        label = f"{len(places)} crossings of one family"
+        handles += sheet.axes.plot(*places.T, "o", mfc="none", mec=INK, ms=9, mew=1, label=label, zorder=4)
+    sheet.scale_bar()
+    sheet.save(path, handles)
+
+
+def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
+    """Write any mesh from above as PNG: colour tells the height, shade the slope, marks what the checks found.
+
+    Args:
+        vertices: (n, 3) mm, finite. triangles: (m, 3) vertex numbers, m >= 1.
+        findings: with places in the frame of the mesh. path: to write to.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    corners = np.asarray(vertices, dtype=float)
+    heights, extent = mesh_relief(corners, np.asarray(triangles, dtype=np.intp), _PIXELS)
+    seen = np.isfinite(heights)
+    low, high = (float(heights[seen].min()), float(heights[seen].max())) if seen.any() else (0.0, 0.0)
+    heights[~seen] = low
+    ramp = LinearSegmentedColormap.from_list("heights", _RAMP)
+    colours = lit(ramp((heights - low) / ((high - low) or 1.0))[..., :3], heights)
+    colours[~seen] = 1
+
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(corners, axis=0))
+    sheet = _sheet(extent, f"Mesh from above, {size} mm", len(_marked(findings)))
+    sheet.show(colours)
+    ground = float(corners[:, 2].min())
+    sheet.ramp(ramp, f"{low - ground:.3g} mm", f"{high - ground:.3g} mm above the lowest point")
+    sheet.save(path, sheet.mark(findings))
+
+
+def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
+    """Draw the fibres of a depth with their numbers; the first of their lines stands for them in the legend."""
+    from matplotlib.patheffects import withStroke
+    from shapely.ops import substring
+
+    width = max(1.3, sheet.points(plan.settings.pad.fibre_diameter_mm))
+    size = min(11.0, 0.5 * sheet.points(plan.pad.pitch_mm))
+    drawn = []
+    for fibre in layer.fibres:
+        line = substring(plan.lines[fibre], INTO_WALL_MM, plan.lines[fibre].length - INTO_WALL_MM)
+        edged = [withStroke(linewidth=width + 2, foreground=PAPER)]
+        style = {"linewidth": width, "color": layer.colour, "zorder": 2, "path_effects": edged}
+        drawn += sheet.axes.plot(*np.array(line.coords).T, label=_depth(layer), solid_capstyle="butt", **style)
+        (x, y), *_ = line.coords
+        away, place = ((0, -5), ("center", "top")) if layer.family else ((-5, 0), ("right", "center"))
+        sheet.axes.annotate(
+            str(fibre + 1), (x, y), away, textcoords="offset points", ha=place[0], va=place[1],
+            color=COLOURS[layer.family], fontsize=size, fontweight="bold",
+        )  # fmt: skip
+    return drawn[:1]
+
+
+def _depth(layer: Layer) -> str:
+    return f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
+
+
+def _marked(findings: Sequence[Finding]) -> list[Finding]:
+    """The findings that have something to show, those that fail first."""
+    worth = [finding for finding in findings if finding.status != "pass" and finding.places_mm]
+    return sorted(worth, key=lambda finding: finding.status)
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """A picture in the making: its axes are in mm and cover whole pixels.
+
+    Attributes:
+        extent: left, right, low and high of the axes, mm. pixels: their width and height.
+    """
+
+    figure: "Figure"
+    axes: "Axes"
+    extent: tuple[float, float, float, float]
+    pixels: tuple[int, int]
+
+    def points(self, length_mm: float) -> float:
+        """A length on the picture in typographic points."""
+        left, right, *_ = self.extent
+        return length_mm * self.pixels[0] / (right - left) * 72 / _DPI
+
+    def show(self, colours: np.ndarray) -> None:
+        """Fill the axes with colours (rows, columns, 3), 0..1."""
+        self.axes.imshow(colours, extent=self.extent, interpolation="nearest", aspect="auto")
+
+    def mark(self, findings: Sequence[Finding]) -> list[Any]:
+        """Mark the places of the findings that fail or warn; what explains the marks in the legend."""
+        marks = {"fail": (ALARM, iter(_FAIL_MARKS)), "warn": (CARE, iter(_CARE_MARKS))}
+        handles = []
+        for finding in _marked(findings):
+            colour, shapes = marks[finding.status]
+            shape, places = next(shapes, "X"), np.array(finding.places_mm).T
+            label = f"{finding.status}: {finding.name} ({len(finding.places_mm)})"
+            style = {"marker": shape, "mfc": "none", "linestyle": "none", "ms": 10, "zorder": 5}
+            self.axes.plot(*places, mec="white", mew=3.4, **style)  # keeps the mark off whatever it lies on
+            handles += self.axes.plot(*places, mec=colour, mew=1.5, label=label, **style)
+        return handles
+
+    def scale_bar(self) -> None:
+        """Put a bar of known length under the lower right corner."""
+        right, y = self.extent[1], -46 / self.pixels[1]
+        style = {"color": INK, "clip_on": False, "transform": self.axes.get_xaxis_transform()}
+        self.axes.plot([right - SCALE_MM, right], [y, y], "|-", linewidth=1.2, ms=8, **style)
+        self.axes.annotate(
+            f"{SCALE_MM:g} mm", (right - SCALE_MM, y), (-8, 0), xycoords=self.axes.get_xaxis_transform(),
+            textcoords="offset points", ha="right", va="center", fontsize=9, color=INK, annotation_clip=False,
+        )  # fmt: skip
+
+    def ramp(self, colours: Any, low: str, high: str) -> None:
+        """Put a bar of the colours of heights under the lower left corner."""
+        width, height = self.figure.get_size_inches() * _DPI
+        y = self.axes.get_position().y0 * height - 52
+        bar = self.figure.add_axes((_LEFT / width + 50 / width, y / height, 120 / width, 12 / height))
+        bar.imshow(np.linspace(0, 1, 120)[None], cmap=colours, aspect="auto")
+        bar.set(xticks=[], yticks=[])
+        bar.text(-0.05, 0.5, low, ha="right", va="center", fontsize=9, color=INK, transform=bar.transAxes)
+        bar.text(1.05, 0.5, high, ha="left", va="center", fontsize=9, color=INK, transform=bar.transAxes)
+
+    def save(self, path: Path, handles: list[Any]) -> None:
+        """Write the picture with its legend as PNG."""
+        from design.common.figures import save_figure
+
+        if handles:
+            style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.2, "handlelength": 1.6}
+            self.figure.legend(handles=handles, loc="lower center", ncols=_COLUMNS, **style)
+        save_figure(self.figure, path, _DPI)
+
+
+def _sheet(extent: tuple[float, float, float, float], title: str, entries: int) -> _Sheet:
+    """An empty picture of `extent` (left, right, low, high) mm with room for the legend's entries."""
+    from matplotlib.figure import Figure
+
+    left, right, low, high = extent
+    scale = _PIXELS / max(right - left, high - low)
+    wide, tall = max(1, round(scale * (right - left))), max(1, round(scale * (high - low)))
+    below = _BOTTOM + _ROW * math.ceil(entries / _COLUMNS) + 6 * (entries > 0)
+    width, height = _LEFT + max(wide, _NARROWEST) + _RIGHT, below + tall + _TOP
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    axes = figure.add_axes((_LEFT / width, below / height, wide / width, tall / height))
+    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x (mm)", ylabel="y (mm)")
+    axes.set_title(title, fontsize=11, color=INK, loc="left")
+    axes.tick_params(colors=_GREY, labelsize=9)
+    axes.spines[:].set_color(_EDGE)
+    return _Sheet(figure, axes, extent, (wide, tall))

@@ -1,1 +1,0 @@
-"""Run time against error of filters and localizers, beside plain ways of doing the same."""

@@ -1,0 +1,27 @@
+"""`padforge sense`: the edge where recordings come in and places go out."""
+
+import click
+
+from .analysis import recalibrate, robustness, size_curve
+from .calibration import calibrate, evaluate
+from .live import live
+from .locate import health, locate
+from .recordings import export, import_
+from .rig import doctor, record
+
+
+@click.group()
+def sense() -> None:
+    """Record presses, learn places from them and find new ones.
+
+    \b
+    padforge sense record --morphology out/pad/morphology.json
+    padforge sense calibrate out/pad/recording
+    padforge sense locate --model out/pad out/later/recording --out places.csv
+    """
+
+
+for command in (import_, export, calibrate, evaluate, locate, health):
+    sense.add_command(command)
+for command in (record, doctor, live, recalibrate, robustness, size_curve):
+    sense.add_command(command)

@@ -1,0 +1,1 @@
+"""Which fibres are at fault, told from readings alone."""

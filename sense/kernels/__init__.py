@@ -1,7 +1,0 @@
-"""Compiled kernels: pure functions on arrays of readings."""
-
-from pathlib import Path
-
-from design.compiled import forget_outdated
-
-forget_outdated(Path(__file__).parent)

@@ -1,0 +1,1 @@
+"""Touches as they happen."""

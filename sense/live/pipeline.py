@@ -1,0 +1,270 @@
+"""From readings as they come to places as they are pressed: the pipeline behind `padforge sense live`.
+
+Readings go in, in blocks of any size. Out comes what they bring to light: where each press was, first from the few
+readings that one localizer can do with, refined by others, and which fibres are bad. Those are left out from the next
+press on.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError, instance, real, shown, whole
+from sense.health.health_model import HealthModel
+from sense.health.monitor import Finding, Monitor
+from sense.localizer.features import REST, bridged, press_inputs
+from sense.localizer.localizer import RATE_TOLERANCE, Localizer
+from sense.localizer.normalization import Scaled
+from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, stream_of
+from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+
+from .press_buffer import DONE, NEEDS, Press, Ring
+
+TRAIL = 12
+"""Presses that are kept to be shown."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Where a press was, by one localizer.
+
+    Attributes:
+        press: its number, counted from 0. time_s: of its touch, by the clock of the readings.
+        features: which the localizer takes. final: whether no other localizer will refine it.
+        x_mm, y_mm: place. sd_x_mm, sd_y_mm: standard deviations.
+        r50_mm, r90_mm: radius around the place that holds the press in 50 % and in 90 % of cases.
+        lost: fibres that were left out, by index.
+    """
+
+    press: int
+    time_s: float
+    features: str
+    final: bool
+    x_mm: float
+    y_mm: float
+    sd_x_mm: float
+    sd_y_mm: float
+    r50_mm: float
+    r90_mm: float
+    lost: tuple[int, ...]
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        return (
+            f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, "
+            f"within {self.r50_mm:.1f} mm at 50 %, {self.r90_mm:.1f} mm at 90 % ({self.features})"
+        )
+
+
+Event = Estimate | Finding
+
+
+class Live:
+    """Follows the readings of a pad. Memory is bounded, however long it runs and a press is held.
+
+    Attributes:
+        presses: the latest estimates, one for each of the last `TRAIL` presses, oldest first.
+        findings: all that was found of the fibres, oldest first.
+    """
+
+    def __init__(
+        self, localizers: Sequence[Localizer], health: HealthModel | None, fibres: int, rate_hz: float
+    ) -> None:
+        """Get ready for readings of so many fibres, `rate_hz` a second.
+
+        Args:
+            localizers: of that pad, at least one; the one that needs the fewest readings answers first.
+            health: of that pad; without it no fibre is found bad.
+
+        Raises:
+            InputError: there is none, or one was learnt from other fibres, or at another rate.
+        """
+        fibres, rate_hz = whole("fibres", fibres, 1, MAX_FIBRES), real("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
+        if not isinstance(localizers, Sequence) or not localizers:
+            raise InputError(f"localizers are {shown(localizers)}, expected at least one")
+        self._monitor = None if health is None else Monitor(health)
+        models = [instance("localizers", each, Localizer) for each in localizers]
+        for model in (*models, *([] if health is None else [health])):
+            _refuse_other(model, fibres, rate_hz)
+        self._localizers = sorted(localizers, key=lambda each: NEEDS[each.features][::-1])
+        self._usual = _usual(self._localizers[-1])
+        self._finder = Finder(fibres)
+        self._ring = Ring(1 + fibres)
+        self._press: Press | None = None
+        self._count = self._free = 0
+        self.presses: deque[Estimate] = deque(maxlen=TRAIL)
+        self.findings: list[Finding] = []
+
+    @property
+    def pressed(self) -> bool:
+        """Whether the pad is pressed now."""
+        return self._press is not None and self._press.lifted is None
+
+    @property
+    def lost(self) -> tuple[int, ...]:
+        """Fibres that are left out, by index."""
+        return () if self._monitor is None else self._monitor.lost
+
+    def feed(self, times_s: Array, readings: Array) -> list[Event]:
+        """Take readings; what they bring to light does not depend on how they are cut into blocks.
+
+        Args:
+            times_s: (n,) ascending, s. readings: (n, C) volts, NaN where missing.
+
+        Returns:
+            Estimates and findings, in the order in which they were made.
+
+        Raises:
+            InputError: as `limits.stream_of`, or times before those that were fed last.
+        """
+        events: list[Event] = []
+        times, rows = stream_of(times_s, readings, len(self._usual))
+        if len(times) and self._ring.end and not times[0] > self._ring.rows(self._ring.end - 1, self._ring.end)[0, 0]:
+            raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
+        for row in np.column_stack([times, rows]):
+            self._ring.append(row)
+            for change in self._finder.feed(row[:1], row[None, 1:]):
+                if change.down:
+                    events += self._begin(change.reading)
+                elif self._press is not None:
+                    self._press.let_go(max(self._sent(change.reading, SENT_UP_S), self._press.touched))
+            events += self._advance()
+        return events
+
+    def view(self) -> dict[str, Any]:
+        """What there is to show now, as JSON.
+
+        Returns:
+            "pressed"; "fibres", for each its "swing" (from its rest, as a share of the usual; None where there is no
+            reading) and "state"; "presses", see `Estimate`, and "text"; "findings", a line each.
+        """
+        swings = self._swings()
+        states = self._states(np.isnan(swings))
+        return {
+            "pressed": self.pressed,
+            "fibres": [
+                {"swing": None if np.isnan(swing) else round(swing, 3), "state": state}
+                for swing, state in zip(swings.tolist(), states, strict=True)
+            ],
+            "presses": [asdict(press) | {"text": press.text} for press in self.presses],
+            "findings": [finding.text for finding in self.findings],
+        }
+
+    def _swings(self) -> Array:
+        """(C,) how far each fibre is from its rest, as a share of the usual; NaN where there is no reading."""
+        end = self._ring.end
+        if end == 0:
+            return np.full(len(self._usual), np.nan)
+        rest = self._rest(end) if self._press is None else self._press.rest
+        return (self._ring.rows(end - 1, end)[0, 1:] - rest) / self._usual
+
+    def _states(self, missing: NDArray[np.bool_]) -> list[str]:
+        kinds = {fibre: finding.kind for finding in self.findings for fibre in finding.fibres}
+        usual = "unwatched" if self._monitor is None else "sound"
+        return [
+            kinds.get(fibre, "dead") if fibre in self.lost else "missing" if gone else usual
+            for fibre, gone in enumerate(missing)
+        ]
+
+    def _rest(self, at: int) -> Array:
+        """(C,) V, mean of the readings just before index `at`."""
+        return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
+
+    def _sent(self, reading: int, delay_s: float) -> int:
+        """Index of the reading at which a probe would have been sent that shows its effect `delay_s` later."""
+        times_s = self._ring.rows(0, reading + 1)[:, 0]
+        return reading + 1 - len(times_s) + int(np.searchsorted(times_s, times_s[-1] - delay_s))
+
+    def _begin(self, touched: int) -> list[Event]:
+        """The pad is touched; what was still to come of the press before comes now."""
+        begun = self._sent(touched, SENT_DOWN_S)
+        events = self._advance(begun)
+        begun = max(begun, self._free + 1)
+        time_s = float(self._ring.rows(touched, touched + 1)[0, 0])
+        self._press = Press(self._count, time_s, touched, begun, self._free, self._rest(begun))
+        self._count += 1
+        return events
+
+    def _advance(self, over: int | None = None) -> list[Event]:
+        """Do with the press under way what the readings allow, or all there is to do if it was over at index `over`."""
+        press, now = self._press, self._ring.end
+        if press is None:
+            return []
+        if over is not None:
+            now = max(over, press.begun + 1)
+            if press.lifted is None:
+                press.let_go(over)
+        press.keep_opening(self._ring)
+        events: list[Event] = []
+        for localizer in self._localizers[press.told :]:
+            enough = press.enough(localizer.features)
+            if enough is None or (enough > now and over is None):
+                break
+            press.told += 1
+            events.append(self._estimate(press, localizer, min(enough, now)))
+        if press.lifted is not None and (now >= press.lifted + DONE or over is not None):
+            events += self._judge(press, min(press.lifted + DONE, now))
+            self._free, self._press = press.lifted, None
+        return events
+
+    def _estimate(self, press: Press, localizer: Localizer, end: int) -> Estimate:
+        readings, begun, lifted, free = press.excerpt(self._ring, end)
+        # The press before stands in by its end alone: the rest of this one reaches back no further.
+        begins, ends = ([free - 1, begun], [free, lifted]) if free > 0 else ([begun], [lifted])
+        raw = press_inputs(readings, np.array(begins), np.array(ends), localizer.features)[-1:]
+        presses = localizer.scaling.inputs(raw)
+        alive = presses.alive.copy()
+        alive[:, list(self.lost)] = False
+        found = localizer.locate(Scaled(presses.inputs, alive))
+        x, y, sd_x, sd_y = np.concatenate([found.places_mm[0], found.sd_mm[0]]).tolist()
+        estimate = Estimate(
+            press=press.number,
+            time_s=press.time_s,
+            features=localizer.features,
+            final=localizer is self._localizers[-1],
+            x_mm=x,
+            y_mm=y,
+            sd_x_mm=sd_x,
+            sd_y_mm=sd_y,
+            r50_mm=float(found.r50_mm[0]),
+            r90_mm=float(found.r90_mm[0]),
+            lost=tuple(np.flatnonzero(~alive[0]).tolist()),
+        )
+        if self.presses and self.presses[-1].press == press.number:
+            self.presses.pop()
+        self.presses.append(estimate)
+        return estimate
+
+    def _judge(self, press: Press, end: int) -> list[Finding]:
+        """What a press that is over says of the fibres."""
+        if self._monitor is None:
+            return []
+        readings, begun, lifted, free = press.excerpt(self._ring, end)
+        first = max(begun + REST[0], free)
+        findings = self._monitor.update(readings[first:], begun - first, lifted - first)
+        self.findings += findings
+        return findings
+
+
+def _usual(localizer: Localizer) -> Array:
+    """(C,) V, what a fibre's answer to a press goes up to."""
+    usual = (np.abs(localizer.scaling.centre) + 2 * localizer.scaling.spread).max(axis=1)
+    return np.where(usual > 0, usual, 1.0)
+
+
+def _refuse_other(model: Localizer | HealthModel, fibres: int, rate_hz: float) -> None:
+    name = "the localizer" if isinstance(model, Localizer) else "health"
+    if model.fibres != fibres:
+        raise InputError(f"readings are of {fibres} fibres, {name} was learnt from {model.fibres}")
+    if abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
+        raise InputError(
+            f"readings come {rate_hz:.3g} a second, allowed is {model.rate_hz:.3g}, at which {name} was learnt, "
+            f"within {RATE_TOLERANCE:.0%}"
+        )

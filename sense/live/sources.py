@@ -1,0 +1,100 @@
+"""Where live readings come from: a converter, the simulated pad of a model, or a recording that is replayed."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design import Contact, Morphology
+from design.common.errors import InputError, real
+from design.common.files import read_json
+from design.common.settings import validated
+from sense.recordings.recorder import FORMAT, START
+from sense.recordings.recording import Recording
+from sense.rig.devices import Converter
+from sense.rig.emulators.live_pad import DemoConverter
+from sense.rig.session.averaging import Averager
+from sense.settings import Rig
+
+Array = NDArray[np.float64]
+Block = tuple[Array, Array]
+"""Times (n,) in s, and readings (n, C) in V."""
+
+PAUSE_S = 0.01
+"""Between two looks at a converter, or at the clock of a replay."""
+MOST_ROWS = 64
+"""Readings that are replayed at a time, so that a fast replay can be watched too."""
+RECORDED = "recording"
+"""The recording that a model was learnt from, in the folder of the model."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Readings as they come.
+
+    Attributes:
+        fibres: C. rate_hz: readings a second. blocks: of readings, as they come; they may be empty.
+    """
+
+    fibres: int
+    rate_hz: float
+    blocks: Iterator[Block]
+
+
+def connected(converter: Converter, rate_hz: float) -> Source:
+    """The readings of a converter, which is connected now, averaged to about `rate_hz`; without end.
+
+    Raises:
+        RigFault: as the converter does, now or while its readings are taken.
+    """
+    identity = converter.connect()
+    ratio = max(1, round(identity["rate_hz"] / rate_hz))
+    averager = Averager(ratio, identity["channels"])
+
+    def blocks() -> Iterator[Block]:
+        while True:
+            yield averager.feed(converter.read())
+            time.sleep(PAUSE_S)
+
+    return Source(identity["channels"], identity["rate_hz"] / ratio, blocks())
+
+
+def replayed(recording: Recording, speed: float) -> Source:
+    """The readings of a recording, `speed` times as fast as they were taken; InputError for a speed that is none."""
+    speed = real("speed", speed, 1e-9, np.inf)
+    due_s = (recording.times_s - recording.times_s[0]) / speed
+
+    def blocks() -> Iterator[Block]:
+        started_s, done = time.monotonic(), 0
+        while done < len(due_s):
+            due = int(np.searchsorted(due_s, time.monotonic() - started_s, side="right"))
+            end = min(due, done + MOST_ROWS)
+            yield recording.times_s[done:end], recording.readings[done:end]
+            if end == due:
+                time.sleep(PAUSE_S)
+            done = end
+
+    return Source(recording.fibres, recording.rate_hz, blocks())
+
+
+def simulated(model: Path) -> DemoConverter:
+    """The pad that the model in this folder was learnt from, where that was a simulated one.
+
+    Raises:
+        InputError: its recording is not beside it, or of another kind.
+    """
+    path = model / RECORDED / START
+    if not path.is_file():
+        raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")
+    source = read_json(path, FORMAT).get("source")
+    if not isinstance(source, dict) or source.get("kind") != "simulated":
+        raise InputError(f"{path}: of no simulated pad, but --rig simulated needs one; --replay shows a recording")
+    try:
+        pad = Morphology(np.array(source["morphology"]["knots"]), source["morphology"]["pitch_mm"])
+        contact, rig = dict(source["contact"]), dict(source["rig"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
+    return DemoConverter(pad, validated(Rig, rig, f"{path}: rig"), validated(Contact, contact, f"{path}: contact"))

@@ -1,0 +1,1 @@
+"""The localizer: from presses to places."""

@@ -1,0 +1,1 @@
+"""How a localizer is learnt, renewed and judged."""

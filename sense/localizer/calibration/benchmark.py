@@ -1,0 +1,195 @@
+"""Test error of localizers against the time they train, on a simulated recording, for two kinds of inputs.
+
+The published network is trained three ways, by budgets: Levenberg-Marquardt, as published; L-BFGS; and Adam. The masked
+network, which bears lost fibres as well, is trained as in a calibration. All learn from the same presses.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design import Morphology
+from design.benchmarking.harness import Bench, Trial
+from design.common.computing import one_torch_thread
+from sense import settings
+from sense.localizer.features import press_inputs
+from sense.localizer.network import Floats, Weights, forward, masked, pooled
+from sense.localizer.normalization import Scaling
+from sense.recordings.recording import Recording
+from sense.recordings.simulation import simulate
+
+from .published_training import HIDDEN
+
+PRESSES, TEST = 1500, 300
+EPOCHS = (3, 10, 30, 100)
+"""Steps of Levenberg-Marquardt at most; it looks at all presses in each."""
+ITERATIONS = (30, 100, 300)
+"""Of L-BFGS, which does likewise."""
+PASSES = (30, 100, 300)
+"""Of Adam, through batches of BATCH presses."""
+STEPS = (50, 200, 800)
+"""Of the masked network, one member of its usual size."""
+FEATURES = ("published", "full")
+MARQUARDT = ("published",)
+"""Inputs that Levenberg-Marquardt is tried on: with F times as many, each of its steps takes F^2 to F^3 as long."""
+BATCH, ADAM_RATE = 128, 3e-3
+
+Array = NDArray[np.float64]
+Predict = Callable[[Array], Array]
+
+
+def trials() -> Iterator[Trial]:
+    """Trainings on PRESSES simulated presses less TEST, in every way, and the time to find one press."""
+    with one_torch_thread():
+        for features in FEATURES:
+            yield from _trainings(features)
+        yield from _predictions()
+
+
+@cache
+def _recording() -> Recording:
+    return simulate(Morphology.random(3, knots=5, seed=0), settings.Rig(presses=PRESSES, seed=0))
+
+
+def _trainings(features: str) -> Iterator[Trial]:
+    recording = _recording()
+    raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
+    scaling, table = Scaling.fit(raw[:-TEST], recording.presses_mm[:-TEST])
+    scaled, targets = scaling.inputs(raw), scaling.targets(recording.presses_mm)
+    flat = scaled.inputs.reshape(len(scaled), -1).astype(np.float64)
+    x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
+
+    def judge(predict: Predict) -> Mapping[str, float]:
+        off = scaling.places_mm(predict(flat[-TEST:]).astype(np.float32)) - recording.presses_mm[-TEST:]
+        return {"error": float(np.hypot(*off.T).mean())}
+
+    ways: dict[str, tuple[tuple[int, ...], Callable[[int], Predict]]] = {
+        "LM": (EPOCHS if features in MARQUARDT else (), partial(_marquardt, x, y)),
+        "L-BFGS": (ITERATIONS, partial(_bfgs, x, y)),
+        "Adam": (PASSES, partial(_adam, x, y)),
+        "masked": (STEPS, partial(_masked, scaled.inputs[:-TEST], targets[:-TEST], table)),
+    }
+    for way, (sizes, train) in ways.items():
+        for size in sizes:
+            yield Trial(features, way, size, partial(train, size), judge)
+
+
+def _held(presses: int) -> NDArray[np.bool_]:
+    """(Q,) presses that end a training, where it looks at some, and are not learnt from."""
+    return np.arange(presses) % 12 == 0
+
+
+def _marquardt(x: Array, y: Array, epochs: int) -> Predict:
+    from design.evaluation.levenberg_marquardt import fit
+
+    held = _held(len(x))
+    return fit(x[~held], y[~held], np.random.default_rng(0), HIDDEN, epochs, check=(x[held], y[held]))
+
+
+class _Published:
+    """The published network with its squared error, for optimisers that are given slopes."""
+
+    def __init__(self, x: Array, y: Array) -> None:
+        import torch
+
+        from design.evaluation.levenberg_marquardt import first_weights
+
+        rng = np.random.default_rng(0)
+        weights = first_weights(np.ptp(x, axis=0) > 0, HIDDEN, rng), rng.uniform(-0.5, 0.5, (y.shape[1], HIDDEN + 1))
+        self.weights = [torch.from_numpy(part).requires_grad_() for part in weights]
+        self._x, self._y = torch.from_numpy(np.column_stack([x, np.ones(len(x))])), torch.from_numpy(y)
+
+    def slope(self, rows: Any = slice(None)) -> Any:
+        """The mean squared error of some presses; leaves its slope in the weights."""
+        hidden, output = self.weights
+        hidden.grad = output.grad = None
+        neurons = (self._x[rows] @ hidden.T).tanh()
+        loss = (neurons @ output[:, :-1].T + output[:, -1] - self._y[rows]).square().mean()
+        loss.backward()
+        return loss
+
+    def __call__(self, x: Array) -> Array:
+        hidden, output = (weight.detach().numpy() for weight in self.weights)
+        return np.tanh(x @ hidden[:, :-1].T + hidden[:, -1]) @ output[:, :-1].T + output[:, -1]
+
+
+def _bfgs(x: Array, y: Array, iterations: int) -> Predict:
+    import torch
+
+    network = _Published(x, y)
+    torch.optim.LBFGS(
+        network.weights, max_iter=iterations, tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe"
+    ).step(network.slope)
+    return network
+
+
+def _adam(x: Array, y: Array, passes: int) -> Predict:
+    import torch
+
+    network, generator = _Published(x, y), torch.Generator().manual_seed(0)
+    optimizer = torch.optim.Adam(network.weights, lr=ADAM_RATE)
+    for _ in range(passes):
+        for rows in torch.randperm(len(x), generator=generator).split(BATCH):
+            network.slope(rows)
+            optimizer.step()
+    return network
+
+
+def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
+    from .training import Samples, train
+
+    alive = np.ones(inputs.shape[:2], dtype=bool)
+    held = _held(len(inputs))
+    shown, check = (Samples(inputs[part], alive[part], targets[part]) for part in (~held, held))
+    batches = max(1, int((~held).sum()) // settings.Localizer().batch)
+    options = settings.Localizer(members=1, epochs=-(-steps // batches))
+    weights = train(shown, check, table, options, np.random.default_rng(0), lambda done, total: None)
+
+    return lambda x: _places(weights, x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)).astype(np.float64)
+
+
+def _predictions() -> Iterator[Trial]:
+    """Finding one press with networks of the usual size; what they were taught does not matter for it."""
+    rng = np.random.default_rng(0)
+    one = _scaled("published")[:1].reshape(1, -1).astype(np.float64)
+    published = _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
+    yield Trial("one press", "published", 0, partial(published, one))
+    inputs = _scaled("full")[:1]
+    weights = _untrained(inputs.size + inputs.shape[1])
+    yield Trial("one press", "masked", 0, partial(_places, weights, inputs))
+
+
+def _scaled(features: str) -> Floats:
+    recording = _recording()
+    raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
+    return Scaling.fit(raw, recording.presses_mm)[0].inputs(raw).inputs
+
+
+def _places(weights: Weights, inputs: Floats) -> Floats:
+    return pooled(forward(weights, masked(inputs, np.array(True))))[0]
+
+
+def _untrained(entries: int) -> Weights:
+    """A masked network of the usual size as training begins."""
+    import torch
+
+    from .training import initial
+
+    options, generator = settings.Localizer(), torch.Generator().manual_seed(0)
+    members = [initial(entries, options, generator) for _ in range(options.members)]
+    axis = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
+    return {name: torch.cat([each[name] for each in members], dim=axis[name]).detach().numpy() for name in axis}
+
+
+BENCH = Bench(
+    "localizer",
+    trials,
+    "mean error (mm)",
+    ("LM", EPOCHS[-1]),
+    ("masked", STEPS[1]),
+    plain=("published", "L-BFGS", "Adam"),
+    prepare=lambda: [train(np.zeros((4, 1)), np.zeros((4, 2)), 1) for train in (_bfgs, _adam)],
+)

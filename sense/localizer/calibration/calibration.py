@@ -1,0 +1,166 @@
+"""Calibration: learn places from a recording, and say how far off they are on presses never learnt from."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError, instance
+from design.common.files import provenance
+from design.common.profiling import stage
+from design.common.settings import section, validated
+from design.criteria.fibre_loss import lost_subsets
+from sense import settings
+from sense.localizer.evaluation import conformal, evaluate
+from sense.localizer.features import press_inputs
+from sense.localizer.localizer import Localizer
+from sense.localizer.network import refuse_unsound
+from sense.localizer.normalization import Scaled, Scaling
+from sense.recordings.recording import Recording
+
+LEAST_TRAINING = 3
+"""Presses needed to learn from and to check on: of fewer, the span is none."""
+
+CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
+"""Share of the presses of training that end it and find the radii; of the published method, 15 % of all."""
+
+SUBSETS = 32
+"""Sets of lost fibres of a size that the radii are found on, at most."""
+
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.int64]
+
+
+def calibrate(
+    recording: Recording,
+    options: settings.Localizer | None = None,
+    *,
+    split: str | None = None,
+    seed: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Localizer, dict[str, Any]]:
+    """Train a localizer on a part of the presses and test it on the rest.
+
+    Test presses enter nothing but the test, which looks at them once: not the scaling, not the training, not its
+    length, not the radii. Presses whose place is not known are left out.
+
+    Args:
+        recording: readings and presses with known places.
+        options: how to learn; the defaults if None. split, seed: win over those of `options`.
+        progress: called with (steps done, steps in all).
+
+    Returns:
+        The localizer, and the document of `calibration.json`.
+
+    Raises:
+        InputError: an option out of range, too few presses to hold a share back, or a training that diverged.
+    """
+    instance("recording", recording, Recording)
+    options = section("options", options, settings.Localizer)
+    given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
+    options = validated(settings.Localizer, {**options.model_dump(), **given}, "[localizer]")
+    if options.method == "published":
+        options = options.model_copy(update={"features": "published"})
+    rng = np.random.default_rng(options.seed)
+    known = np.flatnonzero(recording.known)
+    training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
+    made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
+    made_by["inputs"] = {"recording": recording.digest}
+    from design.common.computing import one_torch_thread
+
+    with stage("train"), one_torch_thread():
+        localizer = learn(recording, training, options, rng, progress)
+    localizer = replace(localizer, split=options.split, test=tuple(test.tolist()), provenance=made_by)
+    levels = range(min(options.lost, recording.fibres - 1) + 1) if options.method == "masked" else (0,)
+    with stage("evaluate"):
+        document = evaluate(localizer, recording, levels)
+    document |= {"training_presses": len(training), "settings": options.model_dump()}
+    return replace(localizer, errors=document["errors"]), document
+
+
+def learn(
+    recording: Recording,
+    training: Indices,
+    options: settings.Localizer,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Localizer:
+    """Train a localizer on the presses `training` of a recording, by index.
+
+    Of them, a share is not trained on but ends the training and finds the radii: drawn at random, or the last ones, as
+    the split is. Presses are shown as they were commanded and, once more, as they would be found in the readings.
+
+    Raises:
+        InputError: the training diverged.
+    """
+    taught, checked = (
+        training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
+    )
+    edges = recording.begun, recording.lifted
+    raw = press_inputs(recording.readings, *edges, options.features)
+    shown_raw, shown_mm, held_mm = raw[taught], recording.presses_mm[taught], recording.presses_mm[checked]
+    if options.method == "masked":
+        from sense.processing.press_alignment import felt  # compiled, which takes a moment to load
+
+        again = felt(recording.readings, recording.times_s, *edges)
+        shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
+        shown_mm = np.concatenate([shown_mm, shown_mm])
+    scaling, table = Scaling.fit(shown_raw, shown_mm)
+    held_presses = scaling.inputs(raw[checked])
+    from .training import Samples, train  # torch, seconds to import, is needed here only
+
+    shown, held = (
+        Samples(presses.inputs, presses.alive, scaling.targets(places))
+        for presses, places in ((scaling.inputs(shown_raw), shown_mm), (held_presses, held_mm))
+    )
+    if options.method == "masked":
+        weights = train(shown, held, table, options, rng, progress)
+    else:
+        from .published_training import train_published
+
+        weights = train_published(shown, held, rng)
+    try:
+        refuse_unsound(weights, scaling.entries(options.method), options.method)
+    except InputError as error:
+        raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
+    localizer = Localizer(
+        weights=weights,
+        scaling=scaling,
+        table=table,
+        method=options.method,
+        features=options.features,
+        factors=np.ones((1, 3)),
+        rate_hz=recording.rate_hz,
+        learnt_from=recording.digest,
+    )
+    levels = min(options.lost, recording.fibres - 1) + 1 if options.method == "masked" else 1
+    return replace(localizer, factors=radii(localizer, held_presses, held_mm, levels))
+
+
+def radii(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Array:
+    """(levels, 3) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
+    plain = replace(localizer, factors=np.ones((1, 3)))
+    by_level = (lost_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
+    found = ([plain.locate(presses, subset) for subset in subsets] for subsets in by_level)
+    return np.clip([conformal(each, places_mm) for each in found], 1e-6, 1e6)
+
+
+def split_presses(
+    presses: int, split: str, share: float, rng: np.random.Generator, least: int = LEAST_TRAINING
+) -> tuple[Indices, Indices]:
+    """Indices (ascending) of the presses to learn from and of those held back: drawn at random, or the last.
+
+    Raises:
+        InputError: a share of so few presses leaves none on one side, or fewer than `least` to learn from.
+    """
+    held = max(round(share * presses), 1 if least < LEAST_TRAINING else 0)
+    if not 1 <= held <= presses - least:
+        raise InputError(
+            f"recording has {presses} presses of known place: a share of {share:g} holds {held} back, "
+            f"expected at least 1, and {least} to learn from"
+        )
+    order = rng.permutation(presses) if split == "random" else np.arange(presses)
+    return np.sort(order[:-held]), np.sort(order[-held:])

@@ -1,0 +1,205 @@
+"""Robustness to lost fibres: the one masked network, and the published way, another network for every set of losses.
+
+Both are tested on the same presses, so their errors stand side by side. The published way (paper, figure 9 and
+experiment) knows beforehand which fibres will be lost, and trains on the others alone: 42 networks for 6 fibres of
+which up to 3 are lost.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.checkpoints import Checkpoints, State
+from design.common.errors import InputError, instance, path, shown, whole
+from design.common.files import provenance
+from design.common.settings import section
+from design.criteria.fibre_loss import lost_subsets
+from sense import settings
+from sense.localizer.evaluation import by_place, errors_by_loss, held_back
+from sense.localizer.localizer import Found, Localizer
+from sense.processing.limits import MAX_FIBRES
+from sense.recordings.recording import Recording
+
+from .calibration import learn, split_presses
+
+FORMAT = "padforge-robustness/1"
+ONE, MANY = "one network", "retrained"
+"""The two ways, as the document calls them."""
+
+Indices = NDArray[np.int64]
+Lost = tuple[int, ...]
+
+
+def robustness(
+    recording: Recording,
+    localizer: Localizer | None = None,
+    *,
+    retrain: bool = False,
+    options: settings.Localizer | None = None,
+    lost: int = 3,
+    keep_in: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Errors for every set of lost fibres, of one network, of networks retrained for each set, or of both.
+
+    Args:
+        recording: with presses of known place. Those that `localizer` held back are the test if it learnt from this
+            recording, else the share of them that `options` hold back.
+        localizer: the one network; None for the second way alone. retrain: whether the second way is wanted.
+        options: split, share and seed; the defaults if None.
+        lost: fibres that are lost at once, at most; no more than leave one.
+        keep_in: folder for the networks that are done, from which a run that was broken off goes on; removed when all
+            are done.
+        progress: called with (networks done, networks in all).
+
+    Returns:
+        A document with "ways": for each, "errors" and "by_subset" as `evaluate` gives them, and "maps", errors by place
+        without the worst set of each size; and "test_presses".
+
+    Raises:
+        InputError: neither way wanted, too few presses, a recording seen in a recalibration or that does not suit the
+            localizer, a localizer that knows no lost fibres, or networks in `keep_in` of other settings.
+    """
+    instance("retrain", retrain, bool)
+    if localizer is None and not retrain:
+        raise InputError("neither a localizer nor retraining is given, expected one of them or both")
+    instance("recording", recording, Recording)
+    if localizer is not None:
+        instance("localizer", localizer, Localizer)
+    keep_in = None if keep_in is None else path("keep_in", keep_in)
+    options, lost = section("options", options, settings.Localizer), whole("lost", lost, 0, MAX_FIBRES)
+    training, test = _presses(recording, localizer, options)
+    levels = range(min(lost, recording.fibres - 1) + 1)
+    places_mm = recording.presses_mm[test]
+    ways: dict[str, Any] = {}
+    if localizer is not None:
+        locate = partial(localizer.locate, localizer.inputs(recording)[test])
+        ways[ONE] = _way(recording.fibres, levels, locate, places_mm)
+    if retrain:
+        about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
+        kept = Checkpoints(keep_in, {"robustness": about}) if keep_in else None
+        found = _retrained(recording, training, test, options, levels, kept, progress)
+        ways[MANY] = _way(recording.fibres, levels, found.__getitem__, places_mm)
+        if kept:
+            kept.clear()
+    made_by = provenance("padforge sense robustness", options.seed, packages=("torch",))
+    made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
+    return {
+        "format": FORMAT,
+        "split": options.split if localizer is None else localizer.split,
+        "training_presses": len(training),
+        "test_presses": len(test),
+        "ways": ways,
+        "provenance": made_by,
+    }
+
+
+def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm: NDArray[np.float64]) -> dict[str, Any]:
+    rows, by_subset = errors_by_loss(fibres, levels, locate, places_mm)
+    worst = [
+        max((each for each in by_subset if len(each["lost"]) == level), key=lambda each: each["mean_mm"])["lost"]
+        for level in levels
+    ]
+    maps = [{"lost": lost, "by_place": by_place(locate(tuple(lost)).places_mm, places_mm)} for lost in worst]
+    return {"errors": rows, "by_subset": by_subset, "maps": maps}
+
+
+def _presses(recording: Recording, localizer: Localizer | None, options: settings.Localizer) -> tuple[Indices, Indices]:
+    """Presses of known place to train on and to test on."""
+    known, digest = np.flatnonzero(recording.known), recording.digest
+    if localizer is not None and digest in localizer.recalibrated_by:
+        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
+    if localizer is not None and digest == localizer.learnt_from:
+        test = held_back(localizer, recording)
+        return np.setdiff1d(known, test), test
+    rng = np.random.default_rng(options.seed)
+    training, test = split_presses(len(known), options.split, options.test_share, rng)
+    return known[training], known[test]
+
+
+def _retrained(
+    recording: Recording,
+    training: Indices,
+    test: Indices,
+    options: settings.Localizer,
+    levels: range,
+    kept: Checkpoints | None,
+    progress: Callable[[int, int], None],
+) -> dict[Lost, Found]:
+    """What the network of each set of lost fibres finds for the test presses; finished ones are not made again."""
+    subsets = [subset for level in levels for subset in lost_subsets(recording.fibres, level)]
+    states = kept.begin(resume=True) if kept else {}
+    found = {lost: _found_of(states[_number(lost)], len(test)) for lost in subsets if _number(lost) in states}
+    progress(len(found), len(subsets))
+    options = options.model_copy(update={"method": "published", "features": "published"})
+    from design.common.computing import one_torch_thread
+
+    # Threads, since torch lets go of the interpreter: no copies of the recording.
+    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        missing = [lost for lost in subsets if lost not in found]
+        running = {pool.submit(_train_without, lost, recording, training, test, options): lost for lost in missing}
+        try:
+            for future in as_completed(running):
+                lost = running[future]
+                found[lost] = future.result()
+                if kept:
+                    kept.save(_number(lost), _state(found[lost]))
+                progress(len(found), len(subsets))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return found
+
+
+def _train_without(
+    lost: Lost, recording: Recording, training: Indices, test: Indices, options: settings.Localizer
+) -> Found:
+    """Train on the other fibres alone, and find the test presses; the same whatever else is trained, and when."""
+    rest = np.setdiff1d(np.arange(recording.fibres), lost)
+    fewer = replace(recording, readings=recording.readings[:, rest])
+    localizer = learn(fewer, training, options, np.random.default_rng([options.seed, _number(lost)]))
+    return localizer.locate(localizer.inputs(fewer)[test])
+
+
+def _number(lost: Lost) -> int:
+    """A number that stands for a set of fibres: the sum of 2^fibre."""
+    return sum(1 << fibre for fibre in lost)
+
+
+def _state(found: Found) -> State:
+    return {
+        "places_mm": found.places_mm,
+        "sd_mm": found.sd_mm,
+        "r50_mm": found.r50_mm,
+        "r90_mm": found.r90_mm,
+    }
+
+
+def _found_of(state: State, presses: int) -> Found:
+    """What a network that was done found for so many presses; InputError where its file holds something else."""
+    shapes = {"places_mm": (presses, 2), "sd_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
+    arrays = {name: (array.shape, array.dtype.kind) for name, array in state.items()}
+    if arrays != {name: (shape, "f") for name, shape in shapes.items()}:
+        raise InputError(f"unfinished networks hold {shown(arrays)}, expected {shapes}; remove them to start anew")
+    if not all(np.isfinite(array).all() for array in state.values()):
+        raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
+    return Found(**state)
+
+
+def lines(document: dict[str, Any]) -> list[str]:
+    """The errors of both ways as a table for people."""
+    head = f"error in mm on {document['test_presses']} presses (split: {document['split']})"
+    out = [head, f"{'':14s}lost  sets   mean    std    max"]
+    for way, errors in document["ways"].items():
+        out += [
+            f"{way:<14s}{row['lost']:4d} {row['subsets']:5d} {row['mean_mm']:6.2f} {row['std_mm']:6.2f} "
+            f"{row['max_mm']:6.2f}"
+            for row in errors["errors"]
+        ]
+    return out

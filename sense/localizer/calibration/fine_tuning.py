@@ -1,0 +1,116 @@
+"""Adapting a trained network to a pad that has changed a little, by few presses: needs torch.
+
+So few presses would drag a network of thousands of weights after their own noise. So every step looks at two sets of
+presses: the new ones, moved by a few millimetres as in `training`, whose places are known; and the new ones moved
+anywhere on the pad, whose places the network is to go on finding where it found them before (Li & Hoiem 2016, Learning
+without forgetting). The more presses there are, the more the first count. Expected errors stay as they were.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from design.common.computing import one_torch_thread
+from sense.localizer.network import Floats, Weights
+
+from .training import INPUT_NOISE, MOVED, Samples, draw_alive, forward, looked_up, masked, one_cycle
+
+STEPS, BATCH, RATE = 200, 128, 1e-4
+"""Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""
+OLD_PRESSES = 100
+"""New presses that count as much as what was learnt before."""
+FAR_NOISE = 0.1
+"""Noise on the scaled inputs of presses moved anywhere, which is less sure than a move by millimetres."""
+SPREAD_KEPT = 0.02
+"""Weight of keeping the logarithms of expected errors, beside the places."""
+
+
+def adapt(
+    weights: Weights,
+    samples: Samples,
+    table: Floats,
+    lost: int,
+    rng: np.random.Generator,
+    progress: Callable[[int], None] = lambda steps: None,
+) -> Weights:
+    """Adapt the members of a network of method "masked".
+
+    Args:
+        weights: as `network.forward` takes them.
+        samples: presses of known place.
+        table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
+        lost: fibres that are lost at once, at most, while adapting.
+        rng: source of the seed of torch's generator, which draws all that is random here.
+        progress: called with the steps done since it was last called.
+
+    Returns:
+        Weights of the same shapes.
+    """
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+    before = {name: torch.from_numpy(weight) for name, weight in weights.items()}
+    now = {name: weight.clone().requires_grad_() for name, weight in before.items()}
+    presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator)
+    members = len(now["first.w"])
+    trust = len(samples.inputs) / (len(samples.inputs) + OLD_PRESSES)
+    optimizer = torch.optim.Adam(now.values(), lr=RATE)
+    with one_torch_thread():
+        for number in range(1, STEPS + 1):
+            optimizer.param_groups[0]["lr"] = RATE * one_cycle(number / STEPS)
+            optimizer.zero_grad()
+            entries, places = presses.nearby()
+            off = forward(now, entries.expand(members, -1, -1))[..., :2] - places
+            loss = trust * _length(off).mean(dim=1).sum()
+            entries = presses.anywhere().expand(members, -1, -1)
+            with torch.no_grad():
+                found = forward(before, entries)
+            loss = loss + (1 - trust) * _change(forward(now, entries), found)
+            loss.backward()
+            optimizer.step()
+            progress(1)
+    return {name: weight.detach().numpy() for name, weight in now.items()}
+
+
+class _Presses:
+    """Draws presses that resemble the known ones."""
+
+    def __init__(self, samples: Samples, table: Floats, lost: int, generator: torch.Generator) -> None:
+        self._x, self._alive, self._y = (torch.from_numpy(a) for a in (samples.inputs, samples.alive, samples.places))
+        self._table = torch.from_numpy(table).flatten(2)
+        self._at_home = looked_up(self._table, self._y)
+        self._lost, self._generator = lost, generator
+
+    def nearby(self) -> tuple[Tensor, Tensor]:
+        """Entries (1, B, D) of the network and places (B, 2) of presses moved by a few millimetres."""
+        rows = self._rows()
+        places = (self._y[rows] + MOVED * self._normal(BATCH, 2)).clamp(-1, 1)
+        return self._entries(rows, places, INPUT_NOISE), places
+
+    def anywhere(self) -> Tensor:
+        """Entries (1, B, D) of presses moved to any place of the pad."""
+        rows = self._rows()
+        return self._entries(rows, 2 * torch.rand(BATCH, 2, generator=self._generator) - 1, FAR_NOISE)
+
+    def _rows(self) -> Tensor:
+        return torch.randint(len(self._x), (BATCH,), generator=self._generator)
+
+    def _entries(self, rows: Tensor, places: Tensor, noise: float) -> Tensor:
+        moved = (looked_up(self._table, places) - self._at_home[rows]).view_as(self._x[rows])
+        inputs = self._x[rows] + moved
+        inputs = inputs + noise * self._normal(*inputs.shape)
+        alive = self._alive[rows] & draw_alive(BATCH, self._x.shape[1], self._lost, self._generator)
+        return masked(inputs, alive)[None]
+
+    def _normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self._generator)
+
+
+def _change(found: Tensor, before: Tensor) -> Tensor:
+    """How far places and expected errors (E, B, 4) moved, summed over members."""
+    change = found - before
+    return (_length(change[..., :2]) + SPREAD_KEPT * change[..., 2:].abs().mean(dim=2)).mean(dim=1).sum()
+
+
+def _length(off: Tensor) -> Tensor:
+    return off.square().sum(dim=-1).add(1e-8).sqrt()

@@ -1,0 +1,218 @@
+"""Recalibration: a localizer learnt long ago follows its pad by a few new presses, or stays as it was.
+
+A pad that drifted needs little: its network is adapted gently (`adaptation`). One that was re-made or re-mounted needs
+a `correction` first. Whether either is worth it is tried by cross-validation: presses left out of it in turn are found
+before and after. The document's errors are those of presses left out; what is kept in the end has seen them all.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError, instance, whole
+from design.common.files import provenance
+from design.criteria.fibre_loss import lost_subsets
+from sense.localizer.evaluation import conformal, distances, summary
+from sense.localizer.features import Inputs
+from sense.localizer.localizer import Found, Localizer
+from sense.recordings.recording import Recording
+
+from .affine_correction import fit_correction
+
+FORMAT = "padforge-recalibration/1"
+LEAST_PRESSES = 10
+"""New presses needed: fewer can neither change much nor show that it was for the better."""
+FOLDS = 5
+"""Parts that are left out in turn."""
+CORRECT_FROM, ADAPT_FROM = 2.0, -1.0
+"""Gains from which a correction, which is coarse, and adapting, which is gentle, are kept; in standard errors. Adapting
+gains almost always, but less than a hundred presses can show, so it is kept unless they speak against it."""
+SUBSETS = 16
+"""Sets of lost fibres of a size that are looked at, at most."""
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Found_by_loss = Mapping[tuple[int, ...], Found]
+Change = Callable[[Localizer, Inputs, Array], Localizer]
+
+
+def recalibrate(
+    localizer: Localizer,
+    recording: Recording,
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Localizer, dict[str, Any]]:
+    """Follow a pad that has changed since `localizer` was trained.
+
+    The radii only ever grow: they are widened where presses left out lie outside more often than they should. What the
+    localizer says of its own test, `errors`, stays that of the calibration.
+
+    Args:
+        recording: of the pad as it is now, with some 20 to 500 presses of known place; others are not looked at.
+        seed: of the parts left out in turn, and of adapting.
+        progress: called with (steps done, steps in all).
+
+    Returns:
+        The localizer to use from now on, which finds places as the old one did if nothing was gained, and the document
+        of `recalibration.json`: "changes" that were kept; "before" and "after", rows as "errors" of `evaluate` on the
+        new presses; "gain_mm" of the errors' mean over all numbers of lost fibres, and its "standard_error_mm".
+
+    Raises:
+        InputError: too few presses of known place, or a recording that does not suit the localizer.
+    """
+    instance("localizer", localizer, Localizer)
+    known = np.flatnonzero(instance("recording", recording, Recording).known)
+    seed = whole("seed", seed, 0, 2**32 - 1)
+    if len(known) < LEAST_PRESSES:
+        raise InputError(f"recording has {len(known)} presses of known place, expected at least {LEAST_PRESSES}")
+    rng = np.random.default_rng(seed)
+    rows = rng.permutation(known)
+    raw, places_mm = localizer.raw_inputs(recording)[rows], recording.presses_mm[rows]
+    folds = np.array_split(np.arange(len(rows)), FOLDS)
+    levels = len(localizer.factors)
+    subsets = [subset for level in range(levels) for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
+    trial = _Trial(raw, places_mm, folds, subsets)
+    steps, total = 0, 2 + (FOLDS + 1 if localizer.method == "masked" else 0)
+
+    def step() -> None:
+        nonlocal steps
+        steps += 1
+        progress(steps, total)
+
+    before = trial.found([localizer] * FOLDS)
+    now, kept, after, changes = localizer, [localizer] * FOLDS, before, []
+    corrected = trial.changed(kept, fit_correction)
+    step()
+    found = trial.found(corrected)
+    gain, error = trial.gain(after, found)
+    if gain > CORRECT_FROM * error:
+        now, kept, after = fit_correction(now, raw, places_mm), corrected, found
+        changes.append("corrected")
+    step()
+    if localizer.method == "masked":
+
+        def adapt(old: Localizer, inputs: Inputs, places_mm: Array) -> Localizer:
+            changed = _adapted(old, inputs, places_mm, np.random.default_rng([seed, len(inputs)]))
+            step()
+            return changed
+
+        adapted = trial.changed(kept, adapt)
+        found = trial.found(adapted)
+        gain, error = trial.gain(after, found)
+        if gain > ADAPT_FROM * error:
+            now, after = adapt(now, raw, places_mm), found
+            changes.append("adapted")
+    progress(total, total)
+    gain, error = trial.gain(before, after)
+    made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
+    made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance)}
+    document = {
+        "format": FORMAT,
+        "presses": len(rows),
+        "changes": changes,
+        "before": trial.summary(before),
+        "after": trial.summary(after),
+        "gain_mm": gain,
+        "standard_error_mm": error,
+        "widened": trial.widened(after).tolist(),
+        "provenance": made_by,
+    }
+    now = replace(
+        now,
+        factors=np.minimum(now.factors * trial.widened(after), 1e6),
+        recalibrated_by=(*localizer.recalibrated_by, recording.digest),
+        provenance=made_by,
+    )
+    return now, document
+
+
+def _adapted(localizer: Localizer, raw: Inputs, places_mm: Array, rng: np.random.Generator) -> Localizer:
+    from .fine_tuning import adapt  # torch, seconds to import, is needed here only
+    from .training import Samples
+
+    scaled, targets = localizer.scaling.inputs(raw), localizer.scaling.targets(places_mm)
+    samples = Samples(scaled.inputs, scaled.alive, targets)
+    return replace(
+        localizer, weights=adapt(localizer.weights, samples, localizer.table, len(localizer.factors) - 1, rng)
+    )
+
+
+class _Trial:
+    """Cross-validation on the new presses.
+
+    Args:
+        raw, places_mm: inputs and places (Q, 2) of the presses. folds: indices that are left out in turn, in order.
+        subsets: the sets of lost fibres to look at, by number of lost fibres.
+    """
+
+    def __init__(
+        self, raw: Inputs, places_mm: Array, folds: Sequence[Indices], subsets: Sequence[tuple[int, ...]]
+    ) -> None:
+        self._raw, self._places_mm, self._folds, self._subsets = raw, places_mm, folds, subsets
+
+    def changed(self, localizers: Sequence[Localizer], change: Change) -> list[Localizer]:
+        """The localizers, one a fold, each changed by the presses that its fold does not hold."""
+        out = []
+        for localizer, fold in zip(localizers, self._folds, strict=True):
+            rest = np.setdiff1d(np.arange(len(self._places_mm)), fold)
+            out.append(change(localizer, self._raw[rest], self._places_mm[rest]))
+        return out
+
+    def found(self, localizers: Sequence[Localizer]) -> Found_by_loss:
+        """Each press found by the localizer of the fold that holds it, with each set of lost fibres."""
+        scaled = [each.scaling.inputs(self._raw[fold]) for each, fold in zip(localizers, self._folds, strict=True)]
+        out = {}
+        for lost in self._subsets:
+            parts = [each.locate(part, lost) for each, part in zip(localizers, scaled, strict=True)]
+            names = ("places_mm", "sd_mm", "r50_mm", "r90_mm")
+            out[lost] = Found(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return out
+
+    def gain(self, before: Found_by_loss, after: Found_by_loss) -> tuple[float, float]:
+        """By how much the errors shrink, mm, the mean over numbers of lost fibres, and its standard error."""
+        by_level = [
+            np.mean([self._errors(before[lost]) - self._errors(after[lost]) for lost in level], axis=0)
+            for level in self._levels()
+        ]
+        shrunk = np.mean(by_level, axis=0)
+        return float(shrunk.mean()), float(shrunk.std(ddof=1) / np.sqrt(len(shrunk)))
+
+    def summary(self, found: Found_by_loss) -> list[dict[str, Any]]:
+        """Rows as "errors" of `evaluate`."""
+        return [summary(len(level[0]), [found[lost] for lost in level], self._places_mm) for level in self._levels()]
+
+    def widened(self, found: Found_by_loss) -> Array:
+        """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do."""
+        return np.maximum([conformal([found[lost] for lost in sets], self._places_mm) for sets in self._levels()], 1.0)
+
+    def _levels(self) -> list[list[tuple[int, ...]]]:
+        sizes = dict.fromkeys(len(lost) for lost in self._subsets)
+        return [[lost for lost in self._subsets if len(lost) == size] for size in sizes]
+
+    def _errors(self, found: Found) -> Array:
+        return distances(found.places_mm, self._places_mm)
+
+
+def lines(document: Mapping[str, Any]) -> list[str]:
+    """A recalibration for people."""
+    gain, error = document["gain_mm"], document["standard_error_mm"]
+    names = ("lost  sets", "before mm", "after mm", "in r90 before", "in r90 after")
+    verdict = (
+        f"{' and '.join(document['changes'])}: errors shrink by {gain:.3f} mm (standard error {error:.3f} mm)"
+        if document["changes"]
+        else "nothing gained: places are found as before"
+    )
+    return [
+        f"{document['presses']} new presses, each found by what was changed without it",
+        "  ".join(names),
+        *(
+            f"{old['lost']:4d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
+            f"{old['within_r90']:13.1%}  {new['within_r90']:12.1%}"
+            for old, new in zip(document["before"], document["after"], strict=True)
+        ),
+        verdict,
+    ]

@@ -1,0 +1,262 @@
+"""Training the network: with `classic`, the only place that needs torch.
+
+The loss is the distance itself, not its square; beside it the network learns how far off it expects to be. Every step
+loses a random few fibres of every press and moves the press by a few millimetres, its readings following as the fitted
+`response` of the pad says. The rate follows one cycle; what is kept is a running average of the weights, the one that
+did best on presses held back for that, which also end the training where they have long gained nothing. Members are
+independent, each on a thread of its own.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Event, Lock
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from design.common import profiling
+from sense import settings
+from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Floats, Weights
+
+MOST_STEPS = 11_000
+"""Steps of training at most: with moved presses, the length of the recording does not matter beyond."""
+WARM_UP = 0.2
+"""Share of the steps in which the rate of learning rises."""
+WEIGHT_DECAY = 1e-2
+AVERAGE = 0.998
+"""Share of the running average of the weights that a step leaves as it was."""
+INPUT_NOISE = 0.02
+"""Noise on the scaled inputs while training, their spread being about 1."""
+WHOLE = 0.25
+"""Share of training presses that keep all fibres; the others lose 1 .. `lost`, each as often."""
+MOVED = 0.13
+"""Standard deviation of the way a press is moved, in units of the span: 3 mm on a pad of 45 mm."""
+EXPECTING = 0.1
+"""Weight of learning the expected error, beside the distance."""
+LOOKS = 40
+"""How often in a training the presses held back are looked at."""
+PATIENCE = 12
+"""Looks without gain that end it."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Presses to learn from or to check on.
+
+    Attributes:
+        inputs: (Q, C, F) scaled. alive: (Q, C). places: (Q, 2) in units of the span.
+    """
+
+    inputs: Floats
+    alive: NDArray[np.bool_]
+    places: Floats
+
+
+class StoppedError(Exception):
+    """Another member failed, or the user broke off."""
+
+
+def train(
+    learn: Samples,
+    check: Samples,
+    table: Floats,
+    options: settings.Localizer,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None],
+) -> Weights:
+    """Fit the members of the localizer.
+
+    Args:
+        learn, check: presses to learn from, and to tell by when to stop.
+        table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
+        options: size of the network and length of the training.
+        rng: source of the seeds of torch's own generators, which draw all that is random here.
+        progress: called with (steps done, steps in all), of all members together.
+
+    Returns:
+        Weights as `network.forward` takes them.
+    """
+    seeds = [int(seed) for seed in rng.integers(2**63, size=options.members)]
+    steps = training_steps(len(learn.inputs), options)
+    lock, stop, done = Lock(), Event(), 0
+
+    def step(count: int) -> None:
+        nonlocal done
+        if stop.is_set():
+            raise StoppedError
+        with lock:
+            done += count
+            progress(done, steps * options.members)
+
+    def member(seed: int) -> Weights:
+        torch.set_num_threads(1)  # counts for this thread: matrices this small gain little from a second one
+        return _Member(learn, check, table, options, seed).train(steps, step)
+
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(max(1, min(options.members, os.cpu_count() or 1))) as pool:
+        try:
+            found = [future.result() for future in [pool.submit(member, seed) for seed in seeds]]
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            torch.set_num_threads(threads)
+    axis = {name: 1 if name.startswith("hidden") else 0 for name in found[0]}
+    return {name: np.concatenate([weights[name] for weights in found], axis=axis[name]) for name in found[0]}
+
+
+def training_steps(presses: int, options: settings.Localizer) -> int:
+    """Steps that a member takes: `epochs` times through the presses, but no more than `MOST_STEPS`."""
+    return min(MOST_STEPS, options.epochs * max(1, presses // options.batch))
+
+
+class _Member:
+    """One network in training, on the GPU where there is one."""
+
+    def __init__(self, learn: Samples, check: Samples, table: Floats, options: settings.Localizer, seed: int) -> None:
+        self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self._generator = torch.Generator(self._device).manual_seed(seed)
+        self._options = options
+        self._x, self._alive, self._y = self._on_device(learn)
+        self._check = self._on_device(check)
+        self._fibres, size = self._x.shape[1:]
+        self._lost = min(options.lost, self._fibres - 1)
+        self._table = torch.from_numpy(table).to(self._device).flatten(2)
+        self._bounds = self._y.amin(dim=0), self._y.amax(dim=0)
+        self._at_home = looked_up(self._table, self._y)
+        self._weights = initial(self._fibres * size + self._fibres, options, self._generator)
+
+    def _on_device(self, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
+        arrays = (samples.inputs, samples.alive, samples.places)
+        x, alive, y = (torch.from_numpy(array).to(self._device) for array in arrays)
+        return x, alive, y
+
+    def train(self, steps: int, step: Callable[[int], None]) -> Weights:
+        weights, rate = self._weights, self._options.rate
+        average = {name: w.detach().clone() for name, w in weights.items()}
+        optimizer = torch.optim.AdamW(weights.values(), lr=rate, weight_decay=WEIGHT_DECAY, fused=True)
+        look = max(1, steps // LOOKS)
+        masks = self._check[1] & draw_alive(len(self._check[1]), self._fibres, self._lost, self._generator)
+        best, least, failures = average, math.inf, 0
+        for number in range(1, steps + 1):
+            optimizer.param_groups[0]["lr"] = rate * one_cycle(number / steps)
+            optimizer.zero_grad()
+            self._loss().backward()
+            optimizer.step()
+            # The average forgets the first steps sooner than the later ones, or it would start from the initial draw.
+            keep = min(AVERAGE, number / (number + 9))
+            with torch.no_grad():
+                for name, w in weights.items():
+                    average[name].lerp_(w, 1 - keep)
+            if number % look == 0 or number == steps:
+                error = self._error(average, masks)
+                if error < least:
+                    best, least, failures = {name: w.clone() for name, w in average.items()}, error, 0
+                else:
+                    failures += 1
+                step(look if number % look == 0 else number % look)
+                if failures == PATIENCE:
+                    step(steps - number)
+                    profiling.looked_at("training steps", number, steps)
+                    break
+        else:
+            profiling.looked_at("training steps", steps, steps)
+        return {name: w.cpu().numpy() for name, w in best.items()}
+
+    def _loss(self) -> Tensor:
+        batch = min(self._options.batch, len(self._x))
+        rows = torch.randint(len(self._x), (batch,), generator=self._generator, device=self._device)
+        places = self._y[rows] + MOVED * self._normal(batch, 2)
+        low, high = self._bounds
+        places = torch.where(places < low, 2 * low - places, places)  # a press that would leave the pad is sent back
+        places = torch.where(places > high, 2 * high - places, places).clamp(-1, 1)
+        moved = (looked_up(self._table, places) - self._at_home[rows]).view(batch, self._fibres, -1)
+        inputs = self._x[rows] + moved
+        inputs = inputs + INPUT_NOISE * self._normal(*inputs.shape)
+        alive = self._alive[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
+        found = forward(self._weights, masked(inputs, alive)[None])[0]
+        off = found[:, :2] - places
+        logs = found[:, 2:].clamp(LEAST_LOG, MOST_LOG)
+        expected = (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)
+        return (off.square().sum(dim=1).add(1e-8).sqrt() + EXPECTING * expected).mean()
+
+    def _normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self._generator, device=self._device)
+
+    def _error(self, weights: dict[str, Tensor], masks: Tensor) -> float:
+        """Mean distance on the presses held back, with the fibres in `masks`."""
+        x, _, y = self._check
+        with torch.no_grad():
+            found = forward(weights, masked(x, masks)[None])[0, :, :2]
+            return float((found - y).square().sum(dim=1).sqrt().mean())
+
+
+def looked_up(table: Tensor, places: Tensor) -> Tensor:
+    """(S, S, D) table over [-1, 1]^2 and (B, 2) places to (B, D), linear between entries."""
+    cells = table.shape[0] - 1
+    at = ((places + 1) * (cells / 2)).clamp(0, cells - 1e-3)
+    whole = at.floor().long()
+    x, y = (at - whole).T[:, :, None]
+    i, j = whole.T
+    low = torch.lerp(table[i, j], table[i, j + 1], y)
+    return torch.lerp(low, torch.lerp(table[i + 1, j], table[i + 1, j + 1], y), x)
+
+
+def one_cycle(share: float) -> float:
+    """Rate of learning after `share` of the steps: up along a line to 1, then down along a cosine to 0."""
+    if share < WARM_UP:
+        return share / WARM_UP
+    return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
+
+
+def initial(entries: int, options: settings.Localizer, generator: torch.Generator) -> dict[str, Tensor]:
+    """Random first weights of one member, named and shaped as in `network.Weights`, for `entries` numbers entering."""
+    hidden, layers = options.hidden, options.layers
+
+    def normal(*shape: int, gain: float = 1.0) -> Tensor:
+        return torch.randn(*shape, generator=generator, device=generator.device) * (gain / shape[-2] ** 0.5)
+
+    def zeros(*shape: int) -> Tensor:
+        return torch.zeros(*shape, device=generator.device)
+
+    weights = {
+        "first.w": normal(1, entries, hidden),
+        "first.b": zeros(1, 1, hidden),
+        "hidden.w": normal(layers, 1, hidden, hidden, gain=0.5),
+        "hidden.b": zeros(layers, 1, 1, hidden),
+        "last.w": normal(1, hidden, OUTPUTS, gain=0.3),
+        "last.b": zeros(1, 1, OUTPUTS),
+    }
+    return {name: w.requires_grad_() for name, w in weights.items()}
+
+
+def draw_alive(batch: int, fibres: int, lost: int, generator: torch.Generator) -> Tensor:
+    """(B, C) masks, true where a fibre lives: all of them, or 1 .. `lost` fewer, each set of a size as likely."""
+    device = generator.device
+    count = torch.randint(1, max(lost, 1) + 1, (batch, 1), generator=generator, device=device)
+    whole = torch.rand(batch, 1, generator=generator, device=device) < (WHOLE if lost else 1.0)
+    rank = torch.rand(batch, fibres, generator=generator, device=device).argsort(dim=1)
+    return (rank >= count) | whole
+
+
+def masked(inputs: Tensor, alive: Tensor) -> Tensor:
+    """(B, C, F) inputs and (B, C) masks to (B, C F + C) entries, as `network.masked`."""
+    kept = torch.where(alive[..., None], inputs, 0.0)
+    return torch.cat([kept.flatten(1), alive.to(inputs.dtype)], dim=1)
+
+
+def forward(weights: dict[str, Tensor], x: Tensor) -> Tensor:
+    """(E, B, D) entries to (E, B, 4), as `network.forward`."""
+    h = torch.baddbmm(weights["first.b"], x, weights["first.w"])
+    for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
+        h = h + torch.baddbmm(b, _ready(h), w)
+    return torch.baddbmm(weights["last.b"], _ready(h), weights["last.w"])
+
+
+def _ready(h: Tensor) -> Tensor:
+    return functional.gelu(functional.layer_norm(h, h.shape[-1:], eps=EPSILON))

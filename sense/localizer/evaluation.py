@@ -1,0 +1,185 @@
+"""Evaluation: how far off a localizer is, by sets of lost fibres, by place, and whether its radii hold."""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError, instance, shown, whole
+from design.criteria.fibre_loss import lost_subsets
+from sense.recordings.recording import Recording
+
+from .features import bridged, window_inputs
+from .localizer import Found, Localizer
+
+FORMAT = "padforge-calibration/1"
+CELLS = 5
+"""Cells along a side of the map of errors by place."""
+ACTIVE = 0.02
+"""Share of its total variation that a fibre must change by to be active in a press (paper, table III)."""
+
+Array = NDArray[np.float64]
+
+
+def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
+    """Errors of a localizer for every set of lost fibres of the sizes `levels`.
+
+    On the recording it was trained on, only the presses held back then count; of any other, all of known place do.
+
+    Returns:
+        A document with "errors", one row per level: how many sets of lost fibres were tried; mean, standard deviation
+        and greatest of their mean errors; median and 95th percentile over all their presses, mm; shares of presses
+        within the radii of 50 and 90 %. Besides "split" ("none" for another recording), "test_presses", "by_subset"
+        (mean error of each set), "by_place" (`by_place`), "idle_share" of each fibre, and "test" (places pressed, and
+        found with all fibres).
+
+    Raises:
+        InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
+            or was seen in its recalibration.
+    """
+    instance("localizer", localizer, Localizer)
+    instance("recording", recording, Recording)
+    presses = len(recording.presses_mm)
+    try:
+        levels = tuple(levels)
+    except TypeError as error:
+        raise InputError(f"lost is {shown(levels)}, expected numbers of lost fibres") from error
+    if not levels:
+        raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
+    digest = recording.digest
+    if digest in localizer.recalibrated_by:
+        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
+    own = digest == localizer.learnt_from
+    test = held_back(localizer, recording) if own else np.flatnonzero(recording.known)
+    if len(test) == 0:
+        raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
+    inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
+    rows, by_subset = errors_by_loss(localizer.fibres, levels, partial(localizer.locate, inputs), places_mm)
+    whole = localizer.locate(inputs)
+    return {
+        "format": FORMAT,
+        "errors": rows,
+        "split": localizer.split if own else "none",
+        "test_presses": len(test),
+        "by_subset": by_subset,
+        "by_place": by_place(whole.places_mm, places_mm),
+        "idle_share": idle_share(recording).tolist(),
+        "test": {
+            "press": test.tolist(),
+            "pressed_mm": places_mm.tolist(),
+            "found_mm": whole.places_mm.tolist(),
+            "r90_mm": whole.r90_mm.tolist(),
+        },
+        "provenance": dict(localizer.provenance),
+    }
+
+
+def held_back(localizer: Localizer, recording: Recording) -> NDArray[np.int64]:
+    """Presses of the recording it was trained on that a localizer says were held back, by index.
+
+    Raises:
+        InputError: one of them is not there, or its place is not known, so that it was not.
+    """
+    presses = len(recording.presses_mm)
+    for press in localizer.test:
+        if not 0 <= press < presses or not recording.known[press]:
+            raise InputError(
+                f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known place"
+            )
+    return np.array(localizer.test, dtype=np.int64)
+
+
+def errors_by_loss(
+    fibres: int, levels: Iterable[int], locate: Callable[[tuple[int, ...]], Found], places_mm: Array
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """ "errors" and "by_subset" as `evaluate` gives them.
+
+    Args:
+        fibres: how many there are. levels: how many are lost.
+        locate: finds the presses without the fibres given by index. places_mm: (Q, 2) where they were.
+
+    Raises:
+        InputError: a level that leaves no fibre.
+    """
+    rows, by_subset = [], []
+    for level in levels:
+        level = whole("lost", level, 0, fibres - 1)
+        subsets = lost_subsets(fibres, level)
+        found = [locate(subset) for subset in subsets]
+        rows.append(summary(level, found, places_mm))
+        by_subset += [
+            {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
+            for subset, each in zip(subsets, found, strict=True)
+        ]
+    return rows, by_subset
+
+
+def distances(found_mm: Array, pressed_mm: Array) -> Array:
+    """(Q,) distance of (Q, 2) places."""
+    return np.hypot(*(found_mm - pressed_mm).T)
+
+
+def conformal(found: Sequence[Found], places_mm: Array) -> Array:
+    """(3,) factors by which standard deviations and the radii of 50 and 90 % must grow to be right for these presses.
+
+    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
+    distance over radius on presses never trained on, a rank higher than their share, as if the next were one; so of few
+    presses they are the more cautious.
+
+    Args:
+        found: the Q presses, with each of some sets of lost fibres. places_mm: (Q, 2).
+    """
+    off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
+    errors = [distances(each.places_mm, places_mm) for each in found]
+    share = 1 + 1 / len(places_mm)
+    r50 = np.quantile([error / each.r50_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.5 * share))
+    r90 = np.quantile([error / each.r90_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.9 * share))
+    return np.array([np.sqrt(np.square(off).mean()), r50, r90])
+
+
+def by_place(found_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
+    """Presses, mean and greatest error in each cell of the pad that was pressed; "x_mm", "y_mm" are its middle."""
+    low, high = pressed_mm.min(axis=0), pressed_mm.max(axis=0)
+    side = np.where(high > low, (high - low) / CELLS, 1.0)
+    cells = np.minimum(((pressed_mm - low) / side).astype(int), CELLS - 1)
+    errors = distances(found_mm, pressed_mm)
+    rows = []
+    for cell in np.unique(cells, axis=0):
+        inside = (cells == cell).all(axis=1)
+        x, y = low + (cell + 0.5) * side
+        rows.append(
+            {
+                "x_mm": float(x),
+                "y_mm": float(y),
+                "presses": int(inside.sum()),
+                "mean_mm": float(errors[inside].mean()),
+                "max_mm": float(errors[inside].max()),
+            }
+        )
+    return rows
+
+
+def idle_share(recording: Recording) -> Array:
+    """(C,) share of presses in which each fibre is idle: it changes by less than 2 % of its range over all presses."""
+    changes = window_inputs(bridged(recording.readings), recording.begun, recording.lifted, release=False)[:, :, -1]
+    variation = np.ptp(changes, axis=0)
+    return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
+
+
+def summary(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
+    """A row of "errors" from what was found with each set of so many lost fibres."""
+    errors = np.stack([distances(each.places_mm, places_mm) for each in found])
+    means = errors.mean(axis=1)
+    return {
+        "lost": lost,
+        "subsets": len(errors),
+        "mean_mm": float(means.mean()),
+        "std_mm": float(means.std()),
+        "max_mm": float(means.max()),
+        "median_mm": float(np.median(errors)),
+        "p95_mm": float(np.percentile(errors, 95)),
+        "within_r50": float(np.mean([error <= each.r50_mm for error, each in zip(errors, found, strict=True)])),
+        "within_r90": float(np.mean([error <= each.r90_mm for error, each in zip(errors, found, strict=True)])),
+    }

@@ -1,0 +1,239 @@
+"""The localizer: from the readings of a press to its place, with any fibres lost. Needs no torch."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from design.common.errors import InputError, instance, shown
+from design.common.files import atomic, read_bytes, read_json, writing
+from sense.recordings.recording import Recording
+
+from .features import SIZES, Inputs, press_inputs
+from .network import Floats, Weights, forward, masked, pooled, refuse_unsound
+from .normalization import Scaled, Scaling
+from .schema import FORMAT, read_document
+
+DOCUMENT, WEIGHTS = "localizer.json", "localizer.safetensors"
+TABLE = "table"
+"""Name of the table among the weights."""
+RATE_TOLERANCE = 0.25
+"""Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
+UNKNOWN = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
+"""Standard deviation and the radii of 50 and 90 % for a place anywhere in a square of half-width 1."""
+_CHUNK = 8192
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Places found for Q presses, and how sure they are.
+
+    Attributes:
+        places_mm: (Q, 2). sd_mm: (Q, 2) standard deviation in x and in y.
+        r50_mm, r90_mm: (Q,) radius around the place that holds the press in 50 % and in 90 % of cases.
+    """
+
+    places_mm: Array
+    sd_mm: Array
+    r50_mm: Array
+    r90_mm: Array
+
+
+@dataclass(frozen=True)
+class Localizer:
+    """A trained localizer.
+
+    Attributes:
+        weights: of the network, see `network.Weights`.
+        scaling: of its inputs and outputs.
+        table: (S, S, C, F) scaled inputs by place, see `response.Response`; what a recalibration moves presses by.
+        method: which network and training, of `settings.Method`.
+        features: which inputs it takes, of `presses.FEATURES`.
+        factors: (K, 3) by number of lost fibres, what makes of the expected error a standard deviation, and the radii
+            of 50 % and of 90 %; found on presses never trained on.
+        rate_hz: readings per second of the recording it learnt from.
+        learnt_from: digest of that recording, `test`: its presses that were held back, by index, and `split`: how.
+        recalibrated_by: digests of the recordings that it was recalibrated by, all of whose presses it has seen.
+        errors: on those, one row per number of lost fibres.
+        provenance: where the localizer came from; free JSON.
+    """
+
+    weights: Weights
+    scaling: Scaling
+    table: Floats
+    method: str
+    features: str
+    factors: Array
+    rate_hz: float
+    learnt_from: str
+    split: str = "random"
+    test: tuple[int, ...] = ()
+    recalibrated_by: tuple[str, ...] = ()
+    errors: Sequence[Mapping[str, Any]] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def fibres(self) -> int:
+        """C, the number of fibres it was trained on, lost ones included."""
+        return len(self.scaling.centre)
+
+    def inputs(self, recording: Recording) -> Scaled:
+        """The scaled inputs of every press of `recording`; raises what `raw_inputs` raises."""
+        return self.scaling.inputs(self.raw_inputs(recording))
+
+    def raw_inputs(self, recording: Recording) -> Inputs:
+        """The inputs of every press of `recording` in volts.
+
+        Raises:
+            InputError: the recording has other fibres or another rate than the one that was learnt from.
+        """
+        if instance("recording", recording, Recording).fibres != self.fibres:
+            raise InputError(f"recording has {recording.fibres} fibres, the localizer was trained on {self.fibres}")
+        if abs(recording.rate_hz / self.rate_hz - 1) > RATE_TOLERANCE:
+            raise InputError(
+                f"recording has {recording.rate_hz:.3g} readings a second, allowed is {self.rate_hz:.3g}, "
+                f"at which the localizer was trained, within {RATE_TOLERANCE:.0%}"
+            )
+        return press_inputs(recording.readings, recording.begun, recording.lifted, self.features)
+
+    def locate(self, presses: Scaled, lost: ArrayLike = ()) -> Found:
+        """Find the places of Q presses without what the fibres `lost`, by index, gave.
+
+        A press of which no fibre is left is put in the middle, with radii that say it may be anywhere.
+
+        Raises:
+            InputError: a lost fibre that is not there, or none left, or a published localizer that is to do without.
+        """
+        alive: NDArray[np.bool_] = np.logical_and(presses.alive, self._alive(lost))
+        if self.method == "published" and np.size(lost):
+            raise InputError(f"lost fibres {lost}: a published localizer knows none, train one of method masked")
+        chunks = range(0, len(presses), _CHUNK)
+        found = [self._pooled(presses.inputs[i : i + _CHUNK], alive[i : i + _CHUNK]) for i in chunks]
+        places, spread = (
+            (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (np.empty((0, 2)),) * 2
+        )
+        level = np.minimum((~alive).sum(axis=1), len(self.factors) - 1)
+        to_sd, to_r50, to_r90 = self.factors[level].T * self.scaling.span_mm
+        radius = np.hypot(*spread.T)
+        sd, r50, r90 = to_sd[:, None] * spread, to_r50 * radius, to_r90 * radius
+        blind = np.logical_not(alive.all(axis=1) if self.method == "published" else alive.any(axis=1))
+        anywhere = np.array(UNKNOWN) * self.scaling.span_mm
+        places, sd = np.where(blind[:, None], 0.0, places), np.where(blind[:, None], anywhere[0], sd)
+        r50, r90 = np.where(blind, anywhere[1], r50), np.where(blind, anywhere[2], r90)
+        return Found(self.scaling.places_mm(places), sd, r50, r90)
+
+    def _pooled(self, inputs: Floats, alive: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        entries = inputs.reshape(len(inputs), -1) if self.method == "published" else masked(inputs, alive)
+        return pooled(forward(self.weights, entries))
+
+    def _alive(self, lost: ArrayLike) -> NDArray[np.bool_]:
+        alive = np.ones(self.fibres, dtype=bool)
+        try:
+            fibres = np.asarray(lost).ravel().tolist()
+        except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
+            raise InputError(f"lost fibres are {shown(lost)}, expected their indices") from error
+        for fibre in fibres:
+            if type(fibre) is not int or not 0 <= fibre < self.fibres:
+                raise InputError(f"lost fibre {shown(fibre)}: no such fibre, allowed are 0 to {self.fibres - 1}")
+            alive[fibre] = False
+        if not alive.any():
+            raise InputError(f"all {self.fibres} fibres are lost, at least one must be left")
+        return alive
+
+    def save(self, folder: str | Path) -> None:
+        """Write `localizer.safetensors` and `localizer.json`; reading them back gives the same to the last bit.
+
+        Nothing is touched before both are complete. The document has the digest of its weights, so `load` tells a
+        pair that was interrupted between its halves from a whole one.
+
+        Raises:
+            InputError: something is not finite or no JSON, or `folder` cannot be written.
+        """
+        folder = Path(folder)
+        arrays = {**self.weights, TABLE: self.table}
+        content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+        document = {
+            "format": FORMAT,
+            "method": self.method,
+            "features": self.features,
+            "fibres": self.fibres,
+            "rate_hz": self.rate_hz,
+            "scaling": {
+                "centre_v": self.scaling.centre.tolist(),
+                "spread_v": self.scaling.spread.tolist(),
+                "memory": self.scaling.memory.tolist(),
+                "usual_v": self.scaling.usual.tolist(),
+                "middle_mm": self.scaling.middle_mm.tolist(),
+                "span_mm": self.scaling.span_mm,
+            },
+            "factors": self.factors.tolist(),
+            "weights_sha256": hashlib.sha256(content).hexdigest(),
+            "split": self.split,
+            "test_presses": len(self.test),
+            "errors": [dict(row) for row in self.errors],
+            "learnt_from": self.learnt_from,
+            "test": list(self.test),
+            "recalibrated_by": list(self.recalibrated_by),
+            "provenance": dict(self.provenance),
+        }
+        try:
+            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{folder / DOCUMENT}: localizer cannot be written as JSON ({error})") from error
+        with writing(folder), atomic(folder / WEIGHTS) as new_weights, atomic(folder / DOCUMENT) as new_document:
+            new_weights.write_bytes(content)
+            new_document.write_text(text, encoding="utf-8")
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "Localizer":
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: a file is missing, torn or of another kind, a value is none that `save` writes, or the two do
+                not belong together.
+        """
+        folder = Path(folder)
+        document = read_document(read_json(folder / DOCUMENT, FORMAT), str(folder / DOCUMENT))
+        path = folder / WEIGHTS
+        content = read_bytes(path)
+        if hashlib.sha256(content).hexdigest() != document.weights_sha256:
+            raise InputError(f"{path}: not the weights that {DOCUMENT} was written with; calibrate again")
+        scaling = Scaling(
+            np.array(document.scaling.centre_v),
+            np.array(document.scaling.spread_v),
+            np.array(document.scaling.memory).reshape(document.fibres, -1, SIZES[document.features]),
+            np.array(document.scaling.usual_v).reshape(document.fibres, -1),
+            np.array(document.scaling.middle_mm),
+            document.scaling.span_mm,
+        )
+        try:
+            weights = load(content)
+            table = weights.pop(TABLE)
+            scaling.refuse_unsound(table)
+            refuse_unsound(weights, scaling.entries(document.method), document.method)
+        except (KeyError, TypeError, ValueError, SafetensorError) as error:
+            raise InputError(f"{path}: no weights of the localizer that {DOCUMENT} describes ({error})") from error
+        return cls(
+            weights=weights,
+            scaling=scaling,
+            table=table,
+            method=document.method,
+            features=document.features,
+            factors=np.array(document.factors),
+            rate_hz=document.rate_hz,
+            learnt_from=document.learnt_from,
+            split=document.split,
+            test=tuple(document.test),
+            recalibrated_by=tuple(document.recalibrated_by),
+            errors=[row.model_dump() for row in document.errors],
+            provenance=document.provenance,
+        )

@@ -1,0 +1,51 @@
+"""Places found, as CSV: one line a press, with how sure it is."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from design.common.errors import InputError, instance, shown
+from design.common.files import write_text, writing
+from sense.health.monitor import Finding
+from sense.recordings.recording import Recording
+
+from .localizer import Found, Localizer
+
+COLUMNS = ("press", "x_mm", "y_mm", "sd_x_mm", "sd_y_mm", "r50_mm", "r90_mm")
+"""Press, counted from 0; place from the pad's centre; standard deviations; radii that hold 50 % and 90 % of presses."""
+
+
+def write_places(found: Found, path: str | Path) -> None:
+    """Write what was found for Q presses as CSV with the columns `COLUMNS`, atomically.
+
+    Raises:
+        InputError: `path` cannot be written.
+    """
+    table = np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm])
+    lines = [",".join([str(press), *(f"{value:.4f}" for value in row)]) for press, row in enumerate(table.tolist())]
+    with writing(Path(path)):
+        write_text(Path(path), "\n".join([",".join(COLUMNS), *lines]) + "\n")
+
+
+def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = (), findings: Sequence[Finding] = ()) -> Found:
+    """Find the place of every press of `recording`, without the fibres `lost`, by index.
+
+    Args:
+        findings: of `monitor.examine`; a fibre found at fault is left out from the press on since which it is.
+
+    Raises:
+        InputError: as `Localizer.inputs` and `Localizer.locate`, or findings of a pad with more fibres.
+    """
+    presses = instance("localizer", localizer, Localizer).inputs(recording)
+    alive = presses.alive.copy()
+    if not isinstance(findings, Sequence):
+        raise InputError(f"findings are {shown(findings)}, expected a sequence of them")
+    for finding in findings:
+        fibres = list(instance("findings", finding, Finding).fibres)
+        if max(fibres, default=0) >= localizer.fibres:
+            raise InputError(f"findings name fibre {max(fibres)}, allowed are 0 to {localizer.fibres - 1}")
+        alive[finding.since :, fibres] = False
+    return localizer.locate(replace(presses, alive=alive), lost)

@@ -1,0 +1,104 @@
+"""The networks of the localizer, in NumPy: what they compute, apart from how they are trained.
+
+Of the method "masked": masked inputs enter together with the mask, so one network serves every set of lost fibres. A
+first layer leads to residual layers h + gelu(normalised h) W + b, and a normalised last one to two coordinates and the
+logarithms of their expected errors. Members of an ensemble are stacked along the first axis of every array. Of the
+method "published": one layer of tanh neurons leads to two coordinates.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from design.common.errors import InputError
+
+Floats = NDArray[np.float32]
+Weights = Mapping[str, Floats]
+"""`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 4) and
+`last.b` (E, 1, 4), for E members, D inputs, H hidden units and L residual layers; of the published network, E = 1,
+no `hidden`, and 2 in place of 4."""
+
+OUTPUTS = 4
+"""x, y, and the logarithms of the mean absolute errors expected of them, all in units of the localizer's span."""
+EPSILON = 1e-5
+"""Added to the variance that a layer is normalised by."""
+LEAST_LOG, MOST_LOG = -9.0, 2.0
+"""Range of the logarithms of expected errors: from a ten-thousandth of the span to the whole pad and more."""
+MAX_WEIGHT = 1e4
+"""Greatest weight of a sound network, far above any that training ends with; no sum of a pass overflows below it."""
+
+
+def refuse_unsound(weights: Weights, entries: int, method: str) -> None:
+    """Raise InputError unless `weights` are those of a network that takes `entries` numbers, and all of them sane."""
+    found = {name: weight.shape for name, weight in weights.items()}
+    first, layers = found.get("first.w", ()), found.get("hidden.w", (0,))[:1]
+    if len(first) != 3 or len(layers) != 1 or 0 in first:
+        raise InputError(f"weights have shapes {found}, expected first.w (E, D, H) and others")
+    members, _, hidden = first
+    outputs = OUTPUTS if method == "masked" else 2
+    expected = {
+        "first.w": (members, entries, hidden),
+        "first.b": (members, 1, hidden),
+        "last.w": (members, hidden, outputs),
+        "last.b": (members, 1, outputs),
+    }
+    if method == "masked":
+        expected |= {"hidden.w": (*layers, members, hidden, hidden), "hidden.b": (*layers, members, 1, hidden)}
+    if found != expected:
+        raise InputError(f"weights have shapes {found}, expected {expected}")
+    for name, weight in weights.items():
+        greatest = np.abs(weight).max(initial=0)
+        if weight.dtype != np.float32 or not greatest <= MAX_WEIGHT:
+            raise InputError(
+                f"weights {name} are {weight.dtype} up to {greatest:g}, allowed is float32 up to {MAX_WEIGHT:g}"
+            )
+
+
+def masked(inputs: Floats, alive: NDArray[np.bool_]) -> Floats:
+    """What enters the network: the inputs of the living fibres, zeros for the lost, then the mask.
+
+    Args:
+        inputs: (Q, C, F) scaled inputs. alive: (C,) or (Q, C).
+
+    Returns:
+        (Q, C F + C). A lost fibre's inputs are replaced, not multiplied: not even NaN gets through.
+    """
+    alive = np.broadcast_to(alive, inputs.shape[:2])
+    kept = np.where(alive[:, :, None], inputs, np.float32(0))
+    return np.concatenate([kept.reshape(len(inputs), -1), alive.astype(np.float32)], axis=1)
+
+
+def forward(weights: Weights, x: Floats) -> Floats:
+    """(Q, D) entries to (E, Q, 4): places and logarithms of expected errors, see `OUTPUTS`.
+
+    The published network expects the same error of every press, which is called 1.
+    """
+    h = x @ weights["first.w"] + weights["first.b"]
+    if "hidden.w" not in weights:
+        places = np.tanh(h) @ weights["last.w"] + weights["last.b"]
+        return np.concatenate([places, np.zeros_like(places)], axis=2)
+    for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
+        h = h + _gelu(_normalised(h)) @ w + b
+    return _gelu(_normalised(h)) @ weights["last.w"] + weights["last.b"]
+
+
+def pooled(outputs: Floats) -> tuple[Floats, Floats]:
+    """(E, Q, 4) outputs of all members to one place (Q, 2) and its standard deviations (Q, 2), in units of the span.
+
+    A member's error is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b; the spread of the
+    members adds to it (Lakshminarayanan et al. 2017, Simple and scalable predictive uncertainty).
+    """
+    places, logs = outputs[:, :, :2], np.clip(outputs[:, :, 2:], LEAST_LOG, MOST_LOG)
+    variance = (2 * np.exp(2 * logs)).mean(axis=0) + places.var(axis=0)
+    return places.mean(axis=0), np.sqrt(variance)
+
+
+def _gelu(x: Floats) -> Floats:
+    return x * np.float32(0.5) * (1 + erf(x * np.float32(np.sqrt(0.5))))
+
+
+def _normalised(x: Floats) -> Floats:
+    x = x - x.mean(axis=-1, keepdims=True)
+    return x / np.sqrt((x * x).mean(axis=-1, keepdims=True) + np.float32(EPSILON))

@@ -1,0 +1,117 @@
+"""`localizer.json`: what it may hold, so that nothing else gets past its reading."""
+
+from collections.abc import Mapping, Sequence
+from reprlib import repr as shortened
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, JsonValue, ValidationError
+
+from design.common.errors import InputError
+from design.common.settings import Section
+from sense.processing.limits import LEAST_SPREAD_V, MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
+from sense.settings import Features, Method, Split
+
+from .features import PASTS, SIZES
+
+FORMAT = "padforge-localizer/2"
+
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+Volts = Annotated[float, Field(ge=-2 * MAX_VOLTS, le=2 * MAX_VOLTS)]
+
+Spread = Annotated[float, Field(ge=LEAST_SPREAD_V, le=2 * MAX_VOLTS)]
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+Factor = Annotated[float, Field(gt=0, le=1e6)]
+
+Distance = Annotated[float, Field(ge=0)]
+
+Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
+
+
+class ScalingTable(Section):
+    """`scaling` of `localizer.json`, see `localizer.Scaling`."""
+
+    centre_v: list[list[Volts]]
+    spread_v: list[list[Spread]]
+    memory: list[list[list[Memory]]]
+    usual_v: list[list[Volts]]
+    middle_mm: Annotated[list[Place], Field(min_length=2, max_length=2)]
+    span_mm: float = Field(gt=0, le=MAX_MM)
+
+
+class ErrorRow(Section):
+    """A row of `errors`, see `calibration.evaluate`."""
+
+    lost: int = Field(ge=0)
+    subsets: int = Field(ge=1)
+    mean_mm: Distance
+    std_mm: Distance
+    max_mm: Distance
+    median_mm: Distance
+    p95_mm: Distance
+    within_r50: Share
+    within_r90: Share
+
+
+class LocalizerDocument(Section):
+    """The whole of `localizer.json`, see `localizer.Localizer`."""
+
+    format: Literal["padforge-localizer/2"] = FORMAT
+    method: Method
+    features: Features
+    fibres: int = Field(ge=1, le=MAX_FIBRES)
+    rate_hz: float = Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
+    scaling: ScalingTable
+    factors: Annotated[list[Annotated[list[Factor], Field(min_length=3, max_length=3)]], Field(min_length=1)]
+    weights_sha256: Digest
+    split: Split
+    test_presses: int
+    errors: list[ErrorRow]
+    learnt_from: Digest
+    test: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    recalibrated_by: list[Digest]
+    provenance: dict[str, JsonValue]
+
+
+def read_document(document: Mapping[str, Any], where: str) -> LocalizerDocument:
+    """`document` with every value checked, and what must fit together.
+
+    Raises:
+        InputError: one line that begins with `where` and names the value.
+    """
+    try:
+        found = LocalizerDocument.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise InputError(f"{where}: {key} is {shortened(first['input'])}: {first['msg'].lower()}") from error
+    size, past, table = SIZES[found.features], PASTS[found.features], found.scaling
+    shapes = {
+        "centre_v": (_sizes(table.centre_v), (found.fibres, size)),
+        "spread_v": (_sizes(table.spread_v), (found.fibres, size)),
+        "usual_v": (_sizes(table.usual_v), (found.fibres, past)),
+        "memory": (_sizes([row for fibre in table.memory for row in fibre]), (found.fibres * past, size)),
+        "memory of fibres": (_sizes(table.memory), (found.fibres, past)),
+    }
+    for name, (sizes, (rows, values)) in shapes.items():
+        if sizes != [values] * rows:
+            raise InputError(
+                f"{where}: scaling.{name} has {len(sizes)} rows of {shortened(sorted(set(sizes)))} values, "
+                f"expected {rows} of {values} for {found.fibres} fibres and features {found.features}"
+            )
+    if found.method == "published" and found.features != "published":
+        raise InputError(f"{where}: method is published, features are {found.features}, expected published")
+    if len(set(found.test)) != len(found.test) or found.test_presses != len(found.test):
+        raise InputError(
+            f"{where}: test has {len(found.test)} presses, {len(set(found.test))} of them different, "
+            f"expected {found.test_presses} different ones"
+        )
+    return found
+
+
+def _sizes(rows: Sequence[Sequence[Any]]) -> list[int]:
+    return [len(row) for row in rows]

@@ -1,0 +1,1 @@
+"""Readings: filters, and presses found in them."""

@@ -1,0 +1,191 @@
+"""Filters of readings: total-variation denoising, exact, and the running median (`filter_streams` has both of streams).
+
+Total-variation denoising keeps the steps that presses make and flattens what lies between. A missing reading is NaN:
+it counts for nothing and is bridged at its neighbours' level. Channels are filtered each by itself.
+
+References: the published filter is the robust one with lam = 4, or a median of 15 (T. G. Thuruthel, J. Hughes, F. Iida,
+IEEE Sensors J. 2020); the algorithms are those of `kernels.robust_variation` and `kernels.square_variation`.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from design.common.computing import in_chunks
+from design.common.errors import InputError, instance, real, shown, whole
+from sense.processing.kernels import clipping as clips
+from sense.processing.kernels import running_median as median
+from sense.processing.kernels import total_variation_l1 as robust_variation
+from sense.processing.kernels import total_variation_l2 as square_variation
+
+from .limits import MAX_S, numbers, refuse_beyond
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Fidelity = Literal["robust", "squares"]
+
+KERNELS = {"robust": robust_variation, "squares": square_variation}
+GREATEST = 1e100
+"""Greatest amount of a reading and of lam: beyond, sums may overflow."""
+WIDEST = 2**31 - 1
+"""Greatest width of a running median: no recording is longer."""
+NOBODY = np.empty(0)
+"""In place of the causal values of a forward pass where nobody asks for them."""
+
+_GRAIN = 20_000  # readings below which a thread costs more than it saves
+
+
+def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
+    """Where a recording with gaps begins anew: indices of the readings that follow a longer interval than `longest_s`.
+
+    Args:
+        times_s: (R,) ascending, s. longest_s: above 0.
+
+    Returns:
+        (K,) ascending, for `starts` of the filters.
+
+    Raises:
+        InputError: times that are not finite, beyond 1e10 s or do not ascend, or an interval that is not above 0.
+    """
+    times = numbers(times_s, np.float64, "times_s")
+    if times.ndim != 1:
+        raise InputError(f"times_s have shape {times.shape}, expected (R,)")
+    refuse_beyond("times_s", times[:, None], MAX_S, "s")
+    if (np.diff(times) < 0).any():
+        raise InputError(f"times_s are {shown(times_s)}, expected finite numbers that ascend")
+    if not (longest := real("longest_s", longest_s, 0.0, 1e300)):
+        raise InputError(f"longest_s is {longest_s!r}, allowed is a number above 0")
+    return np.flatnonzero(np.diff(times) > longest) + 1
+
+
+def total_variation(
+    readings: ArrayLike, lam: float, fidelity: Fidelity = "robust", starts: ArrayLike = (), causal: bool = False
+) -> Array:
+    """The exact minimiser x of fidelity + lam * sum |x_{i+1} - x_i|.
+
+    The fidelity "robust" is sum |y_i - x_i|: outliers do not count by how far they are off, and lam counts readings,
+    whatever the unit of y: a bump of fewer than 2 lam readings is cut. "squares" is 1/2 sum (y_i - x_i)^2: lam has the
+    unit of y, and a bump of n readings is lowered by 2 lam / n. The robust minimum is often not one point alone: going
+    back from the last reading, each choice between places is for the middle of them.
+
+    Takes O(R log min(R, lam)) for "robust" and O(R) for "squares".
+
+    Args:
+        readings: (R,) or (R, C) of any real type, NaN where one is missing: there x has the value of the next present
+            reading, else of the last. A channel without any stays NaN.
+        lam: above 0.
+        starts: (K,) ascending indices at which a new stretch begins: nothing is coupled across (see `stretches`).
+        causal: give at each reading the last value of the minimiser of its stretch up to there, what a live filter
+            knows. For "squares" this takes O(R K) for K knots: a dozen on noise, up to 2 R.
+
+    Returns:
+        float64 of the shape of `readings`.
+
+    Raises:
+        InputError: readings that are no numbers of such a shape, or beyond 1e100; lam, fidelity or starts that are not
+            as above.
+    """
+    check_variation(lam, fidelity)
+    instance("causal", causal, bool)
+    kernel = KERNELS[fidelity]
+
+    def denoise(stretch: Array) -> Array:
+        low, high, out = np.empty((3, len(stretch)))
+        latest, _ = kernel.forward(stretch, float(lam), kernel.silent(), low, high, out if causal else NOBODY)
+        if not causal:
+            clips.clip_back(low, high, latest, out)
+        return out
+
+    return _by_channel(readings, starts, denoise)
+
+
+def running_median(readings: ArrayLike, width: int, starts: ArrayLike = (), causal: bool = False) -> Array:
+    """The median of the `width` readings around each, or up to each; windows shrink at the ends of a stretch.
+
+    NaN are left out of their windows; where the number left is even it is the mean of the two in the middle, where
+    none is left NaN. Takes O(R width), most of it short moves of memory.
+
+    Args:
+        readings: (R,) or (R, C) of any real type. width: odd. starts: as `total_variation`.
+        causal: the window ends at the reading, instead of having it in its middle.
+
+    Returns:
+        float64 of the shape of `readings`.
+
+    Raises:
+        InputError: readings or starts as `total_variation`, or a width that is no odd whole number above 0.
+    """
+    before, after = window_reach(width, causal)
+    return _by_channel(readings, starts, lambda stretch: median_of(stretch, before, after))
+
+
+def median_of(stretch: Array, before: int, after: int) -> Array:
+    """(R,) medians of the readings i - before .. i + after that there are in a stretch (R,)."""
+    out = np.empty(len(stretch))
+    median.running_median(stretch, min(before, len(stretch)), min(after, len(stretch)), out)
+    return out
+
+
+def _by_channel(readings: ArrayLike, starts: ArrayLike, work: Callable[[Array], Array]) -> Array:
+    """What `work` makes of every stretch (r,) of every channel, in the shape of the readings."""
+    array = checked_readings(readings)
+    if array.ndim not in (1, 2):
+        raise InputError(f"readings have shape {array.shape}, expected (R,) or (R, C)")
+    count = len(array)
+    columns = np.ascontiguousarray(np.atleast_2d(array.T))
+    edges = [0, *_checked_starts(starts, count), count]
+    out = np.empty_like(columns)
+
+    def filter_channels(begin: int, end: int) -> None:
+        for c in range(begin, end):
+            for first, last in pairwise(edges):
+                out[c, first:last] = work(columns[c, first:last])
+
+    in_chunks(filter_channels, len(columns), 1 + _GRAIN // max(count, 1))
+    return np.ascontiguousarray(out.T).reshape(array.shape)
+
+
+def checked_readings(readings: ArrayLike) -> Array:
+    """Readings as float64, of any shape.
+
+    Raises:
+        InputError: they are no real numbers, or beyond GREATEST.
+    """
+    array = numbers(readings, np.float64, "readings")
+    beyond = np.abs(array) > GREATEST
+    if beyond.any():
+        first = np.argwhere(beyond)[0].tolist()
+        raise InputError(
+            f"readings hold {array[beyond][0]:g} (first at {first}), allowed is {-GREATEST:g} to {GREATEST:g}, "
+            "or NaN for one that is missing"
+        )
+    return array
+
+
+def _checked_starts(starts: ArrayLike, readings: int) -> list[int]:
+    array = numbers(starts, np.int64, "starts")
+    if array.ndim != 1 or (np.diff(array) <= 0).any() or (len(array) and not 0 <= array[0] <= array[-1] < readings):
+        raise InputError(f"starts are {shown(starts)}, allowed are ascending indices of {readings} readings")
+    return array.tolist()
+
+
+def check_variation(lam: float, fidelity: str) -> None:
+    """Raise InputError unless `total_variation` takes these."""
+    if not isinstance(fidelity, str) or fidelity not in KERNELS:
+        raise InputError(f"fidelity is {shown(fidelity)}, allowed is {' or '.join(KERNELS)}")
+    if not real("lam", lam, 0.0, GREATEST):
+        raise InputError(f"lam is {lam!r}, allowed is a number above 0, up to {GREATEST:g}")
+
+
+def window_reach(width: int, causal: bool) -> tuple[int, int]:
+    """How many readings before and after each are in the window of a running median.
+
+    Raises:
+        InputError: a width that is no odd whole number above 0.
+    """
+    if (width := whole("width", width, 1, WIDEST)) % 2 != 1:
+        raise InputError(f"width is {width!r}, allowed is an odd whole number above 0")
+    return (width - 1, 0) if instance("causal", causal, bool) else (width // 2, width // 2)

@@ -1,0 +1,86 @@
+"""What a recording may hold: beyond these limits lies no pad, probe or clock, but a file of another kind."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from design.common.errors import InputError, shown
+
+MAX_FIBRES = 512
+MAX_VOLTS, MAX_MM, MAX_S = 1e3, 1e5, 1e10
+"""Greatest reading, place and time, by amount (seconds since 1970 are 2e9)."""
+MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
+MAX_VALUES = 2**30
+"""Greatest number of values in an array of a file: 8 GiB of them."""
+MAX_BYTES = 8 * MAX_VALUES
+"""Size of the largest file of a recording."""
+MAX_INDEX = 2**53
+"""Greatest index that float64 holds exactly."""
+
+
+def numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
+    """`values`, or a copy of them, as an array of float64, or of int64 where all are whole numbers.
+
+    Raises:
+        InputError: anything else.
+    """
+    what = "real numbers" if kind is np.float64 else f"whole numbers up to {MAX_INDEX}"
+    try:
+        array = np.asarray(values)
+    except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
+        raise InputError(f"{name} are {shown(values)}, expected an array of {what} ({error})") from error
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} are {shown(values)} ({array.dtype}), expected an array of {what}")
+    with np.errstate(over="ignore"):  # of longer floats, which become infinity
+        array = array.astype(np.float64, copy=copy) if array.dtype.kind == "f" else array
+    if kind is np.int64 and not ((array >= -MAX_INDEX) & (array <= MAX_INDEX) & (array == np.trunc(array))).all():
+        raise InputError(f"{name} are {shown(values)}, expected an array of {what}")
+    return array.astype(kind, copy=copy)
+
+
+def refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str, missing: bool = False) -> None:
+    """Raise InputError if an entry of (N, M) values is not finite, or beyond `limit`; NaN is allowed if `missing`."""
+    sound = ~np.isinf(values) if missing else np.isfinite(values)
+    if not sound.all():
+        row = int(np.argmin(sound.all(axis=1)))
+        kind = "infinity" if missing else "NaN or infinity"
+        raise InputError(f"{name} hold {kind} (first in row {row}), expected finite numbers")
+    beyond = np.abs(values) > limit
+    if beyond.any():
+        row = int(np.argmax(beyond.any(axis=1)))
+        raise InputError(
+            f"{name} hold {values[beyond][0]:g} {unit} (first in row {row}), allowed is {-limit:g} to {limit:g} {unit}"
+        )
+
+
+def stream_of(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Times (n,) and readings (n, C), NaN where missing, as float64; C is `fibres`, where that is given.
+
+    Raises:
+        InputError: shapes that do not fit together, what is beyond the limits above, or times that do not ascend.
+    """
+    times = numbers(times_s, np.float64, "times", copy=False)
+    rows = numbers(readings, np.float64, "readings", copy=False)
+    if times.ndim != 1 or rows.ndim != 2 or len(rows) != len(times) or rows.shape[1] != (fibres or rows.shape[1]):
+        raise InputError(
+            f"times have shape {times.shape} and readings {rows.shape}, expected (n,) and (n, {fibres or 'C'})"
+        )
+    if not 1 <= rows.shape[1] <= MAX_FIBRES:
+        raise InputError(f"readings are of {rows.shape[1]} fibres, allowed is 1 to {MAX_FIBRES}")
+    refuse_beyond("readings", rows, MAX_VOLTS, "V", missing=True)
+    refuse_beyond("times", times[:, None], MAX_S, "s")
+    refuse_descent(times)
+    return times, rows
+
+
+def refuse_descent(times_s: NDArray[np.float64]) -> None:
+    """Raise InputError unless each of (n,) times is later than the one before."""
+    late = np.diff(times_s) > 0
+    if not late.all():
+        row = int(np.argmin(late)) + 1
+        raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
+
+
+LEAST_SPREAD_V = 1e-9
+"""Least spread that an input is divided by: what varies less never varied."""

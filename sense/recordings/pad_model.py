@@ -1,0 +1,196 @@
+"""The simulated pad: what an ADC reads from each fibre while a probe presses.
+
+The strain of a fibre is its signal by the contact model times how far the probe is down. Three things the published
+recording shows come on top: the answer creeps (part of it follows slowly), unloading is not the reverse of loading
+(the fibre overshoots beyond its rest and comes back within seconds), and the rest itself wanders over minutes. A fibre
+is a resistor in a potential divider with a fixed one; an ADC with white noise reads their middle.
+
+Strengths are of the order of that recording: answers up to some 0.2 V on a rest near 2 V, overshoot of a fifth, rest
+wandering by 0.04 V, noise of 1.6 mV.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from design import Contact, Morphology, signals
+from sense.settings import Rig
+
+Array = NDArray[np.float64]
+
+SUPPLY_V = 3.3
+ADC_STEPS = 4095
+GAUGE = 0.08
+"""Relative change of a fibre's resistance per grid unit of signal at full depth, 5 mm."""
+FULL_DEPTH_MM = 5.0
+TRAVEL_S = 0.15
+"""Time the probe takes from the surface to its depth, and back."""
+DELAY_S = (0.08, 0.2)
+"""Range of the time from the command to the touch, and to the start of the release."""
+CREEP_S = (0.4, 6.0)
+"""Time constants of the creeping part of an answer, in equal shares."""
+OVERSHOOT_S = 2.5
+"""Time constant of the return from the overshoot after unloading."""
+DRIFT_S = 600.0
+"""Correlation time of the rest."""
+REST_V = (1.7, 2.1)
+"""Range of the voltages at rest; the divider is matched to half the supply only roughly."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """When, within a cycle of `readings` readings at `rate_hz`, the probe is sent down; up it goes at the end."""
+
+    readings: int
+    rate_hz: float
+
+    @property
+    def down_at(self) -> int:
+        """Reading of the cycle at which the probe is sent down."""
+        return self.readings // 2
+
+
+def indentation(cycle: Cycle, delays_s: Array) -> Array:
+    """How far the probe is down, 0 to 1, in the cycle of each press and the one after, in which it leaves.
+
+    Args:
+        delays_s: (Q, 2) from the command to the touch, and from the command to the start of the release.
+
+    Returns:
+        (Q, 2 readings).
+    """
+    times = np.arange(2 * cycle.readings) / cycle.rate_hz
+    touch = cycle.down_at / cycle.rate_hz + delays_s[:, :1]
+    leave = cycle.readings / cycle.rate_hz + delays_s[:, 1:]
+    return np.clip((times - touch) / TRAVEL_S, 0, 1) - np.clip((times - leave) / TRAVEL_S, 0, 1)
+
+
+def strain(signals: Array, indented: Array) -> Array:
+    """(Q, C) signals and (Q, 2 readings) indentation to (Q readings, C) strain; neighbouring cycles add up."""
+    readings = indented.shape[1] // 2
+    own = signals[:, None, :] * indented[:, :readings, None]
+    own[1:] += signals[:-1, None, :] * indented[:-1, readings:, None]
+    return own.reshape(-1, signals.shape[1])
+
+
+class Answer:
+    """The part of the strain that shows: creeping, and overshooting as it goes down; may be asked bit by bit.
+
+    Args:
+        rate_hz: readings a second. creep: share that follows by `CREEP_S`. hysteresis: overshoot as a share of the
+            strain lost.
+    """
+
+    def __init__(self, rate_hz: float, creep: float, hysteresis: float) -> None:
+        self._creep, self._hysteresis = creep, hysteresis
+        self._lags = [Lag(rate_hz * time_constant) for time_constant in CREEP_S]
+        self._stay = np.exp(-1 / (rate_hz * OVERSHOOT_S))
+        self._last: Array | None = None
+        self._overshoot: Array | None = None
+
+    def __call__(self, strained: Array) -> Array:
+        """(R, C) strain, going on from what was asked before, to (R, C), settling at it where it stays as it is."""
+        shown = (1 - self._creep) * strained
+        for lag in self._lags:
+            shown = shown + self._creep / len(self._lags) * lag(strained)
+        last = strained[:1] if self._last is None else self._last
+        unloading = np.maximum(-np.diff(strained, axis=0, prepend=last), 0)
+        before = np.zeros_like(last) if self._overshoot is None else self._overshoot
+        over, self._overshoot = lfilter([1.0], [1.0, -self._stay], unloading, axis=0, zi=before)
+        self._last = strained[-1:].copy()
+        return shown - self._hysteresis * over
+
+
+class Lag:
+    """A first-order lag with a time constant of `steps` rows, starting settled at the first of (R, C) values."""
+
+    def __init__(self, steps: float) -> None:
+        self._stay = np.exp(-1 / steps)
+        self._state: Array | None = None
+
+    def __call__(self, values: Array) -> Array:
+        before = self._stay * values[:1] if self._state is None else self._state
+        lagged, self._state = lfilter([1 - self._stay], [1.0, -self._stay], values, axis=0, zi=before)
+        return lagged
+
+
+class Wander:
+    """Rests of unit variance, correlated over `DRIFT_S`: an Ornstein-Uhlenbeck process from its own equilibrium."""
+
+    def __init__(self, fibres: int, rate_hz: float, rng: np.random.Generator) -> None:
+        self._stay = np.exp(-1 / (rate_hz * DRIFT_S))
+        self._rng = rng
+        self._state = self._stay * rng.standard_normal((1, fibres))
+
+    def __call__(self, readings: int) -> Array:
+        """The next (R, C)."""
+        kicks = self._rng.standard_normal((readings, self._state.shape[1])) * np.sqrt(1 - self._stay**2)
+        wandered, self._state = lfilter([1.0], [1.0, -self._stay], kicks, axis=0, zi=self._state)
+        return wandered
+
+
+def divider(rest_v: Array, change: Array) -> Array:
+    """Voltage over the fixed resistor as the fibre's resistance grows by the share `change`, from `rest_v`."""
+    ratio = SUPPLY_V / rest_v - 1  # fibre at rest over fixed resistor
+    return SUPPLY_V / (1 + ratio * (1 + change))
+
+
+def digitised(volts: Array) -> Array:
+    """What a 12-bit ADC makes of `volts`: a whole number of steps within its range, in volts."""
+    return np.clip(np.rint(volts / SUPPLY_V * ADC_STEPS), 0, ADC_STEPS) * (SUPPLY_V / ADC_STEPS)
+
+
+def read_pad(signals: Array, cycle: Cycle, rig: Rig, rng: np.random.Generator) -> Array:
+    """(Q, C) signals of a plan of presses to (Q readings, C) volts as the ADC gives them."""
+    model = Divider(signals.shape[1], cycle.rate_hz, rig, rng)
+    indented = indentation(cycle, rng.uniform(*DELAY_S, (len(signals), 2)))
+    return model(rig.depth_mm / FULL_DEPTH_MM * strain(signals, indented))
+
+
+class Divider:
+    """The fibres of a simulated pad in their dividers, read by an ADC; may be asked bit by bit."""
+
+    def __init__(self, fibres: int, rate_hz: float, rig: Rig, rng: np.random.Generator) -> None:
+        self._rest_v = rng.uniform(*REST_V, fibres)
+        self._answer = Answer(rate_hz, rig.creep, rig.hysteresis)
+        self._wander = Wander(fibres, rate_hz, rng)
+        self._rig, self._rng = rig, rng
+
+    def __call__(self, strained: Array) -> Array:
+        """(R, C) strain, 1 for a signal of 1 at full depth, going on from what was asked before, to (R, C) volts."""
+        if not len(strained):
+            return strained
+        volts = divider(self._rest_v, GAUGE * self._answer(strained))
+        volts += self._rig.drift_mv * 1e-3 * self._wander(len(volts))
+        volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
+        return digitised(volts)
+
+
+class LivePad:
+    """A simulated pad that is asked what it gives for where the tip is; one physical model for every simulated rig.
+
+    Args:
+        pad: course of the fibres. contact: what a press deforms. rig: strengths of creep, noise and drift.
+        rate_hz: at which it is asked. rng: of rests, drift and noise.
+    """
+
+    def __init__(self, pad: Morphology, contact: Contact, rig: Rig, rate_hz: float, rng: np.random.Generator) -> None:
+        self._pad, self._contact = pad, contact
+        self._divider = Divider(2 * pad.grid, rate_hz, rig, rng)
+        self._known: dict[tuple[float, float], Array] = {}
+
+    def volts(self, places_mm: Array, depths_mm: Array) -> Array:
+        """(R, C) volts for tips at (R, 2) mm from the pad's centre, (R,) mm below its surface (above: less than 0)."""
+        strained = np.zeros((len(places_mm), 2 * self._pad.grid))
+        for row in np.flatnonzero(depths_mm > 0):
+            strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._signals(places_mm[row])
+        return self._divider(strained)
+
+    def _signals(self, place_mm: Array) -> Array:
+        """(C,) signals of a press at full depth; the tip of an arm at rest stays within hundredths of a millimetre."""
+        x, y = np.round(place_mm, 2).tolist()
+        if (x, y) not in self._known:
+            self._known = {(x, y): signals(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
+        return self._known[x, y]

@@ -1,0 +1,243 @@
+"""The run directory that keeps a recording, written so that nothing finished is ever lost.
+
+It holds `start.json` (what was recorded, with what), `readings.bin` and, of a real or emulated arm, `states.bin`
+(streams, see `stream`), and `journal.ndjson`: one line as a press begins, with its place and the index of its first
+reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done, so
+after a kill every press the journal calls done can be used, and the others are repeated.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from design.common.errors import InputError, shown, whole
+from design.common.files import lock, read_json, refuse_unwritable, write_json, writing
+from sense.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, numbers
+
+from .block_file import BlockWriter, write_at
+from .press_journal import cut_torn_line, read_journal
+
+FORMAT = "padforge-recording/1"
+START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+
+
+class Recorder:
+    """Writes a run directory as it is recorded: append readings, begin a press, end it, `sync`.
+
+    Nothing is promised to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
+
+    Attributes:
+        done: numbers of the presses that are done.
+        readings: how many readings there are.
+        last_s: time of the last reading or state, s; -inf where there is none.
+
+    Raises:
+        InputError: `path` exists and is not an empty directory, or cannot be written, or too few or many fibres.
+    """
+
+    def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
+        fibres = whole("fibres", fibres, 1, MAX_FIBRES)
+        refuse_existing(path)
+        document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
+        with writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+            try:  # of two that start at once, one makes this file
+                self._stream: BinaryIO = (path / READINGS).open("xb", buffering=0)
+            except FileExistsError:
+                refuse_existing(path)
+                raise
+            try:
+                write_json(path / START, document)
+                self._journal: BinaryIO = (path / JOURNAL).open("xb", buffering=0)
+                lock(self._journal, _busy(path))
+            except BaseException:
+                self._stream.close()
+                for name in (JOURNAL, START, READINGS):  # a part of a recording would be in the way of another try
+                    (path / name).unlink(missing_ok=True)
+                raise
+        self._begin_with(path, BlockWriter(self._stream, fibres), 0)
+
+    def _begin_with(self, path: Path, blocks: BlockWriter, noted: int) -> None:
+        self._path = path
+        self._blocks = blocks
+        self._fibres = blocks.fibres
+        self._noted = noted  # bytes of the journal
+        self._states: tuple[BlockWriter, BinaryIO] | None = None
+        self._lines: list[str] = []
+        self._press = 0
+        self._down = False
+        self.done: set[int] = set()
+        self.readings = 0
+        self.last_s = -np.inf
+
+    @classmethod
+    def resume(cls, path: Path) -> "Recorder":
+        """Go on with a run directory that was left unfinished; torn tails are cut off.
+
+        Raises:
+            InputError: no run directory, or damage elsewhere than at its end.
+        """
+        fibres = fibres_of(path)
+        done = read_journal(path / JOURNAL)
+        self = cls.__new__(cls)
+        with writing(path):
+            self._journal = (path / JOURNAL).open("r+b", buffering=0)
+            try:
+                lock(self._journal, _busy(path))
+                blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
+            except InputError:
+                self._journal.close()
+                raise
+            cut_torn_line(path / JOURNAL)
+            self._begin_with(path, blocks, (path / JOURNAL).stat().st_size)
+            self._note_time(rows)
+            if (path / STATES).exists():
+                states, file, state_rows = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
+                self._states = (states, file)
+                self._note_time(state_rows)
+        self.done = {press for press, entry in done.items() if entry[3] <= len(rows)}
+        self.readings = len(rows)
+        for press in sorted(set(done) - self.done):  # or they would count again as soon as enough rows follow
+            self._note(
+                {"event": "aborted", "press": press, "reading": len(rows), "reason": "its readings were torn off"}
+            )
+        self.sync()
+        self._press = max(self.done, default=-1) + 1
+        return self
+
+    def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
+        """Add (n,) times in s and (n, C) volts.
+
+        Raises:
+            InputError: shapes that do not fit, or times that are not finite.
+            OSError: the disk is full or gone; then nothing was added.
+        """
+        times, volts = numbers(times_s, np.float64, "times"), numbers(readings, np.float64, "readings")
+        if times.ndim != 1 or volts.shape != (len(times), self._fibres) or not np.isfinite(times).all():
+            raise InputError(
+                f"times have shape {times.shape} and readings {volts.shape}, expected (n,) finite numbers and "
+                f"(n, {self._fibres})"
+            )
+        rows = np.column_stack([times, volts])
+        self._blocks.append(rows)
+        self._note_time(rows)
+        self.readings += len(rows)
+
+    def append_states(self, rows: NDArray[np.float64]) -> None:
+        """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
+        if self._states is None:
+            file = (self._path / STATES).open("xb", buffering=0)
+            self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
+        self._states[0].append(rows)
+        self._note_time(rows)
+
+    def _note_time(self, rows: NDArray[np.float64]) -> None:
+        if len(rows):
+            self.last_s = max(self.last_s, float(rows[-1, 0]))
+
+    def begin(self, place_mm: ArrayLike, reading: int, press: int | None = None, **more: Any) -> None:
+        """Note that the probe is sent down at `place_mm` (2,); `reading` is the index of the reading that follows.
+
+        Args:
+            place_mm: NaN where it is not known.
+            press: its number, by default one more than that of the last.
+            more: what else is known of it, as JSON.
+
+        Raises:
+            InputError: a place, index or number that no press has, or what JSON cannot hold.
+        """
+        place = numbers(place_mm, np.float64, "place")
+        if place.shape != (2,) or not (np.isnan(place).all() or (np.abs(place) <= MAX_MM).all()):
+            raise InputError(f"place is {shown(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
+        number = self._press if press is None else whole("press", press, 0, MAX_INDEX)
+        reading = whole("reading", reading, 0, MAX_INDEX)
+        x, y = (None if np.isnan(value) else value for value in place.tolist())
+        self._note({"event": "begun", "press": number, "reading": reading, "x_mm": x, "y_mm": y, **more})
+        self._press, self._down = number, True
+
+    def finish(self, reading: int, **more: Any) -> None:
+        """Note that the probe is sent up; `reading` is the index of the reading that follows.
+
+        Raises:
+            InputError: no press was begun, an index that no reading has, or `more` is what JSON cannot hold.
+        """
+        if not self._down:
+            raise InputError(f"press {self._press} was not begun, so it cannot be finished")
+        reading = whole("reading", reading, 0, MAX_INDEX)
+        self._note({"event": "done", "press": self._press, "reading": reading, **more})
+        self.done.add(self._press)
+        self._press, self._down = self._press + 1, False
+
+    def abort(self, reason: str) -> None:
+        """Note that the press that was begun, if any is, did not come to its end."""
+        if not self._down:
+            return
+        self._down = False
+        self._note({"event": "aborted", "press": self._press, "reading": self.readings, "reason": reason})
+
+    def _note(self, event: Mapping[str, Any]) -> None:
+        try:
+            self._lines.append(json.dumps(event, allow_nan=False) + "\n")
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputError(f"press {event['press']}: {shown(event)}, expected what JSON can hold") from error
+
+    def sync(self) -> None:
+        """Put all so far on the disk: the readings and states first, then what the journal says of them."""
+        self._blocks.flush()
+        os.fsync(self._stream.fileno())
+        if self._states is not None:
+            self._states[0].flush()
+            os.fsync(self._states[1].fileno())
+        lines = "".join(self._lines).encode()
+        write_at(self._journal, self._noted, lines)
+        self._noted += len(lines)
+        self._lines.clear()
+        os.fsync(self._journal.fileno())
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.ExitStack() as files:
+            for file in (self._journal, self._stream, *(self._states or ())[1:]):
+                files.enter_context(file)
+            with contextlib.suppress(*([OSError] if kind else [])):  # the error under way tells more
+                self.sync()
+
+
+def _busy(path: Path) -> str:
+    return f"{path}: another program is recording into it"
+
+
+def fibres_of(path: Path) -> int:
+    """The number of fibres a run directory was recorded of.
+
+    Raises:
+        InputError: no run directory, or one that does not say.
+    """
+    if not (path / START).is_file():
+        raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
+    fibres = read_json(path / START, FORMAT).get("fibres")
+    if type(fibres) is not int or not 1 <= fibres <= MAX_FIBRES:
+        raise InputError(f"{path / START}: fibres is {fibres!r}, allowed is 1 to {MAX_FIBRES}")
+    return fibres
+
+
+def refuse_existing(path: Path) -> None:
+    """Raise InputError if `path` is anything but absent or an empty directory, or cannot be written."""
+    refuse_unwritable(path)
+    if path.exists() and any(path.iterdir()):
+        raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
+
+
+STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
+"""Columns of a row of `Arm.drain`; force is NaN where the arm has no sensor, safety 1 normal, 0 stopped."""

@@ -1,0 +1,207 @@
+"""Recordings: what the fibres gave while a probe pressed known places, as read from a run directory (`recorder`)."""
+
+import hashlib
+import json
+import shutil
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError, shown
+from design.common.files import read_json, writing
+from sense.processing.limits import (
+    MAX_FIBRES,
+    MAX_MM,
+    MAX_RATE_HZ,
+    MAX_S,
+    MAX_VOLTS,
+    MIN_RATE_HZ,
+    numbers,
+    refuse_beyond,
+    refuse_descent,
+)
+
+from .block_file import read_blocks
+from .press_journal import read_journal
+from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Readings of a pad and the presses made meanwhile.
+
+    Attributes:
+        readings: (R, C) volts, one row per reading, one column per fibre; NaN where one is missing.
+        times_s: (R,) ascending, s.
+        presses_mm: (Q, 2) places, mm from the pad's centre; NaN where a press's place is not known.
+        begun: (Q,) index of the first reading after the probe was sent down.
+        lifted: (Q,) index of the first reading after it was sent up; R if none was taken.
+        source: where the recording came from; free JSON.
+        torn_presses: presses that were left out because the end of the stream was torn off.
+
+    Raises:
+        InputError: no numbers, shapes that do not fit together, infinite values or such beyond the limits of
+            `limits`, no reading at all, half a place, times that do not ascend, presses that overlap, one without a
+            reading before it, or a source that JSON cannot hold.
+    """
+
+    readings: Array
+    times_s: Array
+    presses_mm: Array
+    begun: Indices
+    lifted: Indices
+    source: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    torn_presses: int = field(default=0, compare=False)
+
+    def __post_init__(self) -> None:
+        for name, kind in (
+            ("readings", np.float64),
+            ("times_s", np.float64),
+            ("presses_mm", np.float64),
+            ("begun", np.int64),
+            ("lifted", np.int64),
+        ):
+            array = numbers(getattr(self, name), kind, name)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        _validate(self)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Recording):
+            return NotImplemented
+        names = ("readings", "times_s", "presses_mm", "begun", "lifted")
+        return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def fibres(self) -> int:
+        """C, the number of recorded fibres."""
+        return self.readings.shape[1]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(Q,) whether the place of each press is known."""
+        return ~(np.isnan(self.presses_mm[:, 0]) | np.isnan(self.presses_mm[:, 1]))
+
+    @property
+    def rate_hz(self) -> float:
+        """Readings per second, by the median interval."""
+        return 1 / float(np.median(np.diff(self.times_s)))
+
+    @property
+    def digest(self) -> str:
+        """Hex SHA-256 of all readings and presses, wherever they are kept."""
+        digest = hashlib.sha256()
+        for array in (self.readings, self.times_s, self.presses_mm, self.begun, self.lifted):
+            plain = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # one NaN of many
+            digest.update(repr(array.shape).encode() + plain.tobytes())
+        return digest.hexdigest()
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Recording":
+        """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
+
+        The torn tail of a run directory is cut off, with the presses it had.
+
+        Raises:
+            InputError: no run directory, a file damaged elsewhere than at its end, or no press in it.
+        """
+        path = Path(path)
+        fibres = fibres_of(path)
+        start = read_json(path / START, FORMAT)
+        rows, _ = read_blocks(path / READINGS, fibres)
+        done = read_journal(path / JOURNAL)
+        presses = [press for press in done.values() if press[3] <= len(rows)]
+        table = np.array(presses, dtype=np.float64).reshape(-1, 4)
+        try:
+            return cls(
+                readings=rows[:, 1:],
+                times_s=rows[:, 0],
+                presses_mm=table[:, :2],
+                begun=table[:, 2].astype(np.int64),
+                lifted=table[:, 3].astype(np.int64),
+                source=start.get("source", {}),
+                torn_presses=len(done) - len(presses),
+            )
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def save(self, path: str | Path, provenance: Mapping[str, Any]) -> None:
+        """Write a run directory that appears whole or not at all.
+
+        Raises:
+            InputError: `path` exists and is not an empty directory (a recording is never written over, not even one
+                that appeared meanwhile), or cannot be written.
+        """
+        path = Path(path).resolve()
+        refuse_existing(path)
+        unfinished = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+        try:
+            with writing(path), Recorder(unfinished, self.fibres, self.source, provenance) as recorder:
+                recorder.append(self.times_s, self.readings)
+                for place, begun, lifted in zip(self.presses_mm, self.begun, self.lifted, strict=True):
+                    recorder.begin(place, int(begun))
+                    recorder.finish(int(lifted))
+            _put(unfinished, path)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _put(unfinished: Path, path: Path) -> None:
+    """Rename a run directory to `path`, unless another came there first."""
+    with writing(path):
+        try:
+            if path.exists():
+                path.rmdir()
+            unfinished.rename(path)
+        except OSError:
+            refuse_existing(path)
+            raise
+
+
+def _validate(recording: Recording) -> None:
+    if not isinstance(recording.source, Mapping):
+        raise InputError(f"source is {shown(recording.source)}, expected a mapping")
+    try:
+        json.dumps(dict(recording.source), allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"source is {shown(dict(recording.source))}, expected what JSON can hold ({error})") from error
+    readings, presses = recording.readings, recording.presses_mm
+    if readings.ndim != 2 or not 1 <= readings.shape[1] <= MAX_FIBRES or len(readings) < 2:
+        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
+    if recording.times_s.shape != (len(readings),):
+        raise InputError(f"times have shape {recording.times_s.shape}, expected ({len(readings)},)")
+    if presses.ndim != 2 or presses.shape[1] != 2 or len(presses) == 0:
+        raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
+    if recording.begun.shape != (len(presses),) or recording.lifted.shape != (len(presses),):
+        raise InputError(f"{len(presses)} presses have {recording.begun.size} begins and {recording.lifted.size} ends")
+    refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
+    refuse_beyond("times", recording.times_s[:, None], MAX_S, "s")
+    refuse_beyond("presses", presses, MAX_MM, "mm", missing=True)
+    if np.isnan(readings).all():
+        raise InputError(f"readings are all missing (NaN), all {readings.size} of them, expected some numbers")
+    half = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
+    if half.any():
+        raise InputError(f"press {int(np.argmax(half))} has one of x and y, expected both or neither")
+    refuse_descent(recording.times_s)
+    if not MIN_RATE_HZ <= recording.rate_hz <= MAX_RATE_HZ:
+        raise InputError(
+            f"times give {recording.rate_hz:g} readings a second, allowed is {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"
+        )
+    edges = np.column_stack([recording.begun, recording.lifted]).ravel()
+    late = np.diff(edges, prepend=0, append=len(readings) + 1) < 1
+    if late.any():
+        press = min(int(np.argmax(late)) // 2, len(presses) - 1)
+        raise InputError(
+            f"press {press} goes from reading {recording.begun[press]} to {recording.lifted[press]}, "
+            f"expected presses that do not overlap, each after at least one reading and within {len(readings)}"
+        )

@@ -1,0 +1,68 @@
+"""The simulated rig: the published protocol on the simulated pad."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design import Contact, Morphology, signals
+from design.common.errors import MOST_VALUES, InputError, instance, whole
+from design.common.settings import section
+from sense.processing.limits import MAX_FIBRES
+from sense.settings import Rig
+
+from .pad_model import Cycle, read_pad
+from .recording import Recording
+
+JITTER = 0.1
+"""Spread of the interval between readings, share of its mean: the loop of the recording is no clock."""
+
+Array = NDArray[np.float64]
+
+
+def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = None) -> Recording:
+    """Record presses at random places on a simulated pad.
+
+    A press takes a cycle of readings: the probe goes down in its middle and up at its end.
+
+    Args:
+        pad: course of the fibres. rig: length, rate, seed and strengths. contact: what a press deforms.
+
+    Returns:
+        The recording, the same for the same arguments.
+
+    Raises:
+        InputError: more fibres or readings than a recording may hold.
+    """
+    instance("pad", pad, Morphology)
+    rig, contact = section("rig", rig, Rig), section("contact", contact, Contact)
+    whole("fibres of the pad", 2 * pad.grid, 2, MAX_FIBRES)
+    values = rig.presses * rig.readings_per_press * 2 * pad.grid
+    if values > MOST_VALUES:
+        raise InputError(
+            f"[rig] presses is {rig.presses}: with {rig.readings_per_press} readings each of {2 * pad.grid} fibres "
+            f"{values} values, allowed are {MOST_VALUES}"
+        )
+    rng = np.random.default_rng(rig.seed)
+    cycle = Cycle(rig.readings_per_press, rig.rate_hz)
+    places_mm = random_places(pad, rig.presses, rng)
+    readings = read_pad(signals(pad, pad.to_grid(places_mm), contact), cycle, rig, rng)
+    intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
+    first = cycle.readings * np.arange(rig.presses)
+    return Recording(
+        readings,
+        np.cumsum(intervals_s),
+        places_mm,
+        begun=first + cycle.down_at,
+        lifted=first + cycle.readings,
+        source={
+            "kind": "simulated",
+            "rig": rig.model_dump(mode="json"),
+            "contact": contact.model_dump(),
+            "morphology": {"pitch_mm": pad.pitch_mm, "knots": pad.knots.tolist()},
+        },
+    )
+
+
+def random_places(pad: Morphology, presses: int, rng: np.random.Generator) -> Array:
+    """(Q, 2) places in mm, uniform over the middle square of the pad, half a pitch beyond its outer fibres."""
+    half = pad.grid / 2 * pad.pitch_mm
+    return rng.uniform(-half, half, (presses, 2))

@@ -1,0 +1,1 @@
+"""Calibrations on paper: charts, and their part of the report."""

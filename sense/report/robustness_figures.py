@@ -1,0 +1,102 @@
+"""Figures of the studies: robustness to lost fibres, and error against the number of presses learnt from."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from design.common.figures import ALARM, FAINT, HORIZONTAL, INK, VERTICAL, canvas, explain, save_figure, tidy
+from sense.localizer.calibration.learning_curve import power_law
+
+_WIDTH = 0.36
+
+
+def draw_robustness(document: Mapping[str, Any], path: Path) -> None:
+    """Draw the error against the number of lost fibres, every way beside the others, and every set as a dot; below,
+    each way's errors over the pad, with all fibres and without the worst set of each size."""
+    ways = document["ways"]
+    columns = len(next(iter(ways.values()))["errors"])
+    figure = Figure(figsize=(max(6.4, 1.9 * columns), 4.4 + 1.9 * len(ways)), layout="constrained")
+    grid = figure.add_gridspec(1 + len(ways), columns, height_ratios=[4.4] + [1.9] * len(ways))
+    axes = figure.add_subplot(grid[0, :])
+    tidy(axes)
+    for place, (way, colour) in enumerate(zip(ways, (VERTICAL, HORIZONTAL), strict=False)):
+        sideways = _WIDTH * (place - (len(ways) - 1) / 2)
+        for at, row in enumerate(ways[way]["errors"]):
+            means = [each["mean_mm"] for each in ways[way]["by_subset"] if len(each["lost"]) == row["lost"]]
+            # Spread in order of the error, so that no two dots of a level hide each other.
+            spread = np.linspace(-0.3, 0.3, len(means)) * _WIDTH if len(means) > 1 else np.zeros(1)
+            axes.bar(at + sideways, row["mean_mm"], 0.9 * _WIDTH, color=colour, alpha=0.35, label=None if at else way)
+            axes.scatter(at + sideways + spread, sorted(means), s=9, color=colour, linewidths=0, zorder=3)
+            axes.text(at + sideways, 0.03, f"{row['mean_mm']:.2f}", color=INK, fontsize=9, ha="center", va="bottom")
+    rows = next(iter(ways.values()))["errors"]
+    names = ["all fibres" if row["lost"] == 0 else f"{row['lost']} lost" for row in rows]
+    sets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
+    axes.set_xticks(range(len(rows)), [f"{name}\n{count}" for name, count in zip(names, sets, strict=True)])
+    axes.set_ylabel("mean error (mm)")
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    axes.legend(frameon=False, loc="upper left")
+    axes.set_title(
+        f"Lost fibres, {document['test_presses']} presses never trained on\n", loc="left", color=INK, fontsize=11
+    )
+    explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
+    means = [cell["mean_mm"] for way in ways.values() for each in way["maps"] for cell in each["by_place"]]
+    for row, (way, found) in enumerate(ways.items()):
+        panels = [figure.add_subplot(grid[1 + row, column], aspect="equal") for column in range(len(found["maps"]))]
+        pictures = [_draw_map(panel, each, max(means)) for panel, each in zip(panels, found["maps"], strict=True)]
+        panels[0].set_ylabel(way, fontsize=8, color=INK)
+        figure.colorbar(pictures[0], ax=panels[-1], label="mm", shrink=0.9)
+    save_figure(figure, path)
+
+
+def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
+    """Draw mean errors by cell of the pad, without the fibres that its title names."""
+    cells = found["by_place"]
+    x_mm, y_mm = (sorted({cell[name] for cell in cells}) for name in ("x_mm", "y_mm"))
+    errors = np.full((len(y_mm), len(x_mm)), np.nan)
+    for cell in cells:
+        errors[y_mm.index(cell["y_mm"]), x_mm.index(cell["x_mm"])] = cell["mean_mm"]
+    axes.set_xticks([])
+    axes.set_yticks([])
+    lost = "+".join(str(fibre + 1) for fibre in found["lost"])
+    axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
+    return axes.imshow(errors, origin="lower", cmap="magma_r", vmin=0, vmax=highest_mm)
+
+
+def draw_size_curve(document: Mapping[str, Any], path: Path) -> None:
+    """Draw the error against the number of presses learnt from, the fit, and what twice as many would bring."""
+    figure, axes = canvas(6.4, 4.4)
+    presses = np.array([point["presses"] for point in document["points"]], dtype=float)
+    means = [point["mean_mm"] for point in document["points"]]
+    ahead, fit = document["forecast"], document["fit"]
+    along = np.geomspace(presses[0], ahead["presses"], 200)
+    axes.plot(along, power_law(along, (fit["floor_mm"], fit["factor_mm"], fit["exponent"])), color=FAINT, linewidth=1.6)
+    errors = [2 * point["standard_error_mm"] for point in document["points"]]
+    axes.errorbar(presses, means, errors, fmt="o", color=INK, markersize=5, linewidth=1.2, label="measured")
+    reach = [[ahead["mean_mm"] - ahead["low_mm"]], [ahead["high_mm"] - ahead["mean_mm"]]]
+    axes.errorbar(
+        [ahead["presses"]],
+        [ahead["mean_mm"]],
+        reach,
+        fmt="D",
+        color=ALARM,
+        markersize=6,
+        linewidth=1.2,
+        label="expected",
+    )
+    axes.set_xscale("log")
+    ticks = [*presses.astype(int).tolist(), ahead["presses"]]
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.minorticks_off()
+    axes.set_ylim(0, None)
+    axes.set_xlabel("presses learnt from")
+    axes.set_ylabel("mean error (mm)")
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    axes.legend(frameon=False)
+    axes.set_title(
+        f"Error by number of presses, on the same {document['test_presses']}\n", loc="left", color=INK, fontsize=11
+    )
+    explain(axes, "bars: two standard errors; expected: 80 % of resamplings")
+    save_figure(figure, path)

@@ -1,0 +1,202 @@
+"""What a report has to say of how well a pad locates, with all its fibres and without some, and of studies."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from design.common.errors import InputError
+from design.common.files import read_bytes
+from design.common.page.elements import Section, beside, figures, folded, heading, paragraph, table
+from sense.processing.limits import MAX_FIBRES
+
+from .loss_chart import Errors, loss_chart
+
+STUDY = "padforge-study-"
+"""Formats of studies begin with this."""
+
+_HARDEST = 10
+"""So many sets of lost fibres are listed."""
+
+_COUNTED = ("one fibre", "two fibres", "three fibres")
+
+
+def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+    """Where the readings of a recording in `folder` came from, by its `start.json`.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
+    """
+    source = document["source"]
+    kind = source.get("kind")
+    origin = {"simulated": "the simulated rig", "rig": "a rig"}.get(kind) or source.get("file", kind)
+    rig = source.get("rig", {})
+    how = f", {rig['rate_hz']:g} a second; presses {rig['depth_mm']:g} mm deep" if rig else ""
+    return [Section("Recording", [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")])]
+
+
+def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+    """Errors of a `calibration.json` in `folder`, by lost fibres and by place, and how often each fibre is idle.
+
+    Where no `robustness.json` says more, what the loss of which fibres does follows.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
+        InputError: a picture beside it cannot be read.
+    """
+    rows = document["errors"]
+    first, last = rows[0], rows[-1]
+    idle = [f"{share:.0%}" for share in document["idle_share"]]
+    held = {"random": "drawn at random", "chronological": "the last ones"}.get(document["split"], document["split"])
+    section = Section(
+        "Calibration",
+        [
+            paragraph(
+                f"Errors on {document['test_presses']} presses never trained on ({held})."
+                f"{' One network serves every loss.' if len(rows) > 1 else ''} With every place come two radii that"
+                " ought to hold it in 50 % and in 90 % of cases."
+            ),
+            table(
+                ["lost", "sets", "mean (mm)", "std", "worst", "median", "95 %", "in r50", "in r90"],
+                [
+                    _errors(row, "median_mm", "p95_mm") + [f"{row[f'within_r{k}']:.1%}" for k in (50, 90)]
+                    for row in rows
+                ],
+            ),
+            paragraph(
+                "Mean, spread and worst are over the sets of lost fibres; median and 95th percentile over all their"
+                " presses."
+            ),
+            figures(
+                [
+                    (folder / "error_map.png", "Where presses were, and how far off they were found."),
+                    (folder / "error_by_loss.png", "Error by number of lost fibres."),
+                ]
+            ),
+            heading("Idle share"),
+            paragraph("The share of presses in which a fibre changes by less than 2 % of its range."),
+            table(["fibre", *map(str, range(1, len(idle) + 1))], [["idle", *idle]]),
+        ],
+        [
+            (f"{first['mean_mm']:.2f} mm", "mean error, " + _lost(first["lost"])),
+            *([(f"{last['mean_mm']:.2f} mm", "mean error, " + _lost(last["lost"]))] if len(rows) > 1 else []),
+        ],
+    )
+    return [section, *([] if (folder / "robustness.json").exists() else robustness_sections(folder, document))]
+
+
+def robustness_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+    """What the loss of which fibres does, from a `robustness.json` or `calibration.json`; none if none was lost.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
+        InputError: a picture beside it cannot be read.
+    """
+    ways: Mapping[str, Any] = document.get("ways") or {"": document}
+    found = {
+        name: {tuple(each["lost"]): float(each["mean_mm"]) for each in way["by_subset"]} for name, way in ways.items()
+    }
+    body = []
+    for name, errors in found.items():
+        if any(errors):
+            body += [*([heading(name.capitalize())] if name else []), *_losses(errors)]
+    if not body:
+        return []
+    if "" not in found:
+        rows = [[name, *_errors(row)] for name, way in ways.items() for row in way["errors"]]
+        head = ["way", "lost", "sets", "mean (mm)", "std", "worst"]
+        picture = figures([(folder / "robustness.png", "Error by number of lost fibres; every dot is a set of them.")])
+        body = [
+            paragraph(f"Errors on {document['test_presses']} presses never trained on, without every set of fibres."),
+            table(head, rows),
+            picture,
+            *body,
+        ]
+    return [Section("Robustness", body)]
+
+
+def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Studies in `folder` and in its folder `studies`, by path, with their documents.
+
+    Raises:
+        InputError: a .json file among them is none that can be read, so that nobody knows whether it is a study.
+    """
+    found = sorted([*folder.glob("[!.]*.json"), *(folder / "studies").glob("[!.]*.json")])
+    for path in filter(Path.is_file, found):
+        content = read_bytes(path)
+        try:
+            document = json.loads(content.decode())
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: not a JSON file ({error})") from error
+        if isinstance(document, dict) and str(document.get("format")).startswith(STUDY):
+            yield path, document
+
+
+def study_pieces(path: Path, document: Mapping[str, Any]) -> list[str]:
+    """HTML pieces of a study: what it shows in words, its figure if NAME.png lies beside NAME.json, and its table.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
+        InputError: the figure cannot be read.
+    """
+    title, text, rows = document["title"], document["text"], document["rows"]
+    if not isinstance(title, str) or not isinstance(text, list) or not isinstance(rows, list):
+        raise TypeError("title, text or rows is of another kind")
+    if any(list(row) != list(rows[0]) for row in rows):
+        raise ValueError("rows differ in their keys")
+    return [
+        heading(title),
+        *map(paragraph, text),
+        figures([(path.with_suffix(".png"), title)]),
+        *([table(list(rows[0]), [list(row.values()) for row in rows])] if rows else []),
+    ]
+
+
+def _losses(errors: Errors) -> Iterator[str]:
+    """Which sets of lost fibres are worst, in words, as a drawing and as a table."""
+    fibres = 1 + max(fibre for lost in errors for fibre in lost)
+    if fibres > MAX_FIBRES:
+        raise ValueError(f"fibre {fibres} is lost, of at most {MAX_FIBRES}")
+    counts = sorted({len(lost) for lost in errors} - {0})
+    worst = {count: max((lost for lost in errors if len(lost) == count), key=errors.__getitem__) for count in counts}
+    told = [f"of {_count(count)}, {_names(lost)} ({errors[lost]:.2f} mm)" for count, lost in worst.items()]
+    whole = f" With all fibres the error is {errors[()]:.2f} mm." if () in errors else ""
+    yield paragraph(f"The loss that hurts most: {'; '.join(told)}.{whole}")
+    few = {lost: error for lost, error in errors.items() if len(lost) <= 2}
+    chart: list[str] = []
+    if {1, 2} <= {len(lost) for lost in few}:
+        caption = (
+            "Mean error in mm without two fibres, given by the row and the column; on the diagonal, without one."
+            " Darker is worse."
+        )
+        chart = [f"<figure>{loss_chart(few, fibres)}<figcaption>{caption}</figcaption></figure>"]
+    head = ["fibre", *("alone (mm)" if count == 1 else f"with {_count(count - 1)} more" for count in counts)]
+    rows = [[fibre + 1, *(_mean(errors, fibre, count) for count in counts)] for fibre in range(fibres)]
+    listed = [table(head, rows), paragraph("Mean error over the sets of lost fibres that a fibre is in.")]
+    yield beside(*([chart] if chart else []), listed)
+    hardest = sorted(errors.items(), key=lambda each: -each[1])[:_HARDEST]
+    rows = [[_names(lost), f"{error:.2f}"] for lost, error in hardest if lost]
+    yield folded("The sets that hurt most", [table(["lost", "mean (mm)"], rows)])
+
+
+def _mean(errors: Errors, fibre: int, count: int) -> str:
+    found = [error for lost, error in errors.items() if len(lost) == count and fibre in lost]
+    return f"{sum(found) / len(found):.2f}" if found else "-"
+
+
+def _errors(row: Mapping[str, Any], *more: str) -> list[object]:
+    names = ("mean_mm", "std_mm", "max_mm", *more)
+    return [row["lost"], row["subsets"], *(f"{row[name]:.2f}" for name in names)]
+
+
+def _lost(count: int) -> str:
+    return "all fibres" if count == 0 else f"{count} fibre{'s' if count > 1 else ''} lost"
+
+
+def _count(count: int) -> str:
+    return _COUNTED[count - 1] if count <= len(_COUNTED) else f"{count} fibres"
+
+
+def _names(lost: Sequence[int]) -> str:
+    *rest, last = (str(fibre + 1) for fibre in lost)
+    return f"{', '.join(rest)} and {last}" if rest else last

@@ -1,0 +1,124 @@
+"""A serial port that speaks frames, with pyserial's ways to fail told apart for a person."""
+
+import errno
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from sense.rig.devices import RigFault
+
+from .framing import Decoder, Frame, Request, Settings, encode
+
+BAUD = 115_200
+"""Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
+POLL_S = 0.1
+"""The longest time `Link.receive` waits."""
+
+F = TypeVar("F", bound=Frame)
+
+_RESEND_S = 0.25
+_DUE_PORTS = {0x003E: "native", 0x003D: "programming"}
+_VENDORS = (0x2341, 0x2A03)
+
+
+@dataclass(frozen=True)
+class BoardPort:
+    """A port at which an Arduino Due seems to be: "native" is the one to use, "programming" cannot carry the data."""
+
+    device: str
+    kind: str
+    serial_number: str
+
+
+def find_ports() -> list[BoardPort]:
+    """The ports of this host that look like a Due, native ones first. Raises RigFault("refused") without pyserial."""
+    _pyserial()
+    from serial.tools.list_ports import comports
+
+    found = [
+        BoardPort(port.device, _DUE_PORTS[port.pid], port.serial_number or "")
+        for port in comports()
+        if port.vid in _VENDORS and port.pid in _DUE_PORTS
+    ]
+    return sorted(found, key=lambda port: (port.kind, port.device))
+
+
+class Link:
+    """An open port. Any method but `close` raises RigFault("lost") once the board is gone."""
+
+    def __init__(self, port: str) -> None:
+        """Open `port` for this process alone; raises RigFault("refused") where that cannot be."""
+        self.port = port
+        self.decoder = Decoder()
+        serial = _pyserial()
+        try:
+            self._serial = serial.Serial(port, BAUD, timeout=POLL_S, write_timeout=1, exclusive=True)
+        except Exception as error:  # pyserial lets termios.error through, which is no OSError
+            raise refusal(port, error) from error
+
+    def receive(self) -> tuple[float, list[Frame]]:
+        """The frames that have come, after waiting for at most `POLL_S`, and when they came."""
+        try:
+            data = self._serial.read(1)
+            if data:
+                data += self._serial.read(self._serial.in_waiting)
+        except OSError as error:
+            raise self._lost(error) from error
+        return time.monotonic(), self.decoder.feed(data)
+
+    def send(self, command: Request | Settings) -> None:
+        """Send one command."""
+        try:
+            self._serial.write(encode(command))
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def ask(self, command: Request | Settings, kind: type[F], fits: Callable[[F], bool], wait_s: float) -> F:
+        """Send `command` until a frame of `kind` that `fits` comes; all other frames are thrown away.
+
+        Raises:
+            RigFault: "stale" where none has come after `wait_s`.
+        """
+        deadline = time.monotonic() + wait_s
+        resend = 0.0
+        while (now := time.monotonic()) < deadline:
+            if now >= resend:
+                self.send(command)
+                resend = now + _RESEND_S
+            for frame in self.receive()[1]:
+                if isinstance(frame, kind) and fits(frame):
+                    return frame
+        raise RigFault("stale", f"{self.port}: no answer within {wait_s:g} s")
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        with suppress(OSError):
+            self._serial.close()
+
+    def _lost(self, error: OSError) -> RigFault:
+        return RigFault("lost", f"{self.port}: the board is gone ({error})", "check its cable and connect again")
+
+
+def refusal(port: str, error: Exception) -> RigFault:
+    """What pyserial's `error` on opening `port` means and what to do about it."""
+    number, text = getattr(error, "errno", None), str(error)  # Windows has the kind in the text only
+    if number == errno.ENOENT or "FileNotFoundError" in text:
+        advice = "check the cable; `padforge sense doctor` lists the ports there are"
+        return RigFault("refused", f"{port}: there is no such port", advice)
+    if number in (errno.EAGAIN, errno.EBUSY) or "PermissionError" in text:
+        advice = "close it; it may be the serial monitor of the Arduino IDE"
+        return RigFault("refused", f"{port}: another program uses it", advice)
+    if number in (errno.EACCES, errno.EPERM):
+        advice = "join the group that owns it (`sudo usermod -aG dialout $USER`) and log in again"
+        return RigFault("refused", f"{port}: no permission to open it", advice)
+    return RigFault("refused", f"{port}: cannot be opened ({error})", "check that it is the board's native USB port")
+
+
+def _pyserial() -> Any:
+    try:
+        import serial
+    except ModuleNotFoundError as error:
+        raise RigFault("refused", "pyserial is not installed", "pip install 'padforge[rig]'") from error
+    return serial

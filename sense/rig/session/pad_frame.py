@@ -1,0 +1,53 @@
+"""Where the pad lies before the arm: from places on the pad to poses of the tool and back."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sense.rig.devices import Pose, RigFault
+from sense.settings import Rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The pad's frame in the arm's base frame.
+
+    Attributes:
+        centre_mm: of the pad, x and y. turn_rad: from the base's x axis to the pad's.
+        contact_mm: height of the pad's surface. tool_rad: rotation vector of the tool.
+    """
+
+    centre_mm: tuple[float, float]
+    turn_rad: float
+    contact_mm: float
+    tool_rad: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, rig: Rig) -> "Frame":
+        """The frame that `[rig]` says; raises RigFault where the contact height is unknown."""
+        if rig.contact_mm is None:
+            raise RigFault(
+                "refused",
+                "[rig] contact_mm is unknown, allowed is the height of the pad's surface in the base frame",
+                "touch the pad with the tool by hand and note its z",
+            )
+        return cls(rig.pad_mm, math.radians(rig.pad_angle_deg), rig.contact_mm, rig.tool_rad)
+
+    def pose(self, place_mm: Array, depth_mm: float) -> Pose:
+        """The tool's pose at a place (2,) on the pad, `depth_mm` below its surface (above: less than 0)."""
+        x, y = self._turned(np.asarray(place_mm, dtype=np.float64), self.turn_rad) + self.centre_mm
+        return (float(x), float(y), self.contact_mm - depth_mm, *self.tool_rad)
+
+    def tip(self, poses: Array) -> tuple[Array, Array]:
+        """Places (n, 2) on the pad and depths (n,) of poses (n, 3 or more), mm."""
+        places = self._turned(poses[:, :2] - self.centre_mm, -self.turn_rad)
+        return places, self.contact_mm - poses[:, 2]
+
+    @staticmethod
+    def _turned(points: Array, angle: float) -> Array:
+        c, s = math.cos(angle), math.sin(angle)
+        return points @ np.array([[c, s], [-s, c]])

@@ -1,0 +1,1 @@
+"""The UR arm, in a process of its own."""

@@ -1,0 +1,25 @@
+"""Starts a module of this package as a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+
+
+def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
+    """Run `python -m module` with pipes to its stdin and stdout.
+
+    It finds this package wherever it is started from, and an interrupt from the keyboard does not reach it: its parent
+    decides what is to end first.
+    """
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    return subprocess.Popen(
+        [sys.executable, "-m", module, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=stderr,
+        env=os.environ | {"PYTHONPATH": path},
+        start_new_session=True,
+    )

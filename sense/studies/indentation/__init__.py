@@ -1,0 +1,1 @@
+"""Depth, force and shape of what presses."""

@@ -1,0 +1,221 @@
+"""Taking benchmarks: rounds, files, the summary, and the comparison with an earlier run. No times are asserted."""
+
+import csv
+import json
+import time
+
+import pytest
+
+from design.benchmarking import harness, suite
+from design.benchmarking.comparison import compared, lines, read_earlier, worse
+from design.benchmarking.harness import Bench, Measured, Trial, measure
+from design.benchmarking.suite import run_benches
+from design.benchmarking.table import bench_lines, summary_rows, write_bench
+from design.common.errors import InputError
+
+
+def bench(error=0.1, work=lambda: None, name="x"):
+    def trials():
+        for case in ("a", "b"):
+            yield Trial(case, "plain", 7, lambda: None, lambda found: {"error": 0.5, "visited": 1.0})
+            yield Trial(case, "ours", 0, work, lambda found: {"error": error, "visited": 0.25})
+
+    return Bench(name, trials, "error (mm)", ("plain", 7), ("ours", 0), plain=("plain",))
+
+
+def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
+    row = {"case": "a", "way": way, "size": 0, "repetition": 0}
+    row |= {"error": error, "seconds": seconds, "paces": seconds / pace, "visited": visited, "speed": 1.0}
+    return {"bench": "x", "plain": ["plain"], "pace_s": pace, "rows": [row]}
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr(harness, "BUDGET_S", 0)
+    monkeypatch.setattr(suite.time, "sleep", lambda seconds: None)
+
+
+def test_a_later_round_times_what_it_is_told_to_and_judges_once():
+    judged = []
+    trial = Trial("a", "ours", 3, lambda: 42, lambda found: judged.append(found) or {"error": 1.0})
+    one = Bench("x", lambda: iter([trial]), "error", ("ours", 3), ("ours", 3), plain=())
+    so_far = Measured()
+    assert measure(one, so_far, lambda step: None, lambda key: False) == 1
+    assert measure(one, so_far, lambda step: None, lambda key: False) == 0
+    assert measure(one, so_far, lambda step: None, lambda key: key == trial.key) == 1
+    assert judged == [42]
+    assert len(so_far.times[trial.key]) == 2
+
+
+def test_slow_plain_ways_are_timed_once(monkeypatch):
+    monkeypatch.setattr(harness, "PLAIN_S", -1)
+    so_far = Measured()
+    measure(bench(), so_far, lambda step: None, lambda key: True)
+    assert measure(bench(), so_far, lambda step: None, lambda key: True) == 2  # ours of both cases
+
+
+def test_a_trial_is_settled_when_its_two_best_rounds_agree():
+    so_far = Measured(times={("a", "ours", 0, 0): [1.0], ("b", "ours", 0, 0): [2.0, 1.0, 1.01]})
+    assert not so_far.settled(("a", "ours", 0, 0))
+    assert so_far.settled(("b", "ours", 0, 0))
+    so_far.times["b", "ours", 0, 0] = [2.0, 1.0, 1.5]
+    assert not so_far.settled(("b", "ours", 0, 0))
+
+
+def test_time_is_an_items_and_waits_for_a_core_do_not_count(monkeypatch):
+    waits = iter([0.0, 0.006] * 1000)
+    monkeypatch.setattr(harness, "_waited_s", lambda: next(waits))
+    monkeypatch.setattr(harness, "_fixed_work", lambda: [0.5, 1.0])
+    now = iter([0.0, 0.01] * 1000)
+    monkeypatch.setattr(harness.time, "perf_counter", lambda: next(now))
+    trial = Trial("a", "ours", 0, lambda: None, items=2)
+    so_far = Measured()
+    measure(Bench("x", lambda: iter([trial]), "", ("ours", 0), ("ours", 0), ()), so_far, lambda s: None, lambda k: True)
+    assert so_far.times[trial.key] == [pytest.approx(0.002)]
+    assert so_far.paces[trial.key] == [pytest.approx(0.002 / 0.75)]
+    assert so_far.pace_s == 0.5
+
+
+def test_files_hold_what_was_measured(tmp_path):
+    heard = []
+    summary, changes = run_benches([bench()], tmp_path, heard.append, {})
+    assert heard
+    assert not changes
+    assert {path.name for path in tmp_path.iterdir()} == {"x.json", "x.csv", "x.png", "bench.json", "bench.csv"}
+    assert json.loads((tmp_path / "bench.json").read_text()) == summary
+    made = summary["benches"]["x"]
+    assert json.loads((tmp_path / "x.json").read_text()) == made
+    assert [(row["case"], row["way"]) for row in made["rows"]] == [
+        *(("a", "plain"), ("a", "ours"), ("b", "plain"), ("b", "ours"))
+    ]
+    assert [row["speed"] for row in made["rows"][::2]] == [1, 1]
+    with (tmp_path / "x.csv").open() as file:
+        assert [row["error"] for row in csv.DictReader(file)] == ["0.5", "0.1"] * 2
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+    assert len(bench_lines(made)) == len(made["rows"]) + 3
+    assert [(row["case"], row["reference_error"], row["error"]) for row in summary["summary"]] == [
+        *(("a", 0.5, 0.1), ("b", 0.5, 0.1))
+    ]
+
+
+def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
+    so_far = Measured(pace_s=1e-3)
+    for number, (error, seconds) in enumerate(((0.1, 2.0), (0.3, 9.0), (0.2, 4.0))):
+        so_far.found["a", "slow", 1, number] = {"error": error}
+        so_far.times["a", "slow", 1, number] = so_far.paces["a", "slow", 1, number] = [seconds + 1, seconds]
+    so_far.found["a", "fast", 0, 0] = {"error": 0.4}
+    so_far.times["a", "fast", 0, 0] = so_far.paces["a", "fast", 0, 0] = [0.5]
+    made = write_bench(Bench("x", lambda: iter(()), "error", ("slow", 1), ("fast", 0), ()), so_far, tmp_path)
+    assert [row["speed"] for row in made["rows"]] == [2.0, pytest.approx(4 / 9), 1.0, 8.0]
+    row = f"{'a':<20} {'slow':<13} {1:>7} {'0.200':>9} {'4.00 s':>10} {'1.00x':>8} {'-':>8}"
+    assert bench_lines(made)[3] == row
+    (only,) = summary_rows([made])
+    assert (only["reference_seconds"], only["seconds"], only["speed"]) == (4.0, 0.5, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("now", "what"),
+    [
+        (document(seconds=1.3), ["slower"]),
+        (document(seconds=1.24), []),
+        (document(seconds=0.5), []),
+        (document(seconds=1.3, pace=1.3e-3), []),  # the machine is slower
+        (document(seconds=1.0, pace=0.7e-3), ["slower"]),  # the machine is faster
+        (document(error=1.0), ["less accurate"]),
+        (document(error=0.11), []),
+        (document(error=float("nan")), ["less accurate"]),
+        (document(visited=0.5), ["looks at more"]),
+        (document(seconds=2.0, error=1.0), ["less accurate", "slower"]),
+        (document(seconds=3.0, way="plain"), []),
+        (document(seconds=3.0, way="new"), []),
+    ],
+)
+def test_what_has_become_worse_is_found(now, what):
+    before = document(way=now["rows"][0]["way"] if now["rows"][0]["way"] != "new" else "ours")
+    assert [change.what for change in worse(before, now)] == what
+
+
+def test_quick_work_is_slower_from_a_smaller_ratio_on():
+    assert [change.what for change in worse(document(seconds=0.01), document(seconds=0.0121))] == ["slower"]
+    assert not worse(document(seconds=0.01), document(seconds=0.0119))
+    assert not worse(document(seconds=0.01), document(seconds=0.013, pace=1.3e-3))  # the machine is slower
+
+
+def test_tiny_work_is_slower_in_company_only():
+    def two(*seconds):
+        made = document(seconds=seconds[0])
+        made["rows"].append(made["rows"][0] | {"case": "b", "seconds": seconds[1], "paces": seconds[1] / 1e-3})
+        return made
+
+    before = two(1e-4, 2e-4)
+    assert not worse(before, two(1.4e-4, 2e-4))
+    assert {change.key[0] for change in worse(before, two(1.4e-4, 2.8e-4))} == {"a", "b"}
+
+
+def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
+    now = document(seconds=1.5)
+    now["rows"][0]["paces"] = 1.05e3
+    assert not worse(document(), now)
+
+
+def test_errors_of_rounding_are_all_alike():
+    assert not worse(document(error=1e-17), document(error=9e-16))
+    assert [change.ratio for change in worse(document(error=0.0), document(error=1e-14))] == [pytest.approx(10)]
+
+
+def test_a_change_is_told_in_one_line():
+    (change,) = worse(document(), document(seconds=1.5))
+    assert str(change) == "x, a, ours: slower, 1.50x (1 before, 1.5 now)"
+    assert lines([change], 3) == ["3 trials compared; worse than before:", f"  {change}"]
+    assert lines([], 3) == ["3 trials compared: none slower, less accurate or looking at more"]
+    assert compared({"x": document()}, {"x": document(), "y": document()}) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file/out: cannot be written"):
+        run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
+
+
+def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path):
+    summary, _ = run_benches([bench(work=lambda: time.perf_counter())], tmp_path, lambda step: None, {})
+    before = summary["benches"]
+    for row in before["x"]["rows"]:
+        row["seconds"], row["paces"] = 10 * before["x"]["pace_s"], 10.0  # some 2 ms
+    delays = iter([0.004] * 12)
+
+    def disturbed():
+        end = time.perf_counter() + next(delays, 0)
+        while time.perf_counter() < end:
+            pass
+
+    _, changes = run_benches([bench(work=disturbed)], tmp_path, lambda step: None, before)
+    assert not changes
+    assert not any(delays)
+
+
+def test_work_that_has_become_slower_and_worse_is_found(tmp_path):
+    def work(times):
+        return lambda: sum(i * i for i in range(times * 10_000))
+
+    before, _ = run_benches([bench(work=work(1))], tmp_path / "a", lambda step: None, {})
+    earlier = read_earlier(tmp_path / "a" / "bench.json")
+    assert earlier == before["benches"]
+    assert read_earlier(tmp_path / "a" / "x.json") == earlier
+    _, changes = run_benches([bench(1.0, work(3))], tmp_path / "b", lambda step: None, earlier)
+    assert {(change.what, change.key[0]) for change in changes} == {
+        *(("slower", "a"), ("slower", "b"), ("less accurate", "a"), ("less accurate", "b"))
+    }
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[]", "{}", '{"format": "padforge-benches/1"}', '{"format": "padforge-benches/1", "benches": 3}'),
+        *('{"format": "padforge-bench/1"}', '{"format": "padforge-benches/1", "benches": {"contact": {"rows": [1]}}}'),
+    ],
+)
+def test_a_file_that_is_no_earlier_run_is_refused(tmp_path, text):
+    (tmp_path / "bench.json").write_text(text)
+    with pytest.raises(InputError, match=r"bench\.json"):
+        read_earlier(tmp_path / "bench.json")

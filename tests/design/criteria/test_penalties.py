@@ -1,0 +1,238 @@
+"""Every rule as a penalty: nothing where it holds, more the more it is broken, with a true gradient."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import PchipInterpolator
+
+from design import Morphology
+from design.criteria.differentiable import span_samples
+from design.criteria.penalties import penalties
+from design.criteria.rules import check
+from design.pad.contact import fibre_axes
+from design.pad.curves import crossings, lengths
+from design.settings import Pad, Rules
+
+NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0, border_mm=0, max_length_mm=1e6)
+
+
+def axes(pad):
+    travel, cross, _ = fibre_axes(pad)
+    return torch.tensor(travel[0], requires_grad=True), torch.tensor(cross[0], requires_grad=True)
+
+
+def found(pad, rules, margin=1.0):
+    return {rule: value.item() for rule, value in penalties(*axes(pad), Pad(grid=pad.grid), rules, margin).items()}
+
+
+def bent(cross, travel=2.5, fibre=0, others=0.0):
+    """A 4 x 4 grid with one knot of one fibre moved, the others lifted by `others`."""
+    knots = Morphology.straight(4).knots
+    middle = knots.mean(axis=1, keepdims=True)
+    middle[:4, :, 1] += others
+    knots = np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1)
+    knots[fibre, 1] = (travel, cross) if fibre < 4 else (cross, travel)
+    return Morphology(knots)
+
+
+def test_the_straight_grid_has_no_penalty():
+    assert set(found(Morphology.straight(4), Rules()).values()) == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("limits", "mild", "worse"),
+    [
+        ({"min_bend_radius_mm": 60.0}, bent(1.75), bent(1.9)),
+        ({"min_gap_mm": 5.0}, bent(1.7), bent(1.9)),
+        ({"same_family_crossings": 0}, bent(2.2), bent(2.8)),
+        ({"border_mm": 4.0}, bent(4.6, travel=0.3), bent(4.6, travel=0.2)),
+        ({"max_length_mm": 60.0}, bent(2.8), bent(3.8)),
+        ({"max_crossings": 10}, bent(1.1), bent(3.5, travel=4.5)),
+        ({"min_crossing_angle_deg": 85.0}, bent(1.3), bent(1.9)),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_broken_rule_has_a_penalty_that_grows(limits, mild, worse):
+    rules = NONE.model_copy(update=limits)
+    (rule,) = limits
+    grid, little, much = (found(pad, rules)[rule] for pad in (Morphology.straight(4), mild, worse))
+    if rule != "max_crossings":
+        assert grid == pytest.approx(0, abs=1e-9)
+    assert 0 < little <= much
+
+
+def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
+    """On random gentle pads; those with a penalty are only counted, so that the test is seen to look at both kinds."""
+    rng, rules, passed = np.random.default_rng(0), Rules(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70), 0
+    for _ in range(60):
+        knots = Morphology.straight(4).knots
+        inner = np.linspace(knots[:, 0], knots[:, -1], 7).transpose(1, 0, 2)[:, 1:-1]
+        scatter = rng.uniform(0.02, 0.3)
+        inner[:4, :, 1] += scatter * rng.standard_normal((4, 5))
+        inner[4:, :, 0] += scatter * rng.standard_normal((4, 5))
+        pad = Morphology(np.concatenate([knots[:, :1], inner, knots[:, 1:]], axis=1))
+        if sum(found(pad, rules, margin=1.05).values()) == 0:
+            passed += 1
+            assert check(pad, rules) == []
+    assert 5 < passed < 55
+
+
+def test_folds_that_come_near_each_other_are_pushed_apart():
+    knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [1.1, 1.9], [1.2, 1.0], [2, 1.0]])
+    straight = np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=-1)
+    pad = Morphology(np.stack([knots, straight]))
+    rules = NONE.model_copy(update={"min_gap_mm": 4.0})
+    assert found(pad, rules)["folds"] > 0
+    assert {v.fibres for v in check(pad, rules)} == {(1,)}
+
+
+def test_the_soft_number_of_crossings_is_the_number_of_crossings():
+    rules = NONE.model_copy(update={"max_crossings": 1})
+    for seed in range(3):
+        pad = Morphology.random(3, 2, seed)
+        number = sum((c.first < 3) != (c.second < 3) for c in crossings(pad))
+        assert found(pad, rules)["max_crossings"] + 1 == pytest.approx(number, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        Rules(min_bend_radius_mm=4, min_gap_mm=9),
+        NONE.model_copy(update={"max_crossings": 3, "min_crossing_angle_deg": 60}),
+    ],
+)
+def test_the_gradient_is_that_of_finite_differences(rules):
+    """Along random directions, since a search follows it; kinks (a nearest sample that changes) are rare."""
+    rng = np.random.default_rng(4)
+    pad = Morphology.random(2, 3, seed=5)
+    travel, cross = axes(pad)
+    total = torch.stack(list(penalties(travel, cross, Pad(grid=2), rules).values())).sum()
+    total.backward()
+    step = 1e-6 * torch.tensor(rng.standard_normal(cross.shape))
+    step[:, [0, -1]] = 0
+    with torch.no_grad():
+        ahead, behind = (
+            torch.stack(list(penalties(travel, cross + sign * step, Pad(grid=2), rules).values())).sum()
+            for sign in (1, -1)
+        )
+    assert cross.grad is not None
+    assert (ahead - behind).item() / 2 == pytest.approx((cross.grad * step).sum().item(), rel=2e-2)
+
+
+@pytest.mark.parametrize("margin", [1.0, 1.25])
+def test_a_fibre_too_long_costs_the_share_by_which_it_is(margin):
+    """All fibres of the grid are 56.25 mm long; one alone counts by its share of the pad."""
+    limit = NONE.model_copy(update={"max_length_mm": 45.0})
+    assert found(Morphology.straight(4), limit, margin)["max_length_mm"] == pytest.approx(1.25 * margin - 1)
+    pad = bent(3.0)
+    over = lengths(pad)[0] * pad.pitch_mm / 57.0 - 1
+    limit = NONE.model_copy(update={"max_length_mm": 57.0})
+    assert found(pad, limit)["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
+
+
+@pytest.mark.parametrize("margin", [1.0, 1.2])
+def test_a_grid_too_narrow_costs_by_a_closed_form(margin):
+    """A sample nearer by the share c costs c + 10 c^2; in a row of four the outer two have one neighbour, not two."""
+    close = 1 - 11.25 / (15.0 * margin)
+    terms = found(Morphology.straight(4), NONE.model_copy(update={"min_gap_mm": 15.0}), margin)
+    assert terms["min_gap_mm"] == pytest.approx((close + 10 * close**2) * 6 / 4)
+    assert terms["same_family_crossings"] == pytest.approx(close + 10 * close**2)
+    passing = found(Morphology.straight(4), NONE.model_copy(update={"min_gap_mm": 11.2 / margin}), margin)
+    assert passing["min_gap_mm"] == passing["same_family_crossings"] == 0
+
+
+def dense(pad, fibre):
+    """Arc length, heading and slope at many points along a fibre, by SciPy, and their travel coordinate."""
+    axis = 0 if fibre < pad.grid else 1
+    t = pad.knots[fibre, :, axis]
+    curve = PchipInterpolator(t, pad.knots[fibre, :, 1 - axis])
+    at = np.linspace(0, pad.grid + 1, 20_001)
+    slope = curve.derivative()(at)
+    arc = np.append(0, np.hypot(np.diff(at), np.diff(curve(at))).cumsum())
+    return arc, np.arctan(slope), slope, at
+
+
+@pytest.mark.parametrize("margin", [1.0, 1.3])
+def test_a_bend_costs_what_its_windows_turn_too_far(margin):
+    """Against the mean over the pad's fibres of the integral along each, in shares of the size of the pad."""
+    pad, limit_mm = bent(2.6), 20.0
+    expected = 0.0
+    for fibre in range(8):
+        arc, heading, _, _ = dense(pad, fibre)
+        turned = np.append(0, np.abs(np.diff(heading)).cumsum())
+        window = limit_mm / pad.pitch_mm / 2
+        over = (np.interp(arc + window, arc, turned) - turned) * margin * 2 - 1
+        expected += np.trapezoid(np.maximum(over, 0), arc) / (pad.grid + 1) / 8
+    rules = NONE.model_copy(update={"min_bend_radius_mm": limit_mm})
+    assert found(pad, rules, margin)["min_bend_radius_mm"] == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(("cross", "travel", "fibre"), [(1.9, 0.3, 0), (3.0, 4.6, 5)])
+def test_a_fibre_steep_beside_its_wall_costs_by_how_steep_and_how_long(cross, travel, fibre):
+    pad, zone_mm = bent(cross, travel, fibre), 9.0
+    arc, _, slope, at = dense(pad, fibre)
+    beside = (at < zone_mm / pad.pitch_mm) | (at > pad.grid + 1 - zone_mm / pad.pitch_mm)
+    expected = np.trapezoid(np.maximum(np.abs(slope) - 1, 0) * beside, arc) / 8 / (pad.grid + 1)
+    found_ = found(pad, NONE.model_copy(update={"border_mm": zone_mm}))["border_mm"]
+    assert expected > 0
+    assert found_ == pytest.approx(expected, rel=0.05)
+
+
+def test_a_slanting_crossing_costs_the_share_its_angle_falls_short():
+    """Two fibres that swing by a slope of 1.5 cross at 33.7 degrees, and the other three pairs more steeply."""
+    swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
+    pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
+    rules = NONE.model_copy(update={"min_crossing_angle_deg": 50.0})
+    expected = 1 - np.degrees(np.arctan(1 / 1.5)) / 50
+    assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(expected, rel=0.1)
+    assert found(pad, rules, margin=1.2)["min_crossing_angle_deg"] == pytest.approx(
+        1 - np.degrees(np.arctan(1 / 1.5)) / 60, rel=0.1
+    )
+    rules = NONE.model_copy(update={"min_crossing_angle_deg": 30.0})
+    assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(0, abs=0.01)
+
+
+def test_crossings_of_a_family_beyond_those_allowed_are_counted():
+    """A fibre that swings over two others and back crosses four times; the count is soft, what is made of it is not."""
+
+    def penalty(allowed, margin=1.0):
+        rules = NONE.model_copy(update={"same_family_crossings": allowed})
+        return found(bent(3.4), rules, margin)["same_family_crossings"]
+
+    count = penalty(1) + 1
+    assert count == pytest.approx(4, rel=0.1)
+    assert penalty(5) == 0
+    assert penalty(8, margin=8.0) == pytest.approx(count - 1)
+    assert penalty(6, margin=2.0) == pytest.approx((count - 3) / 3)
+
+
+def test_only_rules_that_may_be_broken_are_computed():
+    always = {"same_family_crossings", "max_length_mm"}
+    assert set(found(Morphology.straight(2), NONE)) == always
+    assert set(found(Morphology.straight(1), NONE)) == {"max_length_mm"}
+    wide = NONE.model_copy(update={"min_bend_radius_mm": 1.0, "min_gap_mm": 1.0})
+    assert set(found(Morphology.straight(2), wide)) == {*always, "min_bend_radius_mm", "min_gap_mm"}
+    folded = NONE.model_copy(update={"min_bend_radius_mm": 1.0, "min_gap_mm": 1.1})
+    assert set(found(Morphology.straight(2), folded)) == {*always, "min_bend_radius_mm", "min_gap_mm", "folds"}
+    assert set(found(Morphology.straight(1), folded)) == {"max_length_mm", "min_bend_radius_mm", "folds"}
+
+
+@pytest.mark.parametrize("margin", [1.0, 1.5])
+def test_folds_cost_by_how_near_the_points_of_a_fibre_come_to_what_is_far_along_it(margin):
+    """Against the nearest of many points of SciPy's curve that lie half a turn of a gap away or more."""
+    knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [1.1, 1.9], [1.2, 1.0], [2, 1.0]])
+    straight = np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=-1)
+    pad, gap = Morphology(np.stack([knots, straight])), margin * 4.0 / 11.25
+    place = span_samples(*axes(pad), 12)[0].detach().numpy()
+    curve = PchipInterpolator(knots[:, 0], knots[:, 1])
+    at = np.unique(np.concatenate([np.linspace(0, 2, 20_001), place[0, :, 0]]))
+    line = np.column_stack([at, curve(at)])
+    arc = np.append(0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
+    expected = 0.0
+    for point in place[0]:
+        here = arc[np.searchsorted(at, point[0])]
+        far = np.abs(arc - here) >= np.pi / 2 * gap
+        close = max(1 - np.linalg.norm(line[far] - point, axis=1).min() / gap, 0)
+        expected += (close + 10 * close**2) / place[..., 0].size
+    rules = NONE.model_copy(update={"min_gap_mm": 4.0})
+    assert found(pad, rules, margin)["folds"] == pytest.approx(expected, rel=0.2)

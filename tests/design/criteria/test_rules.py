@@ -1,0 +1,258 @@
+"""Exact rule checks on geometry whose answer is known."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import PchipInterpolator
+
+from design import InputError, Morphology, Spec, crossings
+from design.criteria.rules import check
+from design.pad.curves import crossing_angles
+from design.settings import Rules
+
+NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
+
+
+def only(**limits):
+    return NONE.model_copy(update=limits)
+
+
+def test_the_straight_grid_breaks_nothing():
+    assert check(Morphology.straight(4), Rules()) == []
+
+
+def bent(cross, travel=2.5, fibre=0):
+    """A 4 x 4 grid with one knot of one fibre moved."""
+    knots = np.repeat(Morphology.straight(4).knots, [1] * 8, axis=0)
+    middle = knots.mean(axis=1, keepdims=True)
+    knots = np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1)
+    knots[fibre, 1] = (travel, cross) if fibre < 4 else (cross, travel)
+    return Morphology(knots)
+
+
+def test_fibres_too_close_are_named_with_their_gap():
+    found = check(bent(1.95), only(min_gap_mm=0.8))
+    assert [v.fibres for v in found] == [(1, 2)]
+    assert found[0].measured == pytest.approx(0.05 * 11.25, abs=1e-3)
+    assert found[0].place_mm == pytest.approx((0, (1.975 - 2.5) * 11.25), abs=0.3)
+
+
+def zigzag(apart_mm, legs=3):
+    """A pad of 1 + 1 fibres whose horizontal one has upright branches `apart_mm` apart."""
+    at = 1 + np.arange(legs + 1) * apart_mm / 11.25
+    up = np.resize([1.0, 1.5], legs + 2)
+    branches = [
+        (x + side, y) for x, low, high in zip(at, up, up[1:], strict=False) for side, y in ((0, low), (1e-6, high))
+    ]
+    fibre = np.array([(0, 1), *branches, (2, 1)])
+    return Morphology(np.stack([fibre, np.column_stack([np.ones(len(fibre)), fibre[:, 0]])]))
+
+
+def test_branches_of_one_fibre_too_close_are_found_with_their_gap():
+    found = check(zigzag(0.5), only(min_gap_mm=0.8))
+    assert [(v.rule, v.fibres) for v in found] == [("min_gap_mm", (1,))]
+    assert found[0].measured == pytest.approx(0.5, abs=1e-3)
+    assert str(found[0]).startswith("min_gap_mm: fibre 1 at (")
+    assert check(zigzag(0.5), only(min_gap_mm=0.48)) == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_folds_of_a_large_pad_with_a_large_gap_are_those_of_a_small_one(seed, monkeypatch):
+    """The same courses, a hundred times larger: what is found is too, to 2e-4 of the gap, from fewer points."""
+    small = Morphology.random(1, 9, seed)
+    found = [check(Morphology(small.knots, 10.0 * s), only(min_gap_mm=4.0 * s)) for s in (1, 100)]
+    assert found[0]
+    assert [v.fibres for v in found[0]] == [v.fibres for v in found[1]]
+    for one, hundred in zip(*found, strict=True):
+        assert hundred.measured / 100 == pytest.approx(one.measured, abs=4.0 * 2e-4 + 2e-3)
+    measured = []
+    monkeypatch.setattr("design.criteria.rules.fold_gap", lambda line, gap: measured.append(len(line)))
+    check(Morphology(small.knots, 1000.0), only(min_gap_mm=0.8))
+    check(Morphology(small.knots, 1000.0), only(min_gap_mm=400.0))
+    assert measured[2] < measured[0] / 5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_fold_found_is_one_of_the_curve(seed):
+    """Against points of SciPy's curve, 0.02 mm apart: none lies nearer, and some almost as near."""
+    pad = Morphology.random(1, 6, seed)
+    found = check(pad, only(min_gap_mm=2.0))
+    assert found
+    for v in found:
+        fibre = v.fibres[0] - 1
+        t, cross = pad.knots[fibre, :, fibre], pad.knots[fibre, :, 1 - fibre]
+        fine = np.unique(np.concatenate([np.linspace(0, 2, 200_000), t]))
+        curve = 11.25 * np.column_stack([fine, PchipInterpolator(t, cross)(fine)])
+        arc = np.append(0, np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum())
+        at = np.arange(0, arc[-1], 0.02)
+        points = np.column_stack([np.interp(at, arc, axis) for axis in curve.T])
+        ahead = np.searchsorted(at, at + np.pi)
+        least = min(
+            np.linalg.norm(points[j:] - p, axis=1).min(initial=np.inf) for p, j in zip(points, ahead, strict=True)
+        )
+        assert v.measured - 2e-3 <= least <= v.measured + 0.025
+
+
+def test_too_many_crossings_of_the_families_are_one_finding():
+    found = check(Morphology.straight(4), only(max_crossings=15))
+    assert [str(v) for v in found] == ["max_crossings: pad: 16, limit 15"]
+    assert check(Morphology.straight(4), only(max_crossings=16)) == []
+    many = check(Morphology.straight(40), only(max_crossings=1234))
+    assert [str(v) for v in many] == ["max_crossings: pad: 1600, limit 1234"]
+
+
+def test_any_number_of_crossings_is_written_and_read_as_a_word():
+    assert Spec({"rules": {"max_crossings": "any"}}).section(Rules).max_crossings is None
+    assert Rules().model_dump()["max_crossings"] == "any"
+    with pytest.raises(InputError, match=r"\[rules\] max_crossings: got 'none'"):
+        Spec({"rules": {"max_crossings": "none"}}).section(Rules)
+
+
+def test_a_slanting_crossing_is_found_with_its_angle():
+    """Half-way up a span that is as high as long, between two turning points, a PCHIP has slope 1.5."""
+    swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
+    pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
+    found = check(pad, only(min_crossing_angle_deg=40))
+    assert [(v.rule, v.fibres) for v in found] == [("min_crossing_angle_deg", (1, 2))]
+    assert found[0].measured == pytest.approx(np.degrees(np.arctan(1 / 1.5)), abs=1e-6)
+    assert found[0].place_mm == pytest.approx((0, 0), abs=1e-3)
+    assert check(pad, only(min_crossing_angle_deg=33)) == []
+    assert check(Morphology.straight(4), only(min_crossing_angle_deg=90)) == []
+
+
+def test_a_pair_of_fibres_is_named_once_with_its_least_angle():
+    pad = Morphology.random(3, 8, seed=1)
+    across = [c for c in crossings(pad, 1e-6) if c.first < 3 <= c.second]
+    least = {}
+    for c, angle in zip(across, crossing_angles(pad, across), strict=True):
+        pair = (c.first + 1, c.second + 1)
+        least[pair] = min(angle, least.get(pair, 30))
+    found = check(pad, only(min_crossing_angle_deg=30, same_family_crossings=10**6))
+    assert {v.fibres: v.measured for v in found} == {pair: angle for pair, angle in least.items() if angle < 30}
+    assert len(found) > 1
+
+
+def test_a_crossing_within_a_family_is_counted_at_its_places():
+    found = check(bent(2.5), only(same_family_crossings=0))
+    assert len(found) == 2
+    assert {v.fibres for v in found} == {(1, 2)}
+    assert check(bent(2.5), only(same_family_crossings=2)) == []
+
+
+def test_a_fibre_at_the_border_is_found():
+    found = check(bent(0.05, fibre=4), only(border_mm=2.0))
+    assert [v.fibres for v in found] == [(5,)]
+    assert found[0].measured == pytest.approx(0.05 * 11.25, abs=1e-3)
+
+
+def test_a_long_fibre_is_found():
+    found = check(bent(3.0), only(max_length_mm=5 * 11.25 + 0.1))
+    assert [(v.rule, v.fibres) for v in found] == [("max_length_mm", (1,))]
+
+
+def test_a_sharp_bend_is_found_and_a_gentle_one_passes():
+    knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [2, 1.0]])
+    straight = np.array([[1, 0], [1, 0.5], [1, 1.0], [1, 2.0]])
+    sharp = Morphology(np.stack([knots, straight]))
+    found = check(sharp, only(min_bend_radius_mm=1.0))
+    assert [v.fibres for v in found] == [(1,)]
+    assert check(bent(1.3), only(min_bend_radius_mm=1.0)) == []
+
+
+def test_a_bend_is_placed_where_it_is():
+    knots = np.array([[0, 1], [1.0, 1.9], [2, 1.0]])
+    pad = Morphology(np.stack([knots, [[1, 0], [1, 1.0], [1, 2.0]]]), pitch_mm=2.0)
+    found = check(pad, only(min_bend_radius_mm=2.0))
+    assert [v.fibres for v in found] == [(1,)]
+    assert found[0].place_mm == pytest.approx((0, 0.9 * 2), abs=0.01)
+
+
+@pytest.mark.parametrize(("rise", "breaks"), [(0.145, False), (0.155, True)])
+def test_a_kink_passes_up_to_half_a_radian(rise, breaks):
+    """Two straight branches that meet in a peak within 1e-7 of it, where the PCHIP's slope overshoots by a third."""
+    at = np.array([0, 0.5, 1 - 1e-7, 1, 1 + 1e-7, 1.5, 2])
+    roof = np.column_stack([at, 1 + rise * (1 - np.abs(at - 1))])
+    turn = 2 * (2 * np.arctan(4 / 3 * rise) - np.arctan(rise))
+    found = check(Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_bend_radius_mm=3.0))
+    assert (turn > 0.5) == breaks
+    assert [v.measured for v in found] == ([pytest.approx(1.5 / turn, rel=1e-3)] if breaks else [])
+
+
+def test_a_finding_reads_as_one_line():
+    text = str(check(bent(1.95), only(min_gap_mm=0.8))[0])
+    assert text.startswith("min_gap_mm: fibre 1 and fibre 2 at (0.0, -5.9) mm: 0.56")
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(("fibre", "fibres"), [(0, (1, 2)), (2, (3, 4)), (4, (5, 6)), (6, (7, 8))])
+def test_fibres_too_close_are_counted_through_both_families(fibre, fibres):
+    pad = bent(fibre % 4 + 1.95, fibre=fibre)
+    (found,) = check(pad, only(min_gap_mm=0.8))
+    assert found.fibres == fibres
+    between = ((0, (fibre % 4 + 1.975 - 2.5) * 11.25), ((fibre % 4 + 1.975 - 2.5) * 11.25, 0))[fibre // 4]
+    assert found.place_mm == pytest.approx(between, abs=0.3)
+
+
+def test_a_limit_that_is_just_kept_is_kept():
+    """A straight grid: gaps and borders of one pitch, fibres of five, 16 crossings at right angles."""
+    grid, hair = Morphology.straight(4, 10.0), 1e-6
+    for kept, broken, count in (
+        ({"min_gap_mm": 10.0}, {"min_gap_mm": 10.0 + hair}, 6),
+        ({"border_mm": 10.0 - hair}, {"border_mm": 10.0 + hair}, 4),
+        ({"max_length_mm": 50.0 + hair}, {"max_length_mm": 50.0 - hair}, 8),
+        ({"max_crossings": 16}, {"max_crossings": 15}, 1),
+    ):
+        assert check(grid, only(**kept)) == []
+        assert len(check(grid, only(**broken))) == count
+
+
+@pytest.mark.parametrize(("fibre", "cross"), [(0, 0.1), (3, 4.9), (4, 0.1), (7, 4.9)])
+def test_every_side_of_the_pad_has_a_border(fibre, cross):
+    (found,) = check(bent(cross, fibre=fibre), only(border_mm=2.0))
+    assert found.fibres == (fibre + 1,)
+    assert found.measured == pytest.approx(0.1 * 11.25, abs=1e-3)
+    at = ((0, (cross - 2.5) * 11.25), ((cross - 2.5) * 11.25, 0))[fibre // 4]
+    assert found.place_mm == pytest.approx(at, abs=0.05)
+
+
+def test_the_length_found_is_that_of_the_curve():
+    pad = bent(3.0, fibre=5)
+    (found,) = check(pad, only(max_length_mm=5 * 11.25 + 0.1))
+    at = np.linspace(0, 5, 200_001)
+    curve = PchipInterpolator(pad.knots[5, :, 1], pad.knots[5, :, 0])(at)
+    assert found.fibres == (6,)
+    assert found.measured == pytest.approx(11.25 * np.hypot(np.diff(at), np.diff(curve)).sum(), rel=1e-5)
+    assert found.limit == 5 * 11.25 + 0.1
+
+
+def test_the_gap_of_two_bent_fibres_is_that_of_their_curves():
+    """Against SciPy's curves, sampled every micrometre or so."""
+    knots = np.repeat(Morphology.straight(2).knots[:, :1], 4, axis=1)
+    knots[:2, :, 0] = knots[2:, :, 1] = [0, 0.9, 2.1, 3]
+    knots[0, 1:3, 1], knots[1, 1:3, 1] = (1.75, 0.6), (2.3, 0.9)
+    at = np.linspace(0, 3, 6001)
+    first, second = (np.column_stack([at, PchipInterpolator(*knots[f].T)(at)]) * 11.25 for f in (0, 1))
+    least = min(np.linalg.norm(second - place, axis=1).min() for place in first)
+    (found,) = check(Morphology(knots), only(min_gap_mm=6.0))
+    assert found.measured == pytest.approx(least, abs=3e-3)
+
+
+def test_findings_come_rule_by_rule():
+    """A fibre that swings far over breaks most rules at once."""
+    rules = Rules(min_bend_radius_mm=20, min_gap_mm=3, min_crossing_angle_deg=80, max_length_mm=60, max_crossings=15)
+    order = [v.rule for v in check(bent(4.9), rules)]
+    assert sorted(set(order), key=order.index) == [
+        "min_bend_radius_mm",
+        "min_gap_mm",
+        "same_family_crossings",
+        "max_crossings",
+        "min_crossing_angle_deg",
+        "border_mm",
+        "max_length_mm",
+    ]
+
+
+def test_flat_crossings_are_told_in_the_order_of_the_fibres():
+    found = check(Morphology.random(3, 8, seed=1), only(min_crossing_angle_deg=60))
+    pairs = [v.fibres for v in found]
+    assert pairs == sorted(pairs)
+    assert [v.measured for v in found] != sorted(v.measured for v in found)

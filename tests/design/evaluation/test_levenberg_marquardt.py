@@ -1,0 +1,225 @@
+"""The published localizer: its derivatives, what it learns, and inputs that break such code."""
+
+import numpy as np
+import pytest
+import torch
+
+from design.common.errors import InputError
+from design.evaluation.levenberg_marquardt import Network, Scale, first_weights, fit, fit_many
+from design.evaluation.variable_projection import (
+    RIDGE,
+    Fit,
+    curvature,
+    dual_curvature,
+    neurons_of,
+    pull_back,
+    with_ones,
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def rms(difference):
+    return float(np.sqrt((difference**2).mean()))
+
+
+def waves(presses):
+    """Three smooth outputs of two inputs."""
+    x, y = presses.T
+    return np.column_stack([np.sin(2 * x) * y, np.exp(-(x**2) - y**2), 30 + x * y])
+
+
+def network_parts(networks, inputs, hidden, outputs, samples=40, alternatives=1):
+    """Weights, inputs with ones and targets of a batch."""
+    rng = np.random.default_rng(inputs)
+    x = torch.from_numpy(rng.uniform(-1, 1, (networks, samples, inputs)))
+    y = torch.from_numpy(rng.uniform(-1, 1, (networks, alternatives, samples, outputs)))
+    weights = [first_weights(np.ones(inputs, bool), hidden, rng).T for _ in range(networks)]
+    return torch.from_numpy(np.stack(weights)), with_ones(x), y
+
+
+def projected_jacobian(x, fit):
+    """R J of one network, every column by automatic differentiation, and the output weights held."""
+
+    def outputs(hidden):
+        return neurons_of(hidden[None], x[None])[0] @ fit.output[0]
+
+    jacobian = torch.autograd.functional.jacobian(outputs, fit.hidden[0]).flatten(2)
+    gram = fit.neurons[0].mT @ fit.neurons[0]
+    gram.diagonal().add_(RIDGE * len(x))
+    off = torch.eye(len(x)) - fit.neurons[0] @ torch.linalg.solve(gram, fit.neurons[0].mT)
+    return jacobian.flatten(0, 1), torch.einsum("qr,rkp->qkp", off, jacobian).flatten(0, 1)
+
+
+@pytest.mark.parametrize(("inputs", "hidden", "outputs"), [(3, 7, 2), (1, 1, 1), (9, 20, 3)])
+def test_both_forms_of_the_equations_are_those_of_the_whole_jacobian(inputs, hidden, outputs):
+    weights, x, y = network_parts(2, inputs, hidden, outputs)
+    fit = Fit.of(weights, x, y[:, 0])
+    slope, primal, dual = pull_back(x, fit, fit.error), curvature(x, fit), dual_curvature(x, fit)
+    for network in range(2):
+        own = fit.rows(torch.tensor([network]))
+        jacobian, projected = projected_jacobian(x[network], own)
+        torch.testing.assert_close(slope[network], jacobian.mT @ own.error.ravel())
+        torch.testing.assert_close(primal[network].tril(), (jacobian.mT @ projected).tril())
+        torch.testing.assert_close(dual[network], projected @ projected.mT)
+        # The residual is what the projection leaves of the targets, so that both forms take the same step.
+        torch.testing.assert_close(projected.mT @ own.targets.ravel(), -slope[network], atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("samples", "hidden"), [(300, 4), (40, 30)])
+def test_the_slope_is_the_derivative_of_the_least_squares_over_the_output_weights(samples, hidden):
+    weights, x, y = network_parts(1, 3, hidden, 2, samples)
+    weights.requires_grad_()
+    fit = Fit.of(weights, x, y[:, 0])
+    (slope,) = torch.autograd.grad(fit.squares.sum(), weights)
+    torch.testing.assert_close(slope.flatten(1), 2 * pull_back(x, fit, fit.error), atol=1e-6, rtol=1e-6)
+
+
+def test_a_network_does_not_depend_on_the_others_of_its_batch():
+    rng = np.random.default_rng(8)
+    inputs = rng.uniform(-1, 1, (3, 200, 2))
+    targets = waves(inputs[0])
+    together = fit_many(inputs, targets, [np.random.default_rng(s) for s in (1, 2, 3)], hidden=8, epochs=30)
+    alone = fit_many(inputs[1:2], targets, [np.random.default_rng(2)], hidden=8, epochs=30)[0]
+    assert [network.epochs > 0 for network in together] == [True] * 3
+    np.testing.assert_allclose(together[1](inputs[1]), alone(inputs[1]), atol=0.05 * targets.std())
+
+
+def test_a_sample_counts_by_the_nearest_of_its_targets():
+    """Square roots have two signs; a network that may choose finds one, a network told either at random finds 0."""
+    rng = np.random.default_rng(9)
+    inputs = rng.uniform(0.1, 1, (400, 1))
+    root = np.sqrt(inputs) * rng.choice([-1, 1], (400, 1))
+    told = fit(inputs, root, np.random.default_rng(0), hidden=8)(inputs)
+    free = fit_many(inputs, root, [np.random.default_rng(0)], hidden=8, also=-root[None])[0](inputs)
+    assert rms(np.abs(free) - np.sqrt(inputs)) < 0.1
+    assert rms(np.abs(told) - np.sqrt(inputs)) > 0.3
+
+
+def test_a_curved_map_is_learned_on_samples_never_seen():
+    rng = np.random.default_rng(0)
+    known, fresh = rng.uniform(-1, 1, (400, 2)), rng.uniform(-1, 1, (400, 2))
+    network = fit(known, waves(known), rng, hidden=15, epochs=200)
+    constant = rms(waves(fresh) - waves(known).mean(axis=0))
+    assert rms(network(fresh) - waves(fresh)) < constant / 100
+
+
+def test_a_linear_map_in_any_units_is_learned_almost_exactly():
+    rng = np.random.default_rng(1)
+    inputs = rng.uniform([2000, -1e-6], [2001, 1e-6], (300, 2))
+    targets = inputs @ np.array([[1.0, 3.0], [1e6, -1e6]]) + 7
+    network = fit(inputs, targets, rng, hidden=8)
+    assert rms(network(inputs) - targets) < 1e-4 * targets.std()
+
+
+def test_noise_is_not_learned_by_heart():
+    rng = np.random.default_rng(2)
+    inputs, noise = rng.uniform(-1, 1, (200, 3)), rng.normal(size=(200, 1))
+    network = fit(inputs, noise, rng)
+    assert rms(network(rng.uniform(-1, 1, (200, 3)))) < 1
+    assert rms(network(inputs) - noise) > 0.7
+
+
+def test_the_same_seed_gives_the_same_network():
+    inputs = np.random.default_rng(0).uniform(-1, 1, (150, 2))
+    first, again, other = (fit(inputs, waves(inputs), np.random.default_rng(s), 10) for s in (3, 3, 4))
+    np.testing.assert_array_equal(first(inputs), again(inputs))
+    assert not np.array_equal(first(inputs), other(inputs))
+
+
+def test_a_constant_input_is_as_if_it_were_not_there():
+    rng = np.random.default_rng(5)
+    inputs = rng.uniform(-1, 1, (300, 2))
+    with_constant = np.column_stack([np.full(300, 3.0), inputs])
+    network = fit(with_constant, waves(inputs), rng, hidden=15)
+    assert rms(network(with_constant) - waves(inputs)) < 0.02
+    moved = with_constant + np.array([5.0, 0, 0])
+    np.testing.assert_array_equal(network(moved), network(with_constant))
+
+
+@pytest.mark.parametrize("columns", [1, 4])
+def test_constant_inputs_alone_give_the_best_constant(columns):
+    rng = np.random.default_rng(6)
+    targets = rng.normal(5, 0.1, (100, 2))
+    found = fit(np.zeros((100, columns)), targets, rng, hidden=5)(np.zeros((3, columns)))
+    np.testing.assert_allclose(found, np.tile(targets.mean(axis=0), (3, 1)), atol=0.1)
+
+
+def test_constant_targets_are_found():
+    rng = np.random.default_rng(7)
+    inputs, targets = rng.uniform(-1, 1, (50, 2)), np.tile([4.0, -2.0], (50, 1))
+    np.testing.assert_allclose(fit(inputs, targets, rng, hidden=5)(inputs), targets, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, 4, 10])
+def test_fewer_samples_than_weights_still_give_a_network(count):
+    rng = np.random.default_rng(count)
+    inputs = rng.uniform(-1, 1, (count, 2))
+    assert np.isfinite(fit(inputs, inputs, rng, hidden=50)(inputs)).all()
+
+
+@pytest.mark.parametrize(("inputs", "targets"), [(2, 2), (10, 9), (0, 0)])
+def test_samples_that_do_not_fit_are_refused(inputs, targets):
+    with pytest.raises(InputError, match="at least 3"):
+        fit(np.zeros((inputs, 2)), np.zeros((targets, 2)), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_inputs_that_never_vary_end_the_training(value):
+    rng = np.random.default_rng(10)
+    targets = rng.normal(3, 1, (200, 2))
+    found = fit(np.full((200, 3), value), targets, rng, 20)(np.full((1, 3), value))
+    np.testing.assert_allclose(found[0], targets.mean(axis=0), atol=0.3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_refused(bad):
+    inputs, targets = np.ones((10, 2)), np.ones((10, 1))
+    with pytest.raises(InputError, match="NaN or infinity"):
+        fit(inputs, targets * bad, np.random.default_rng(0))
+    with pytest.raises(InputError, match="NaN or infinity"):
+        fit(inputs * bad, targets, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("inputs", "networks", "hidden"), [(0, 1, 5), (2, 0, 5), (2, 1, 0)])
+def test_networks_of_nothing_are_refused(inputs, networks, hidden):
+    with pytest.raises(InputError, match="at least 1 of each"):
+        fit_many(np.ones((10, inputs)), np.ones((10, 1)), [np.random.default_rng(0)] * networks, hidden)
+
+
+@pytest.mark.parametrize(("varying", "hidden"), [(1, 9), (2, 16), (3, 50)])
+def test_first_neurons_are_spread_as_nguyen_and_widrow_have_it(varying, hidden):
+    """Slopes of one length, 0.7 H^(1 / D) by the inputs that vary, and biases evenly over it, of either sign."""
+    varies = np.array([True] * varying + [False])
+    weights = first_weights(varies, hidden, np.random.default_rng(0))
+    length = 0.7 * hidden ** (1 / varying)
+    assert not weights[:, varying].any()
+    np.testing.assert_allclose(np.linalg.norm(weights[:, :-1], axis=1), length)
+    np.testing.assert_allclose(np.abs(weights[:, -1]), np.abs(length * np.linspace(-1, 1, hidden)))
+    assert 0 < (weights[:, -1] * np.linspace(-1, 1, hidden) < 0).sum() < hidden
+    assert (weights[:, 0] > 0).any()
+    assert (weights[:, 0] < 0).any()
+
+
+def test_a_scale_fills_minus_one_to_one_and_comes_back():
+    values = np.array([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0], [2.0, 5.0, 4.0]])
+    scale = Scale.of(values)
+    np.testing.assert_allclose(scale.there(values), [[-1, 0, -1], [1, 0, 1 / 3], [0, 0, 1]])
+    np.testing.assert_allclose(scale.back(scale.there(values)), values)
+    np.testing.assert_allclose(scale.back(np.array([[0.5, 9.0, -2.0]])), [[2.5, 5.0, -5.0]])
+
+
+def test_a_network_is_its_formula():
+    rng = np.random.default_rng(1)
+    inputs, targets = (Scale(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
+    hidden, output = rng.normal(size=(4, 4)), rng.normal(size=(2, 5))
+    x = rng.normal(size=(6, 3))
+    neurons = np.tanh((x - inputs.middle) / inputs.half @ hidden[:, :3].T + hidden[:, 3])
+    expected = targets.middle + targets.half * (neurons @ output[:, :4].T + output[:, 4])
+    np.testing.assert_allclose(Network(hidden, output, inputs, targets, 1)(x), expected)

@@ -1,0 +1,76 @@
+"""Evaluation by simulation: the published order of the pads, and that nothing is tested on what was learned."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from design import Contact, Morphology
+from design.common.errors import InputError
+from design.evaluation.localisation_error import evaluate, fresh_presses, training_presses
+
+
+def means(pad, **settings):
+    return [level.mean for level in evaluate(pad, presses=256, test=500, hidden=20, **settings)]
+
+
+def test_the_published_pad_beats_the_square_grid(published):
+    square = evaluate(Morphology.load(published / "square_grid_cir.mat"), Contact(sides=50), lost=(0, 1), subsets=1)
+    curved = evaluate(Morphology.load(published / "5para_dis.mat"), lost=(0, 1, 3), subsets=1)
+    assert [level.subsets for level in curved] == [1, 1, 1]
+    for straight, bent in zip(square, curved[:2], strict=True):
+        assert bent.mean < 0.7 * straight.mean
+    assert 0.15 < square[0].mean < 0.3
+    assert 0.04 < curved[0].mean < 0.12
+    assert curved[0].mean < curved[2].mean
+
+
+def test_errors_grow_with_lost_fibres_and_are_summed_up_over_all_sets():
+    found = evaluate(Morphology.random(2, 5, seed=1), presses=144, test=300, hidden=10)
+    assert [(level.lost, level.subsets) for level in found] == [(0, 1), (1, 4), (2, 6), (3, 4)]
+    assert found[0].std == 0
+    assert found[0].mean < found[2].mean < found[3].mean
+    assert all(level.mean <= level.max and (level.subsets == 1) == (level.std == 0) for level in found)
+
+
+def test_the_result_depends_on_the_seed_and_not_on_the_cores(monkeypatch):
+    pad = Morphology.random(3, 5, seed=1)
+    side_by_side = means(pad, lost=(0, 1), subsets=3)
+    threads = torch.get_num_threads()
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    assert means(pad, lost=(0, 1), subsets=3) == side_by_side
+    assert means(pad, lost=(1,), subsets=3) == side_by_side[1:]
+    assert means(pad, lost=(0, 1), subsets=3, seed=1) != side_by_side
+    assert torch.get_num_threads() == threads
+
+
+@pytest.mark.parametrize("grid", [1, 4])
+def test_presses_to_test_on_are_others_than_those_learned(grid):
+    learned, fresh = training_presses(grid, 32, seed=0), fresh_presses(grid, 2000, seed=0)
+    low, high = (0.5, 1.5) if grid == 1 else (1, grid)
+    assert not set(map(tuple, learned)) & set(map(tuple, fresh))
+    for presses, beyond in ((learned, 5 / 49), (fresh, 0)):
+        assert presses.min() >= low
+        assert high - 0.1 < presses.max() <= high + beyond
+        assert np.unique(presses, axis=0).shape == presses.shape
+    assert not np.array_equal(fresh, fresh_presses(grid, 2000, seed=1))
+
+
+def test_a_pad_of_two_fibres_is_evaluated_as_far_as_fibres_are_left():
+    found = evaluate(Morphology.random(1, 5, seed=0), presses=144, test=200, hidden=10)
+    assert [level.lost for level in found] == [0, 1]
+    assert 0 < found[0].mean < 0.6
+
+
+def test_fibres_that_no_press_touches_do_no_harm():
+    found = evaluate(Morphology.straight(2), Contact(radius=1e-6), presses=64, test=100, hidden=5, lost=(0,))
+    assert 0.2 < found[0].mean < 0.7
+
+
+@pytest.mark.parametrize(
+    "settings", [{"presses": 1000}, {"presses": 1}, {"presses": -4}, {"test": 0}, {"lost": (-1,)}, {"subsets": 0}]
+)
+def test_settings_that_cannot_be_used_are_refused(settings):
+    with pytest.raises(InputError, match="allowed is"):
+        evaluate(Morphology.straight(4), **settings)

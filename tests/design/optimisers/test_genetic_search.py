@@ -1,0 +1,90 @@
+"""The genetic search: it depends on the seed alone, goes on where it was broken off, and starts from a given pad."""
+
+import numpy as np
+import pytest
+
+from design.criteria.published_objective import published_objective
+from design.optimisers.genetic_search import Breeding
+from design.optimisers.problem import Problem
+from design.settings import Contact, Pad, Rules, Search
+
+PAD, CONTACT = Pad(grid=3), Contact()
+SMALL = Search(method="genetic", knots=3, population=20, generations=30)
+
+
+def bred(generations, search=SMALL, origin=None, state=None):
+    breeding = Breeding(Problem(PAD, (CONTACT,), search, Rules(), origin), state)
+    objectives = []
+    for _ in range(generations):
+        breeding.advance(1)
+        objectives.append(breeding.objective)
+    return breeding, objectives
+
+
+def assert_equal_states(first, second):
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], strict=True)
+
+
+def test_the_same_seed_gives_the_same_pads_and_another_seed_others():
+    first, second = bred(3)[0], bred(3)[0]
+    other = bred(3, SMALL.model_copy(update={"seed": 1}))[0]
+    assert_equal_states(first.state(), second.state())
+    assert first.morphology() != other.morphology()
+
+
+def test_the_best_objective_never_rises_and_is_that_of_the_best_pad():
+    breeding, objectives = bred(6)
+    assert objectives == sorted(objectives, reverse=True)
+    assert objectives[-1] < objectives[0]
+    assert published_objective(breeding.morphology(), CONTACT) == objectives[-1]
+
+
+@pytest.mark.parametrize("broken_at", [0, 1, 2, 5, 6])
+def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit(broken_at, tmp_path):
+    whole, objectives = bred(6)
+    np.savez(tmp_path / "state.npz", allow_pickle=False, **bred(broken_at)[0].state())
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
+        resumed, rest = bred(6 - broken_at, state=state)
+    assert resumed.step == 6
+    assert rest == objectives[broken_at:]
+    assert resumed.morphology() == whole.morphology()
+    assert_equal_states(resumed.state(), whole.state())
+
+
+def test_a_state_is_not_touched_by_what_follows():
+    breeding = bred(2)[0]
+    state = breeding.state()
+    before = {name: array.copy() for name, array in state.items()}
+    resumed = bred(2, state=state)[0]
+    breeding.advance(1)
+    assert_equal_states(state, before)
+    assert resumed.step == 4
+
+
+def test_a_given_origin_is_never_lost():
+    """One far better than what so short a search finds: it is kept to the last bit, or improved on."""
+    origin = bred(30, SMALL.model_copy(update={"population": 40}))[0].morphology()
+    value = published_objective(origin, CONTACT)
+    breeding, objectives = bred(3, origin=origin)
+    assert objectives[0] <= value < bred(3)[1][-1]
+    assert published_objective(breeding.morphology(), CONTACT) <= value
+
+
+@pytest.mark.parametrize("grid", [1, 2])
+def test_the_smallest_pads_with_the_smallest_populations_are_bred_too(grid):
+    search = Search(method="genetic", knots=1, population=4, generations=4)
+    breeding = Breeding(Problem(Pad(grid=grid, pitch_mm=20), (CONTACT,), search, Rules()))
+    breeding.advance(4)
+    found = breeding.morphology()
+    assert found.grid == grid
+    assert found.pitch_mm == 20
+
+
+@pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), (20, 0.1040)])
+def test_a_whole_search_reaches_the_published_objective(knots, bar):
+    breeding = Breeding(Problem(Pad(), (CONTACT,), Search(method="genetic", knots=knots), Rules()))
+    breeding.advance(50)
+    assert breeding.done
+    assert published_objective(breeding.morphology(), CONTACT) <= bar

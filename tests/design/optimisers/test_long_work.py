@@ -1,0 +1,128 @@
+"""Long searches on the command line: killed and resumed, on a cluster that loses a worker, ended by the clock."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Executor
+from typing import cast
+
+import pytest
+
+from design.common.checkpoints import Checkpoints
+from design.optimisers.search import search
+from design.settings import Search
+
+SETTINGS = """
+[search]
+knots = 6
+starts = 2
+steps = 150
+lost = 1
+"""
+
+
+def design(folder, *arguments):
+    (folder / "pad.toml").write_text(SETTINGS)
+    command = [sys.executable, "-m", "padforge", "design", "--out", "pad", *arguments]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finished(process):
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def wait_for(path, process):
+    while not path.exists():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
+def test_a_killed_search_resumes_to_the_same_file(tmp_path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir()
+    broken.mkdir()
+    code, _, err = finished(design(whole))
+    assert code in (0, 1), err
+    for state in ("start_0000.npz", "start_0001.npz"):
+        process = design(broken, "--resume")
+        wait_for(broken / "pad" / "search" / state, process)
+        process.kill()
+        finished(process)
+        assert not (broken / "pad" / "morphology.json").exists()
+    assert finished(design(broken, "--resume"))[0] == code
+    for name in ("morphology.json", "design.svg"):
+        assert (broken / "pad" / name).read_bytes() == (whole / "pad" / name).read_bytes()
+    assert not (broken / "pad" / "search").exists()
+
+
+def test_ctrl_c_leaves_the_best_and_what_to_resume_from(tmp_path):
+    process = design(tmp_path)
+    wait_for(tmp_path / "pad" / "search" / "start_0000.npz", process)
+    process.send_signal(signal.SIGINT)
+    code, out, err = finished(process)
+    assert code == 130, err
+    assert "interrupted: the best so far" in out
+    assert json.loads((tmp_path / "pad" / "design.json").read_text())["stopped"] == "interrupted"
+    assert (tmp_path / "pad" / "search" / "start_0000.npz").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_an_end_from_outside_is_as_ctrl_c_unless_it_is_ignored():
+    """As under nohup, which ignores that the terminal hangs up."""
+    code = (
+        "import signal\n"
+        "from design.endings import _prepare\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "_prepare()\n"
+        "print(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN)\n"
+        "print(signal.getsignal(signal.SIGTERM) is signal.default_int_handler)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True"]
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
+    code, _, err = finished(design(tmp_path, "--scheduler", "tcp://127.0.0.1:9"))
+    assert code == 2
+    assert "--scheduler is tcp://127.0.0.1:9: no Dask scheduler answers there" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
+    distributed = pytest.importorskip("distributed")
+    settings = Search(knots=6, starts=3, steps=80, lost=1)
+    here = search(settings=settings)
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        victim = next(iter(client.run(os.getpid).values()))
+        slices = []
+
+        def report(*step):
+            slices.append(step)
+            if len(slices) == 4:
+                threading.Thread(target=os.kill, args=(victim, signal.SIGKILL)).start()
+
+        executor = cast(Executor, client.get_executor(pure=False, retries=10))
+        there = search(settings=settings, report=report, executor=executor)
+        assert len(slices) > 4
+        with pytest.raises(ProcessLookupError):
+            os.kill(victim, 0)
+    assert there.morphology == here.morphology
+    assert there.history == here.history
+
+
+def test_a_folder_that_holds_more_than_states_keeps_it(tmp_path):
+    (tmp_path / "search.json").write_text("{}")
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "start_of_mine.npz").write_text("mine as well")
+    Checkpoints(tmp_path, {}).begin(resume=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "start_of_mine.npz"]

@@ -1,0 +1,80 @@
+"""The gradient of the exact signals: Taylor tests for every weight, length and shape."""
+
+import numpy as np
+import pytest
+import torch
+
+from design import Contact, Morphology, signals
+from design.criteria.differentiable import ExactSignals, pchip_slopes
+from design.pad.contact import fibre_axes
+
+CONTACTS = [
+    Contact(),
+    Contact(sides=None),
+    Contact(sides=3),
+    Contact(sides=4, length="euclidean"),
+    Contact(weight="inverse_square"),
+    Contact(sides=None, weight="inverse_square", length="euclidean"),
+    Contact(weight="inverse"),
+    Contact(sides=None, weight="inverse", length="euclidean"),
+]
+
+
+def torch_signals(travel, cross, presses, contact):
+    return ExactSignals.apply(travel, cross, pchip_slopes(travel, cross), presses, contact)
+
+
+def taylor_ratio(contact, seed):
+    """How much more a step twice as long leaves over after the gradient's own part: 4 for a right gradient."""
+    rng = np.random.default_rng(seed)
+    axes = fibre_axes(Morphology.random(3, 4, seed))
+    knots = torch.tensor(np.stack([axes[0][0], axes[1][0]]), requires_grad=True)
+    presses, weights = rng.uniform(1, 3, (8, 2)), torch.tensor(rng.normal(size=(6, 8)))
+    move = torch.tensor(rng.normal(size=knots.shape))
+    move[:, :, [0, -1]] = 0
+
+    def value(knots):
+        travel, cross = knots
+        return (weights * torch_signals(travel, cross, presses, contact)).sum()
+
+    base = value(knots)
+    (gradient,) = torch.autograd.grad(base, knots)
+    left = [abs(value(knots + step * move) - base - step * (move * gradient).sum()).item() for step in (2e-6, 1e-6)]
+    return left[0] / left[1]
+
+
+@pytest.mark.parametrize("contact", CONTACTS, ids=lambda c: f"{c.sides}-{c.weight}-{c.length}")
+def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(contact):
+    assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
+
+
+def test_the_torch_function_gives_the_exact_signals():
+    pad = Morphology.random(4, 5, seed=1)
+    presses = np.random.default_rng(1).uniform(1, 4, (20, 2))
+    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
+    found = torch_signals(travel, cross, presses, Contact()).T.numpy()
+    np.testing.assert_allclose(found, signals(pad, presses), rtol=1e-12, atol=1e-14)
+
+
+def test_an_untouched_fibre_has_no_gradient_and_grazing_stays_finite():
+    axes = fibre_axes(Morphology.straight(3))
+    travel, cross = (torch.tensor(axis[0], requires_grad=True) for axis in axes[:2])
+    grazing = np.array([[2.0, 2.0 - 0.6], [2.0, 2.0 - 0.6 + 1e-12]])
+    torch_signals(travel, cross, grazing, Contact(sides=None)).sum().backward()
+    assert cross.grad is not None
+    assert torch.isfinite(cross.grad).all()
+    assert not cross.grad[[2, 3, 5]].any()
+
+
+def test_a_fibre_that_grazes_a_circle_changes_its_signal_by_no_more_than_it_would_at_the_least_angle():
+    """The length cut off at height y is 2 sqrt(r^2 - y^2): it changes by -2 y / sqrt(r^2 - y^2), at most 2 / 0.02."""
+    radius, contact = 0.5, Contact(radius=0.5, sides=None)
+    for height, expected in (
+        (0.3, -2 * 0.3 / 0.4),
+        (radius * np.sqrt(1 - 0.021**2), -2 * np.sqrt(1 - 0.021**2) / 0.021),
+        (radius * (1 - 1e-9), -2 / 0.02),
+    ):
+        travel, cross = (torch.tensor(axis[0], requires_grad=True) for axis in fibre_axes(Morphology.straight(2))[:2])
+        torch_signals(travel, cross, np.array([[1.5, 1 - height]]), contact)[0, 0].backward()
+        assert cross.grad is not None
+        assert cross.grad[0].sum().item() == pytest.approx(expected, rel=1e-4)

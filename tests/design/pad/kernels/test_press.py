@@ -1,0 +1,71 @@
+"""Which fibres a press can touch, and what an element in it weighs, against plain ways to say it."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design import Morphology
+from design.pad.contact import fibre_axes
+from design.pad.kernels.press import (
+    INVERSE,
+    INVERSE_SQUARE,
+    UNIFORM,
+    count_touched,
+    family_strays,
+    touched_range,
+    weigh,
+)
+
+EIGHTHS = st.integers(-40, 80).map(lambda k: k / 8)
+
+
+def can_touch(cv: float, low: float, high: float, stray: float, grid: int) -> list[int]:
+    return [i for i in range(grid) if i + 1 + stray >= cv + low and i + 1 - stray <= cv + high]
+
+
+@given(
+    EIGHTHS,
+    st.integers(1, 16).map(lambda k: -k / 8),
+    st.integers(1, 16).map(lambda k: k / 8),
+    st.integers(0, 16).map(lambda k: k / 8),
+    st.integers(1, 6),
+)
+def test_the_range_holds_just_the_fibres_whose_band_a_press_overlaps(cv, low, high, stray, grid):
+    """On eighths, where bands and presses often only touch: that counts."""
+    first, end = touched_range(cv, np.array([-9.0, 9.0, low, high, 0.1]), stray, grid)
+    assert 0 <= first <= grid
+    assert 0 <= end <= grid
+    assert list(range(first, end)) == can_touch(cv, low, high, stray, grid)
+
+
+def test_the_running_number_of_touched_fibres():
+    rng = np.random.default_rng(0)
+    presses, strays = rng.uniform(-1, 6, (30, 2)), np.array([0.3, 1.1])
+    reach = np.array([[-1, 1, -0.5, 0.7, 0.1], [-1, 1, -0.2, 0.4, 0.1]])
+    numbers = [
+        sum(
+            len(can_touch(press[1 - family], reach[family, 2], reach[family, 3], strays[family], 4))
+            for family in (0, 1)
+        )
+        for press in presses
+    ]
+    np.testing.assert_array_equal(count_touched(strays, presses, reach, 4), np.append(0, np.cumsum(numbers)))
+
+
+def test_strays_are_the_farthest_that_fibres_of_a_family_leave_their_levels():
+    for seed in range(5):
+        pads = np.stack([Morphology.random(3, 2, 10 * seed + k).knots for k in range(2)])
+        found = family_strays(fibre_axes(pads)[1])
+        for pad, strays in zip(pads, found, strict=True):
+            for family in (0, 1):
+                away = [np.abs(pad[3 * family + i, :, 1 - family] - (i + 1)).max() for i in range(3)]
+                assert strays[family] == pytest.approx(max(away))
+
+
+@pytest.mark.parametrize(("d", "inverse"), [(2.0, 0.5), (0.25, 4.0), (0.006, 1 / 0.006), (0.004, 200.0), (0.0, 200.0)])
+def test_weights_of_an_element(d, inverse):
+    radius = 0.5
+    assert weigh(d**2, radius, UNIFORM) == 1
+    assert weigh(d**2, radius, INVERSE_SQUARE) == pytest.approx(1 / (radius + d**2))
+    assert weigh(d**2, radius, INVERSE) == pytest.approx(inverse)

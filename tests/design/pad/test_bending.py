@@ -1,0 +1,178 @@
+"""Bends and folds against closed forms and slow oracles."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
+
+from design import Morphology, flatten
+from design.pad.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, trace
+from design.pad.curves import beziers, slope_beziers
+
+AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+seeds = st.integers(0, 2**32 - 1)
+
+
+def arc_of(points):
+    return np.append(0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
+
+
+def traced(pad, fibre, step=2.5e-3):
+    return trace(beziers(pad)[fibre], slope_beziers(pad)[fibre], step)
+
+
+def dense(pad, fibre, per_span=2000):
+    """Points and headings by SciPy, dense at the ends of spans, where steep ones turn."""
+    axis = 0 if fibre < pad.grid else 1
+    t, v = pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis]
+    u = np.sin(np.linspace(0, np.pi / 2, per_span)) ** 2
+    at = np.append((t[:-1, None] + np.diff(t)[:, None] * u[:-1]).ravel(), t[-1])
+    curve = PchipInterpolator(t, v)
+    return np.column_stack([at, curve(at)]), np.arctan(curve.derivative()(at))
+
+
+@pytest.mark.parametrize("radius", [0.5, 2.0, 10.0])
+def test_an_arc_has_its_own_radius(radius):
+    angle = np.linspace(0, 1.5, 300)
+    arc = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    assert bend_radius(arc, angle, window=radius / 2)[0] == pytest.approx(radius, rel=1e-5)
+
+
+def test_a_corner_is_found_where_it_is():
+    line = np.array([[0, 0], [5, 0], [5, 0], [5, 5.0]])
+    radius, place = bend_radius(line, np.array([0, 0, 1, 1]) * np.pi / 2, window=1.0)
+    assert radius == pytest.approx(1 / (np.pi / 2))
+    assert place == pytest.approx((5, 0))
+
+
+def test_a_straight_line_does_not_bend():
+    assert bend_radius(np.array([[0, 0], [1, 0], [2, 0.0]]), np.zeros(3), 1.0)[0] == np.inf
+
+
+def test_a_curve_shorter_than_the_window_bends_over_its_length():
+    angle = np.linspace(0, 0.2, 50)
+    arc = 5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    assert bend_radius(arc, angle, window=100)[0] == pytest.approx(5, rel=1e-4)
+
+
+@given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 2)), min_size=1, max_size=20), st.integers(1, 12))
+def test_windows_count_the_corners_at_both_their_ends(steps, quarters):
+    """On quarter steps, whose lengths add without rounding, corners lie exactly a window apart again and again."""
+    lengths, ways = np.array(steps).T
+    corners = np.vstack([np.zeros(2), np.cumsum(AXES[ways] * lengths[:, None] / 4, axis=0)])
+    points = np.repeat(corners, 2, axis=0)[1:-1]
+    headings = np.repeat(np.array([0, 1, -1])[ways] * np.pi / 2, 2)
+    arc = arc_of(corners)
+    window = min(quarters / 4, arc[-1])
+    turns = np.abs(np.diff(headings[::2]))
+    most = max(turns[(arc[1:-1] >= start) & (arc[1:-1] <= start + window)].sum() for start in [*arc, *(arc - window)])
+    assert bend_radius(points, headings, quarters / 4)[0] == pytest.approx(window / most if most else np.inf)
+
+
+@given(seeds, st.integers(1, 20), st.sampled_from([0.05, 0.3, 2.0]))
+def test_the_bend_radius_is_that_of_every_window_tried(seed, knots, window):
+    pad = Morphology.random(2, knots, seed)
+    points, headings = dense(pad, fibre=1)
+    arc = arc_of(points)
+    turned = np.append(0, np.abs(np.diff(headings)).cumsum())
+    starts = np.concatenate([np.linspace(0, arc[-1] - window, 20_000), arc])
+    most = (np.interp(starts + window, arc, turned) - np.interp(starts, arc, turned)).max()
+    found = window / bend_radius(*traced(pad, fibre=1, step=2.5e-3), window)[0]
+    assert found == pytest.approx(most, abs=1e-3)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.2, 0.5])
+def test_a_circle_through_knots_has_its_radius(radius):
+    """Three arcs of one radius, 60 degrees steep, through knots so dense that the PCHIP through them is as round."""
+    heading = np.interp(np.linspace(0, 4, 801), [0, 1, 3, 4], np.radians([0, 60, -60, 0]))
+    middle = (heading[1:] + heading[:-1]) / 2
+    chords = 2 * radius * np.sin(np.radians(240) / 1600) * np.column_stack([np.cos(middle), np.sin(middle)])
+    start = np.array([0.1, 1])
+    bump = np.vstack([[0, 1], start, start + chords.cumsum(axis=0), [2, 1]])
+    bump[-2:, 1] = 1
+    straight = np.column_stack([np.ones(len(bump)), bump[:, 0]])
+    points, headings = traced(Morphology(np.stack([bump, straight])), 0)
+    assert bend_radius(points, headings, radius / 2)[0] == pytest.approx(radius, rel=5e-3)
+
+
+@given(seeds, st.integers(0, 20), st.sampled_from([0.5, 0.02]))
+def test_traced_points_lie_on_the_curve_with_its_headings(seed, knots, step):
+    pad = Morphology.random(1, knots, seed)
+    for fibre, axis in ((0, 0), (1, 1)):
+        assume(np.diff(pad.knots[fibre, :, axis]).min() > 1e-3)  # closer ones cost the oracle its own digits
+        points, headings = traced(pad, fibre, step)
+        curve = PchipInterpolator(pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis])
+        np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)
+        np.testing.assert_allclose(headings, np.arctan(curve.derivative()(points[:, axis])), atol=1e-5)
+        assert np.abs(np.diff(headings)).max() <= step
+        assert headings[[0, -1]] == pytest.approx(extreme_headings(slope_beziers(pad)[fibre])[[0, -1]])
+
+
+def test_coincident_knots_are_a_corner():
+    fibre = np.array([[0, 1], [1 - 1e-9, 0.5], [1, 1.5], [2, 1]])
+    pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
+    _, headings = traced(pad, 0)
+    assert np.abs(np.diff(headings)).max() <= 2.5e-3
+    assert headings.max() == pytest.approx(np.pi / 2, abs=1e-6)
+
+
+def folds_tried(line, gap, step):
+    """Least distance of points `step` apart along a polyline that lie at least `FOLD` gaps apart."""
+    arc = arc_of(line)
+    at = np.unique(np.concatenate([np.arange(0, arc[-1], step), arc]))
+    points = np.column_stack([np.interp(at, arc, axis) for axis in line.T])
+    least = np.inf
+    for first, start in enumerate(np.searchsorted(at, at + FOLD * gap)):
+        least = min(least, np.linalg.norm(points[start:] - points[first], axis=1).min(initial=np.inf))
+    return least
+
+
+def assert_nearest(found, tried, gap, step):
+    """Points `step` apart miss the least distance by at most that, and never undercut it."""
+    if found is None:
+        assert tried >= gap - 1e-9
+    else:
+        assert found[0] - 1e-9 <= tried <= found[0] + step
+
+
+@given(seeds, st.integers(1, 12), st.sampled_from([0.1, 0.4]))
+@settings(max_examples=40)
+def test_the_fold_gap_is_that_of_all_points_tried(seed, knots, gap):
+    pad = Morphology.random(1, knots, seed)
+    line = flatten(pad, 1e-3)[0]
+    assert_nearest(fold_gap(line, gap), folds_tried(line, gap, gap / 20), gap, gap / 20)
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 1), st.floats(-1.5, 1.5)), min_size=1, max_size=8), st.floats(0.1, 1))
+def test_the_fold_gap_of_long_straight_branches(steps, gap):
+    length, heading = np.array(steps).T
+    way = np.column_stack([np.cos(heading), np.sin(heading)]) * length[:, None]
+    line = np.vstack([np.zeros(2), way.cumsum(axis=0)])
+    assert_nearest(fold_gap(line, gap), folds_tried(line, gap, gap / 50), gap, gap / 50)
+
+
+def test_a_narrow_u_turn_keeps_the_distance_of_its_legs():
+    angle = np.linspace(np.pi, 0, 500)
+    turn = 0.25 * np.column_stack([np.cos(angle), np.sin(angle)])
+    line = np.vstack([[-0.25, -5], turn, [0.25, -5]])
+    found = fold_gap(line, 0.8)
+    assert found is not None
+    assert found[0] == pytest.approx(0.5)
+    assert found[1][0] == pytest.approx(0, abs=1e-9)
+    assert fold_gap(line, 0.499) is None
+
+
+def test_a_corner_is_as_narrow_as_its_opening():
+    half = np.radians(20)
+    line = 3 * np.array([[-np.sin(half), -np.cos(half)], [0, 0], [np.sin(half), -np.cos(half)]])
+    found = fold_gap(line, 0.8)
+    assert found is not None
+    assert found[0] == pytest.approx(FOLD * 0.8 * np.sin(half))
+    assert found[1] == pytest.approx((0, -FOLD * 0.4 * np.cos(half)))
+
+
+@pytest.mark.parametrize(("turn", "folds"), [(UNFOLDED - 1e-6, False), (UNFOLDED + 1e-6, True)])
+def test_a_corner_folds_where_it_turns_by_more_than_the_unfolded_range(turn, folds):
+    line = np.array([[-np.cos(turn / 2), -np.sin(turn / 2)], [0, 0], [np.cos(turn / 2), -np.sin(turn / 2)]])
+    assert (fold_gap(line, 0.5) is not None) == folds

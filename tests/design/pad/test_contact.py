@@ -1,0 +1,105 @@
+"""The contact model against the published samples, a slow oracle and closed forms."""
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.path import Path as Outline
+from scipy.interpolate import PchipInterpolator
+
+from design import Contact, InputError, Morphology, signals_quantized
+from design.pad.contact import boustrophedon
+
+SETS = [
+    ("1para", Contact()),
+    ("5para_dis", Contact()),
+    ("20para", Contact()),
+    ("5para_moresamps", Contact(weight="inverse_square")),
+    ("square_grid_cir", Contact(sides=50)),
+]
+
+
+@pytest.mark.parametrize(("name", "contact"), SETS, ids=[name for name, _ in SETS])
+def test_quantized_signals_are_the_published_samples(published, name, contact):
+    content = scipy.io.loadmat(published / f"{name}.mat")
+    pad = Morphology.load(published / f"{name}.mat")
+    found = signals_quantized(pad, content["loc_all"], contact)
+    np.testing.assert_allclose(found, content["sens_raw_all"], rtol=0, atol=1e-12)
+
+
+def oracle(pad, presses, contact, samples):
+    """The rule written out plainly: every sample of every fibre, point in polygon by matplotlib."""
+    at = np.linspace(0, pad.grid + 1, samples)
+    out = np.zeros((len(presses), 2 * pad.grid))
+    for fibre in range(2 * pad.grid):
+        axis = 0 if fibre < pad.grid else 1
+        cross = PchipInterpolator(pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis])(at)
+        points = np.column_stack([at, cross] if axis == 0 else [cross, at])
+        step = np.abs(np.diff(points, axis=0))
+        run = step.sum(axis=1) if contact.length == "manhattan" else np.hypot(*step.T)
+        for q, press in enumerate(presses):
+            away = points[:-1] - press
+            d = np.hypot(*away.T)
+            if contact.sides is None:
+                hit = d <= contact.radius
+            else:
+                angle = np.linspace(0, 2 * np.pi, contact.sides + 1)
+                hit = Outline(contact.radius * np.column_stack([np.cos(angle), np.sin(angle)])).contains_points(away)
+            weight = {
+                "uniform": np.ones_like(d),
+                "inverse_square": 1 / (contact.radius + d**2),
+                "inverse": 1 / np.maximum(d, contact.radius / 100),
+            }[contact.weight]
+            out[q, fibre] = (run * weight)[hit].sum()
+    return out
+
+
+contacts = st.builds(
+    Contact,
+    radius=st.floats(0.05, 3),
+    sides=st.one_of(st.none(), st.integers(3, 64)),
+    weight=st.sampled_from(["uniform", "inverse_square", "inverse"]),
+    length=st.sampled_from(["manhattan", "euclidean"]),
+)
+
+
+@given(contacts, st.integers(1, 4), st.integers(0, 8), st.integers(0, 2**32 - 1))
+@settings(max_examples=60)
+def test_culled_sums_equal_the_full_scan(contact, grid, knots, seed):
+    rng = np.random.default_rng(seed)
+    pad = Morphology.random(grid, knots, rng)
+    presses = rng.uniform(-1, grid + 2, (5, 2))
+    expected = oracle(pad, presses, contact, 300)
+    np.testing.assert_allclose(signals_quantized(pad, presses, contact, 300), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_straight_fibre_through_the_centre_signals_the_diameter():
+    found = signals_quantized(Morphology.straight(1), [[1, 1]], Contact(radius=0.5, sides=None), samples=200_001)
+    np.testing.assert_allclose(found, 1.0, atol=2e-5)
+
+
+def test_a_population_is_its_members_one_by_one():
+    pads = [Morphology.random(3, 2, seed) for seed in range(4)]
+    presses = boustrophedon(3, 5, 0.1)
+    batch = signals_quantized(np.stack([pad.knots for pad in pads]), presses)
+    assert batch.shape == (4, 25, 6)
+    for pad, signals in zip(pads, batch, strict=True):
+        np.testing.assert_array_equal(signals, signals_quantized(pad, presses))
+
+
+def test_no_presses_give_no_signals_and_far_presses_none_either():
+    pad = Morphology.straight(2)
+    assert signals_quantized(pad, []).shape == (0, 4)
+    assert not signals_quantized(pad, [[50, 50], [-9, 1]]).any()
+
+
+@pytest.mark.parametrize("presses", [[[np.nan, 1]], [[np.inf, 1]], [1, 2, 3], [[1, 2, 3]]])
+def test_presses_that_are_no_places_are_refused(presses):
+    with pytest.raises(InputError, match="presses"):
+        signals_quantized(Morphology.straight(2), presses)
+
+
+def test_the_serpentine_moves_one_cell_at_a_time():
+    places = boustrophedon(4, 7)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 0.5)

@@ -1,0 +1,130 @@
+"""The three forms of a PCHIP curve (compiled, torch, Bezier) against SciPy's."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
+
+from design import Morphology, crossings, flatten
+from design.criteria.differentiable import pchip_sample
+from design.pad.curves import beziers, crossing_angles, lengths, slopes
+from design.pad.kernels.pchip import sample_curves
+
+pads = st.builds(
+    Morphology.random, st.integers(1, 4), st.integers(0, 12), st.integers(0, 2**32 - 1).map(np.random.default_rng)
+)
+
+
+def scipy_curve(pad, fibre):
+    axis = 0 if fibre < pad.grid else 1
+    return PchipInterpolator(pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis])
+
+
+@given(pads)
+def test_slopes_are_scipys(pad):
+    for fibre, d in enumerate(slopes(pad)):
+        curve = scipy_curve(pad, fibre)
+        np.testing.assert_allclose(d, curve.derivative()(curve.x), rtol=1e-9, atol=1e-9)
+
+
+@given(pads)
+def test_sampled_curves_are_scipys(pad):
+    at = np.linspace(0, pad.grid + 1, 200)
+    compiled = sample_curves(pad.knots[None], 200)[0]
+    axes = [0] * pad.grid + [1] * pad.grid
+    t = torch.tensor(np.array([k[:, a] for k, a in zip(pad.knots, axes, strict=True)]))
+    v = torch.tensor(np.array([k[:, 1 - a] for k, a in zip(pad.knots, axes, strict=True)]))
+    smooth, _ = pchip_sample(t, v, torch.tensor(at))
+    for fibre in range(2 * pad.grid):
+        expected = scipy_curve(pad, fibre)(at)
+        np.testing.assert_allclose(compiled[fibre], expected, atol=1e-9)
+        np.testing.assert_allclose(smooth[fibre].numpy(), expected, atol=1e-9)
+
+
+def test_torch_gradients_pass_the_finite_difference_test():
+    t = torch.tensor([[0.0, 0.6, 1.1, 2.0, 3.0]], dtype=torch.float64, requires_grad=True)
+    v = torch.tensor([[1.0, 1.7, 2.1, 1.2, 1.0]], dtype=torch.float64, requires_grad=True)
+    at = torch.linspace(0.05, 2.95, 23, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda t, v: pchip_sample(t, v, at), (t, v))
+
+
+@given(pads)
+def test_bezier_spans_lie_on_the_curve(pad):
+    u = np.linspace(0, 1, 7)[:, None]
+    for fibre, spans in enumerate(beziers(pad)):
+        axis = 0 if fibre < pad.grid else 1
+        for p in spans:
+            points = (1 - u) ** 3 * p[0] + 3 * (1 - u) ** 2 * u * p[1] + 3 * (1 - u) * u**2 * p[2] + u**3 * p[3]
+            np.testing.assert_allclose(points[:, 1 - axis], scipy_curve(pad, fibre)(points[:, axis]), atol=1e-6)
+
+
+@given(pads, st.sampled_from([1e-2, 1e-3, 1e-4]))
+def test_flattened_fibres_stay_within_the_tolerance(pad, tolerance):
+    for coarse, fine in zip(flatten(pad, tolerance), flatten(pad, tolerance / 100), strict=True):
+        start, end = coarse[:-1], coarse[1:]
+        nearest = np.full(len(fine), np.inf)
+        for a, b in zip(start, end, strict=True):
+            along = np.clip(((fine - a) @ (b - a)) / max((b - a) @ (b - a), 1e-300), 0, 1)
+            nearest = np.minimum(nearest, np.linalg.norm(fine - a - along[:, None] * (b - a), axis=1))
+        assert nearest.max() <= tolerance * 1.02
+
+
+def test_length_of_straight_and_bent_fibres():
+    np.testing.assert_allclose(lengths(Morphology.straight(3)), 4)
+    pad = Morphology.random(4, 5, seed=3)
+    polyline = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in flatten(pad, 1e-8)]
+    np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
+
+
+def test_a_straight_grid_crosses_at_its_nodes():
+    found = crossings(Morphology.straight(3))
+    assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
+    np.testing.assert_allclose([c.place for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
+
+
+def diagonal_pad():
+    """Two fibres, each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2)."""
+    fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
+    return Morphology(np.stack([fibre, fibre[:, ::-1]]))
+
+
+def test_fibres_that_run_on_each_other_also_count_where_they_cross():
+    found = crossings(diagonal_pad())
+    np.testing.assert_allclose([c.place for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
+    np.testing.assert_allclose(crossing_angles(diagonal_pad(), found), [90, 0, 90])
+
+
+@given(pads)
+def test_crossings_within_families_are_those_of_all(pad):
+    family = [c for c in crossings(pad) if (c.first < pad.grid) == (c.second < pad.grid)]
+    assert crossings(pad, across=False) == family
+
+
+@given(pads)
+def test_angles_are_those_of_scipys_tangents(pad):
+    across = [c for c in crossings(pad) if c.first < pad.grid <= c.second]
+    for c, angle in zip(across, crossing_angles(pad, across), strict=True):
+        rise = scipy_curve(pad, c.first).derivative()(c.place[0])
+        run = scipy_curve(pad, c.second).derivative()(c.place[1])
+        between = np.degrees(np.arctan(rise) + np.arctan(run) - np.pi / 2) % 180
+        assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
+
+
+def test_a_touch_has_angle_0():
+    line = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
+    bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
+    pad = Morphology(np.stack([line, bow]))
+    found = crossings(pad)
+    touch = [np.allclose(c.place, 1) for c in found]
+    assert sum(touch) == 1
+    assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("name", "all_", "family"), [("1para", 16, 0), ("5para_dis", 30, 6), ("20para", 672, 124)])
+def test_crossings_of_the_published_pads(published, name, all_, family):
+    """Counts measured independently with a B-Rep kernel's intersection of exact Beziers."""
+    found = crossings(Morphology.load(published / f"{name}.mat"))
+    assert len(found) == all_
+    assert sum((c.first < 4) == (c.second < 4) for c in found) == family

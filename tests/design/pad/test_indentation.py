@@ -1,0 +1,245 @@
+"""The indentation model against identities of contact mechanics, closed forms and adaptive quadrature."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
+
+from design import InputError, Morphology
+from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
+
+INDENTERS = [Indenter("sphere", 0.7), Indenter("cone", angle_deg=30), Indenter("flat", 0.45)]
+
+indenters = st.builds(
+    Indenter,
+    shape=st.sampled_from(["sphere", "cone", "flat"]),
+    radius=st.floats(0.2, 2),
+    angle_deg=st.floats(2, 80),
+)
+
+
+def slope(indenter, r, depth):
+    """dw/dr, differentiated by hand from the deflections of the module's docstring."""
+    a, flank = indenter.contact_radius(depth), np.tan(np.radians(indenter.angle_deg))
+    if indenter.shape == "sphere":
+        if r <= a:
+            return -r / indenter.radius
+        return -2 / (np.pi * indenter.radius) * (r * np.arcsin(a / r) - a * np.sqrt(1 - (a / r) ** 2))
+    if indenter.shape == "cone":
+        return -flank if r <= a else flank * (np.sqrt(1 - (a / r) ** 2) - 1)
+    return 0.0 if r <= a else -2 * depth / np.pi * a / (r * np.sqrt(r**2 - a**2))
+
+
+def oracle(pad, press, depth, indenter, fibre):
+    """One signal: SciPy's adaptive quadrature between knots, edges of the contact and the nearest point."""
+    axis = 0 if fibre < pad.grid else 1
+    t, a = pad.knots[fibre, :, axis], float(indenter.contact_radius(depth))
+    curve = PchipInterpolator(t, pad.knots[fibre, :, 1 - axis])
+    rise = curve.derivative()
+
+    def away(x):
+        return np.hypot(x - press[axis], curve(x) - press[1 - axis])
+
+    def density(x):
+        r, own = away(x), np.hypot(1, rise(x))
+        fall = 0.0
+        if r > 0:
+            along = (x - press[axis]) + (curve(x) - press[1 - axis]) * rise(x)
+            fall = slope(indenter, r, depth) * along / r
+        return np.hypot(own, fall) - own
+
+    cuts = set(t)
+    for low, high in pairwise(t):
+        at = np.linspace(low, high, 2001)
+        inside = away(at) <= a
+        cuts |= {
+            brentq(lambda x: away(x) - a, at[i], at[i + 1], xtol=1e-15)
+            for i in np.flatnonzero(inside[1:] != inside[:-1])
+        }
+        cuts.add(at[away(at).argmin()])
+    total = 0.0
+    for low, high in pairwise(sorted(cuts)):
+        middle, half = (low + high) / 2, (high - low) / 2
+        # towards both ends by a cosine, which takes the pole at a flat punch's edge away
+        total += quad(
+            lambda u, m=middle, h=half: density(m - h * np.cos(u)) * h * np.sin(u), 0, np.pi, epsrel=1e-9, limit=200
+        )[0]
+    return total
+
+
+@given(indenters, st.floats(0.01, 0.19))
+def test_stiffness_is_twice_modulus_times_contact_radius(indenter, depth):
+    step = 1e-5 * depth
+    stiffness = (indenter.force(depth + step) - indenter.force(depth - step)) / (2 * step)
+    np.testing.assert_allclose(stiffness, 2 * indenter.contact_radius(depth), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("indenter", "of_a", "of_force"), zip(INDENTERS, (0.5, 1, 0), (1.5, 2, 1), strict=True))
+def test_contact_radius_and_force_scale_with_a_power_of_depth(indenter, of_a, of_force):
+    assert indenter.contact_radius(0.4) / indenter.contact_radius(0.1) == pytest.approx(4**of_a)
+    assert indenter.force(0.4) / indenter.force(0.1) == pytest.approx(4**of_force)
+
+
+@given(indenters, st.floats(0.01, 0.19), st.floats(0.02, 6))
+def test_the_surface_is_that_of_flat_punches_pressed_one_after_another(indenter, depth, r):
+    """Any contact grows as a flat punch of the present radius would be pressed on (Mossakovskii 1963)."""
+    a, deflection = float(indenter.contact_radius(depth)), float(indenter.deflection(r, depth))
+
+    def pressed_on(radius):  # depth gained per contact radius
+        if indenter.shape == "sphere":
+            return 2 * radius / indenter.radius
+        return np.pi / 2 * np.tan(np.radians(indenter.angle_deg))
+
+    def below(radius):
+        return 2 / np.pi * np.arcsin(min(1, radius / r))
+
+    if indenter.shape == "flat":
+        expected = depth * below(a)
+    else:
+        edges = [0, min(r, a), a]
+        expected = sum(quad(lambda s: below(s) * pressed_on(s), *ends)[0] for ends in pairwise(edges))
+    np.testing.assert_allclose(deflection, expected, rtol=1e-6, atol=1e-9)
+
+
+@given(indenters, st.floats(0.01, 0.19))
+def test_the_surface_has_no_step_and_is_deepest_at_the_axis(indenter, depth):
+    a = float(indenter.contact_radius(depth))
+    near, far = indenter.deflection([a * (1 - 1e-12), a * (1 + 1e-12)], depth)
+    assert near == pytest.approx(far, abs=1e-5 * depth)
+    w = indenter.deflection(np.linspace(0, 8, 500), depth)
+    assert w[0] == pytest.approx(depth)
+    assert (np.diff(w) <= 1e-12).all()
+    assert (w > 0).all()
+
+
+def test_forces_are_newtons():
+    # a ball of 20 mm pressed 2 mm into a half-space of 100 kPa: 4/3 1e5 sqrt(0.01) 0.002^1.5
+    ball = Indenter("sphere", radius=2.0)
+    assert ball.force_n(0.4, pitch_mm=5, reduced_modulus_kpa=100) == pytest.approx(4 / 3 * 1e5 * 0.1 * 0.002**1.5)
+    assert pytest.approx(73.33, abs=0.01) == REDUCED_MODULUS_KPA
+
+
+def test_a_straight_fibre_through_the_axis_is_a_plain_integral_of_the_surface():
+    pad, depth = Morphology.straight(3), 0.3
+    for indenter in INDENTERS:
+        a = float(indenter.contact_radius(depth))
+
+        def lengthening(r, indenter=indenter):
+            return np.hypot(1, slope(indenter, r, depth)) - 1
+
+        under = quad(lengthening, 0, a)[0]
+        around = quad(lambda u, f=lengthening, a=a: f(a + u * u) * 2 * u, 0, np.sqrt(2 - a))[0]
+        found = indented_signals(pad, [[2, 2]], [depth], indenter)
+        np.testing.assert_allclose(found[0, [1, 4]], 2 * (under + around), rtol=1e-7)
+        if indenter.shape == "cone":
+            assert under == pytest.approx(a * (1 / np.cos(np.radians(indenter.angle_deg)) - 1))
+
+
+@given(indenters, st.integers(0, 6), st.floats(0.01, 0.19), st.integers(0, 2**32 - 1))
+@settings(max_examples=60)
+def test_signals_equal_adaptive_quadrature(indenter, knots, depth, seed):
+    rng = np.random.default_rng(seed)
+    pad = Morphology.random(2, knots, rng)
+    presses = rng.uniform(0, 3, (2, 2))
+    found = indented_signals(pad, presses, [depth, depth], indenter)
+    expected = [[oracle(pad, press, depth, indenter, fibre) for fibre in range(4)] for press in presses]
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-11)
+
+
+@pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
+@pytest.mark.parametrize("miss", [0, 1e-12, 1e-6, -1e-6, -1e-12])
+def test_a_fibre_that_grazes_the_contact_has_a_neighbours_signal(indenter, miss):
+    depth = 0.3
+    a = float(indenter.contact_radius(depth))
+    pad = Morphology.straight(2)
+    at = np.array([[1.3, 1 + a + miss], [1.3, 1 + a + 1e-7]])
+    grazed, neighbour = indented_signals(pad, at, depth, indenter)[:, 0]
+    assert grazed == pytest.approx(neighbour, rel=0.01)
+
+
+@pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
+def test_deeper_presses_signal_more_and_no_depth_nothing(indenter):
+    pad = Morphology.random(4, 5, 0)
+    presses = np.random.default_rng(0).uniform(1, 4, (20, 2))
+    by_depth = [indented_signals(pad, presses, depth, indenter) for depth in (0, 1e-9, 0.1, 0.2, 0.4)]
+    assert not by_depth[0].any()
+    assert all((more > less).all() for less, more in pairwise(by_depth[1:]))
+    assert np.isfinite(by_depth[1]).all()
+
+
+@pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
+def test_a_mirrored_pad_gives_mirrored_signals(indenter):
+    pad = Morphology.random(3, 4, 1)
+    presses = np.random.default_rng(2).uniform(0, 4, (10, 2))
+    found = indented_signals(pad, presses, 0.3, indenter)
+    swapped = Morphology(np.concatenate([pad.knots[3:, :, ::-1], pad.knots[:3, :, ::-1]]))
+    turned = indented_signals(swapped, presses[:, ::-1], 0.3, indenter)
+    np.testing.assert_allclose(turned, np.roll(found, 3, axis=1), rtol=1e-5)
+    upside_down = pad.knots * [1, -1] + [0, 4]
+    upside_down = Morphology(np.concatenate([upside_down[2::-1], upside_down[3:, ::-1]]))
+    mirrored = indented_signals(upside_down, presses * [1, -1] + [0, 4], 0.3, indenter)
+    np.testing.assert_allclose(mirrored, found[:, [2, 1, 0, 3, 4, 5]], rtol=1e-5)
+
+
+@pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
+def test_moving_the_press_along_the_pattern_moves_the_signals(indenter):
+    pad = Morphology.straight(40)
+    here, there = indented_signals(pad, [[20.3, 20.4], [21.3, 21.4]], 0.3, indenter)
+    near = np.r_[15:25, 55:65]
+    np.testing.assert_allclose(there[near + 1], here[near], rtol=1e-3)
+    assert here[[0, 39, 40, 79]].max() < 1e-4 * here.max()
+
+
+def test_any_number_of_presses_gives_the_same_signals():
+    pad, rng = Morphology.random(4, 5, 0), np.random.default_rng(3)
+    presses, depths = rng.uniform(0, 5, (300, 2)), rng.uniform(0.1, 0.45, 300)
+    many = indented_signals(pad, presses, depths, INDENTERS[0])
+    one = indented_signals(pad, presses[7:8], depths[7:8], INDENTERS[0])
+    np.testing.assert_array_equal(many[7:8], one)
+    assert indented_signals(pad, [], [], INDENTERS[0]).shape == (0, 8)
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"shape": "cube"}, "shape is 'cube', allowed is sphere, cone, flat"),
+        ({"radius": 0.0}, "radius is 0.0, allowed"),
+        ({"radius": np.nan}, "radius is nan, allowed"),
+        ({"shape": "cone", "angle_deg": 90.0}, "angle_deg is 90.0, allowed"),
+    ],
+)
+def test_impossible_indenters_are_refused(settings, named):
+    with pytest.raises(InputError, match=named):
+        Indenter(**settings)
+
+
+@pytest.mark.parametrize(
+    ("depths", "named"),
+    [
+        ([0.1, -0.1], "depth is -0.1, allowed is 0 to the sphere's radius, 0.7"),
+        ([0.1, 0.8], "depth is 0.8, allowed"),
+        ([0.1, np.nan], "depths hold NaN"),
+        ([0.1], r"depths have shape \(1,\), expected \(2,\)"),
+    ],
+)
+def test_impossible_depths_are_refused(depths, named):
+    with pytest.raises(InputError, match=named):
+        indented_signals(Morphology.straight(2), [[1, 1], [2, 2]], depths, Indenter())
+
+
+@pytest.mark.parametrize("share", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("shape", ["cone", "flat"])
+def test_a_fibre_close_to_a_tip_or_beside_an_edge_misses_nothing(shape, share):
+    """Its slope turns round within a length that quadrature could step over."""
+    depth, pad = 0.3, Morphology.straight(2)
+    indenter = Indenter(shape, radius=0.45, angle_deg=50)
+    a = float(indenter.contact_radius(depth))
+    away = a * share if shape == "cone" else a * (1 + share)
+    found = indented_signals(pad, [[1.3, 1 + away], [1.8, 1 - away]], depth, indenter)[:, 0]
+    expected = [oracle(pad, press, depth, indenter, 0) for press in ((1.3, 1 + away), (1.8, 1 - away))]
+    np.testing.assert_allclose(found, expected, rtol=3e-5)

@@ -1,0 +1,228 @@
+import numpy as np
+import pytest
+import shapely
+import trimesh
+import trimesh.exchange.stl
+from manifold3d import Manifold, OpType
+
+from design.common.errors import InputError
+from fabricate.checks import mesh_checks as soundness
+from fabricate.checks.mesh_checks import SOUND, check_mesh, inspect_mesh, sound
+from fabricate.settings import Printer
+from tests.fabricate.trays import CROSS, block, faults, inspected, line, near, prism, tray
+
+
+class TestSound:
+    box = block(10, 20, 5)
+
+    def test_a_missing_triangle(self):
+        found = inspected(trimesh.Trimesh(self.box.vertices, self.box.faces[1:]))
+        assert found["manifold"].status == found["watertight"].status == "fail"
+        assert found["watertight"].measured == len(found["watertight"].places_mm) == 3
+        assert "ridge_width" not in found
+
+    def test_two_boxes_that_share_an_edge(self):
+        watertight = {f.name: f for f in sound(*_together(self.box, block(10, 20, 5, at=(10, 20, 0))))}["watertight"]
+        assert (watertight.status, watertight.measured) == ("fail", 1)
+        assert near(watertight, 5, 10, 1e-6)
+
+    @pytest.mark.parametrize(("most", "more"), [(4, True), (1000, False)])
+    def test_pairs_that_cut_through_each_other_are_counted_up_to_a_limit(self, monkeypatch, most, more):
+        monkeypatch.setattr(soundness, "_MOST_PAIRS", most)
+        crossing = _together(self.box, block(2, 30, 2, at=(0.3, 0.2, 0.1)))
+        found = {f.name: f for f in sound(*crossing)}["self_intersection"]
+        assert found.status == "fail"
+        assert (found.measured == most) == more
+        assert found.message.endswith("pairs of triangles and more cut through each other") == more
+
+    def test_sizes_are_told_rounded_up(self):
+        found = inspected(block(10.002, 20.01, 5))["bed"]
+        assert found.message.startswith("10.01 x 20.01 x 5 mm to print")
+
+    def test_one_triangle_turned_round(self):
+        faces = np.array(self.box.faces)
+        faces[0] = faces[0][::-1]
+        watertight = inspected(trimesh.Trimesh(self.box.vertices, faces))["watertight"]
+        assert (watertight.status, watertight.measured) == ("fail", 3)
+        middle = self.box.triangles_center[0]
+        assert near(watertight, middle[0], middle[1], 8.0)
+
+    def test_two_bodies(self):
+        other = block(2, 2, 2, at=(30, 7, 0))
+        bodies = {f.name: f for f in sound(*_together(self.box, other))}["bodies"]
+        assert (bodies.status, bodies.measured) == ("fail", 2)
+        assert near(bodies, 30, 7, 1.5)
+        assert len(bodies.places_mm) == 1
+
+    def test_a_hollow_is_no_body(self):
+        hollow = block(2, 2, 2)
+        hollow.invert()
+        found = {f.name: f for f in sound(*_together(self.box, hollow))}
+        assert (found["bodies"].status, found["bodies"].measured) == ("warn", 1)
+        assert near(found["bodies"], 0, 0, 1.5)
+
+    def test_a_body_turned_inside_out_beside_another_is_a_body(self):
+        other = block(2, 2, 2, at=(30, 7, 0))
+        other.invert()
+        found = {f.name: f for f in sound(*_together(self.box, other))}
+        assert (found["bodies"].status, found["bodies"].measured) == ("fail", 2)
+
+    def test_a_body_within_a_body(self):
+        found = {f.name: f for f in sound(*_together(self.box, block(2, 2, 2)))}
+        assert faults(found) == {"bodies": "fail"}
+
+    def test_inside_out(self):
+        mesh = self.box.copy()
+        mesh.invert()
+        assert faults(inspected(mesh)) == {"volume": "fail"}
+
+    def test_nothing(self):
+        found = inspect_mesh(np.empty((0, 3)), np.empty((0, 3), dtype=int))
+        assert {f.name for f in found if f.status == "fail"} >= {"bodies", "volume"}
+
+    def test_the_order_and_the_repetition_of_vertices_say_nothing(self):
+        mesh = tray(*CROSS).to_mesh()
+        corners = np.asarray(mesh.vert_properties)[np.asarray(mesh.tri_verts)][::-1].reshape(-1, 3)
+        found = sound(corners, np.arange(len(corners)).reshape(-1, 3), genus=0)
+        assert [f.name for f in found] == list(SOUND)
+        assert {f.status for f in found} == {"pass"}
+
+    @pytest.mark.parametrize(
+        ("bed", "status"),
+        [
+            ([10.0, 20.0, 5.0], "pass"),
+            ([20.0, 10.0, 5.0], "pass"),
+            ([19.0, 19.0, 5.0], "fail"),
+            ([20.0, 20.0, 4.0], "fail"),
+            ([20.0, 10.0, 4.99], "fail"),
+            ([9.99, 30.0, 5.0], "fail"),
+            ([30.0, 10.0, 5.0], "pass"),
+        ],
+    )
+    def test_bed(self, bed, status):
+        assert inspected(self.box, printer=Printer(bed_mm=bed))["bed"].status == status
+
+    def test_what_a_box_measures(self):
+        found = inspected(self.box, genus=0)
+        assert found["volume"].measured == pytest.approx(1000)
+        assert found["bed"].measured == pytest.approx([10, 20, 5])
+        assert found["bed"].message == "10 x 20 x 5 mm to print on a bed of 220 x 220 x 250 mm"
+        assert found["genus"].measured == 0
+
+    @pytest.mark.parametrize("genus", [0, 1, 2])
+    def test_holes_that_lead_through_are_counted(self, genus):
+        plate = prism(shapely.box(-12, -5, 12, 5), 0, 3)
+        for x in (-6, 6)[:genus]:
+            plate -= Manifold.cylinder(9, 2.0, 2.0, 24).translate((x, 0, -1))
+        mesh = plate.to_mesh()
+        for expected in (0, 1, 2):
+            found = {f.name: f for f in sound(mesh.vert_properties, mesh.tri_verts, genus=expected)}["genus"]
+            assert (found.measured, found.limit) == (genus, expected)
+            assert found.status == ("pass" if genus == expected else "fail")
+
+    @pytest.mark.parametrize(("count", "bodies"), [(99, 1), (100, 101)])
+    def test_of_more_than_a_hundred_shells_all_are_bodies(self, count, bodies):
+        """Hollows in a row within a long box."""
+        hollows = [block(0.5, 0.5, 0.5, at=(n - count / 2, 0, 0)) for n in range(count)]
+        for hollow in hollows:
+            hollow.invert()
+        found = {f.name: f for f in sound(*_together(block(120, 2, 2), *hollows))}["bodies"]
+        assert found.measured == bodies
+
+
+def _together(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)
+    return corners, np.arange(len(corners)).reshape(-1, 3)
+
+
+class TestFiles:
+    @pytest.mark.parametrize("suffix", ["stl", "3mf"])
+    def test_a_box(self, tmp_path, suffix):
+        path = tmp_path / f"box.{suffix}"
+        TestSound.box.export(path)
+        assert {finding.status for finding in check_mesh(path)} == {"pass"}
+
+    def test_two_solids_in_an_ascii_stl(self, tmp_path):
+        far = block(10, 20, 5, at=(30, 0, 0))
+        text = "\n".join(trimesh.exchange.stl.export_stl_ascii(mesh) for mesh in (TestSound.box, far))
+        (tmp_path / "two.stl").write_text(text)
+        found = {finding.name: finding for finding in check_mesh(tmp_path / "two.stl")}
+        assert faults(found) == {"bodies": "fail"}
+        assert found["bodies"].measured == 2
+
+    def test_two_objects_in_a_3mf(self, tmp_path):
+        near_by = block(10, 20, 5, at=(5, 4, 0))
+        trimesh.Scene([TestSound.box, near_by]).export(tmp_path / "two.3mf")
+        found = {finding.name: finding for finding in check_mesh(tmp_path / "two.3mf")}
+        assert {"bodies", "self_intersection"} <= set(faults(found))
+
+    @pytest.mark.parametrize("name", ["torn.stl", "torn.3mf"])
+    @pytest.mark.parametrize("content", [b"", b"solid\n", b"\0" * 84, b"\0" * 90, b"\xff" * 500, b"PK"])
+    def test_a_torn_file_is_refused_on_one_line(self, tmp_path, name, content):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name) as refusal:
+            check_mesh(tmp_path / name)
+        assert "\n" not in str(refusal.value)
+
+    def test_no_file(self, tmp_path):
+        with pytest.raises(InputError, match="cannot be read"):
+            check_mesh(tmp_path / "absent.stl")
+        with pytest.raises(InputError, match="Is a directory"):
+            check_mesh(tmp_path)
+
+
+def test_a_triangle_with_nan_is_refused_not_dropped(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((10, 20, 5)).export(path)
+    content = bytearray(path.read_bytes())
+    content[80:84] = np.uint32(13).tobytes()
+    path.write_bytes(bytes(content) + np.array([0, 0, 1, np.nan, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + b"\0\0")
+    with pytest.raises(InputError, match="NaN"):
+        check_mesh(path)
+
+
+class TestTight:
+    @pytest.mark.parametrize("width", [1.0, 3.0, 8.0])
+    def test_a_wall_cut_open(self, width):
+        cut = prism(line((9, 2), (14, 2), width=width), 2.0, 9.0)
+        finding = inspected(tray(*CROSS) - cut)["tight"]
+        assert finding.status == "fail"
+        assert near(finding, 11, 2, 2.5)
+
+    def test_a_hole_through_the_floor(self):
+        finding = inspected(tray(*CROSS) - Manifold.cylinder(5, 0.5).translate((-6, 6, -1)))["tight"]
+        assert (finding.status, finding.measured) == ("fail", 1)
+        assert near(finding, -6, 6)
+
+    def test_an_opening_below_the_rim(self):
+        bore = Manifold.cylinder(8, 0.6).rotate((0, 90, 0)).translate((8, 0, 5))
+        assert inspected(tray(*CROSS) - bore)["tight"].status == "fail"
+
+    @pytest.mark.parametrize(("width", "status"), [(9.5, "fail"), (10.5, "pass")])
+    def test_openings_wider_than_a_centimetre_are_the_shape_of_the_part(self, width, status):
+        cut = prism(line((9, 2), (14, 2), width=width), 2.0, 9.0)
+        assert inspected(tray() - cut)["tight"].status == status
+
+    @pytest.mark.parametrize(("side", "status"), [(0.09, "pass"), (0.12, "fail")])
+    def test_holes_as_small_as_roundings(self, side, status):
+        hole = Manifold.cube((side, side, 5)).translate((-6, 6, -1))
+        assert inspected(tray() - hole)["tight"].status == status
+
+    @pytest.mark.parametrize(("side", "status"), [(13.5, "fail"), (14.8, "pass")])
+    def test_what_has_less_than_half_a_floor_is_no_tray(self, side, status):
+        """Half of 20 mm squared is 14.1 mm squared."""
+        hole = Manifold.cube((side, side, 5), True)
+        assert inspected(tray(draft_deg=0) - hole)["tight"].status == status
+
+    @pytest.mark.parametrize(("outer", "status"), [(38.0, "fail"), (42.0, "pass")])
+    def test_a_hollow_of_less_than_a_quarter_of_the_outline_is_a_hole(self, outer, status):
+        """A pot of 20 mm squared with a leak in its floor, on a plate."""
+        plate = Manifold.cube((outer, outer, 2.0), True).translate((0, 0, 1))
+        leak = Manifold.cylinder(9, 1.0).translate((3, 3, -1))
+        solid = Manifold.batch_boolean([tray(draft_deg=0), plate], OpType.Add) - leak
+        assert inspected(solid)["tight"].status == status
+
+    def test_pockets_that_lead_nowhere(self):
+        slot = prism(line((9, 2), (11, 2), width=3.0), 2.0, 9.0)
+        recess = Manifold.cylinder(1, 2).translate((5, 5, -0.5))
+        assert inspected(tray(*CROSS) - slot - recess)["tight"].status == "pass"

@@ -1,0 +1,189 @@
+import numpy as np
+import pytest
+import shapely
+
+from design.pad.morphology import Morphology
+from fabricate.checks.findings import Finding
+from fabricate.checks.mesh_checks import SOUND
+from fabricate.checks.plan_checks import _thinner, check
+from fabricate.settings import DEFAULTS, Settings
+from tests.fabricate.planted import level_pad, with_settings
+
+
+def found(pad: Morphology, name: str, settings: Settings = DEFAULTS) -> Finding:
+    return {finding.name: finding for finding in check(pad, settings)}[name]
+
+
+def test_a_buildable_pad_passes_every_check():
+    findings = check(Morphology.straight(4))
+    assert {finding.status for finding in findings} == {"pass"}
+    assert len({finding.name for finding in findings}) == len(findings)
+
+
+def test_published_pad_that_was_built_shows_its_crossings(published):
+    finding = found(Morphology.load(published / "5para_dis.mat"), "same_family_crossings")
+    assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 6, 6)
+
+
+@pytest.mark.parametrize(("knots", "seed"), [(1, 1006), (5, 1001), (20, 1003), (30, 1032)])
+def test_tangled_pads_are_measured_and_sound(knots, seed):
+    found = check(Morphology.random(4, knots, seed))
+    findings = {finding.name: finding for finding in found}
+    assert {findings[name].status for name in SOUND} == {"pass"}
+    assert len(found) == len(findings)
+
+
+class TestPrinter:
+    straight = Morphology.straight(1)
+
+    @pytest.mark.parametrize(
+        ("layer_mm", "status", "least"), [(0.1, "pass", 4), (0.2, "pass", 2), (0.16, "warn", 2.5), (0.3, "fail", 4 / 3)]
+    )
+    def test_layers(self, layer_mm, status, least):
+        finding = found(self.straight, "layers", with_settings(printer={"layer_mm": layer_mm}))
+        assert finding.status == status
+        assert finding.measured == pytest.approx(least)
+
+    def test_a_floor_between_layers_moves_every_ridge(self):
+        finding = found(self.straight, "layers", with_settings({"floor_mm": 2.05}))
+        assert finding.status == "warn"
+        assert "floor_mm" in finding.message
+
+    @pytest.mark.parametrize(
+        ("key", "height"), [("floor_mm", 2.05), ("shallow_ridge_height_mm", 0.45), ("deep_ridge_height_mm", 1.25)]
+    )
+    def test_every_height_is_to_be_a_whole_number_of_layers(self, key, height):
+        finding = found(self.straight, "layers", with_settings({key: height}))
+        assert finding.status == "warn"
+        assert finding.message == f"{key}: not a whole number of 0.1 mm layers"
+
+    @pytest.mark.parametrize(
+        ("width", "printer", "status", "limit"),
+        [
+            (0.4, {}, "pass", 0.4),
+            (0.39, {}, "fail", 0.4),
+            (0.4, {"nozzle_mm": 0.2, "resin": True}, "pass", 0.4),
+            (0.4, {"nozzle_mm": 0.21, "resin": True}, "fail", 0.42),
+            (0.4, {"nozzle_mm": 0.21}, "pass", 0.21),
+        ],
+    )
+    def test_ridges_as_wide_as_what_is_printed(self, width, printer, status, limit):
+        finding = found(self.straight, "ridge_width", with_settings({"ridge_width_mm": width}, printer))
+        assert (finding.status, finding.measured) == (status, width)
+        assert finding.limit == pytest.approx(limit)
+        assert len(finding.places_mm) == (0 if status == "pass" else 2)
+
+
+class TestFibres:
+    def test_a_fibre_thicker_than_its_track(self):
+        finding = found(Morphology.straight(1), "track_size", with_settings(pad={"fibre_diameter_mm": 0.5}))
+        assert (finding.status, finding.measured, finding.limit) == ("fail", 0.4, 0.5)
+
+    @pytest.mark.parametrize(
+        ("width", "height", "fibre", "status"),
+        [(0.4, 0.4, 0.4, "pass"), (0.5, 0.4, 0.41, "fail"), (0.4, 0.6, 0.41, "fail"), (0.5, 0.6, 0.41, "pass")],
+    )
+    def test_a_track_is_as_wide_and_as_deep_as_its_fibre(self, width, height, fibre, status):
+        mould = {"ridge_width_mm": width, "shallow_ridge_height_mm": height}
+        finding = found(Morphology.straight(1), "track_size", with_settings(mould, pad={"fibre_diameter_mm": fibre}))
+        assert (finding.status, finding.measured) == (status, min(width, height))
+
+    @pytest.mark.parametrize(
+        ("deep", "status", "gap"),
+        [(1.1, "pass", 0.4), (1.09, "warn", 0.39), (1.2, "pass", 0.5), (0.9, "warn", 0.2), (0.7, "fail", 0.0)],
+    )
+    def test_gap_where_families_cross(self, deep, status, gap):
+        finding = found(Morphology.straight(1), "crossing_gap", with_settings({"deep_ridge_height_mm": deep}))
+        assert finding.status == status
+        assert finding.measured == pytest.approx(gap, abs=1e-12)
+
+    @pytest.mark.parametrize(("levels", "status"), [("as_needed", "warn"), ("two", "fail")])
+    def test_crossings_of_one_family(self, levels, status):
+        finding = found(level_pad(1.8, 1.2), "same_family_crossings", with_settings({"levels": levels}))
+        assert (finding.status, finding.measured) == (status, 2)
+        (left, y), (right, _) = finding.places_mm
+        assert left == pytest.approx(-right, abs=1e-3)
+        assert y == pytest.approx(0, abs=1e-3)
+
+    def test_a_bend_of_a_third_of_a_millimetre(self):
+        """A step of the cross coordinate within 0.3 mm of travel turns the fibre by about 60 degrees and back."""
+        knots = np.array([[0, 1], [0.9, 1], [0.93, 1.05], [1.5, 1.05], [2, 1]])
+        upright = np.stack([np.ones(5), np.linspace(0, 2, 5)], axis=1)
+        finding = found(Morphology(np.stack([knots, upright]), 11.25), "fibre_bend")
+        assert (finding.status, finding.limit, len(finding.places_mm)) == ("fail", 1.0, 1)
+        assert 0.1 < float(np.asarray(finding.measured)) < 0.6
+        x, y = finding.places_mm[0]
+        assert x == pytest.approx((0.915 - 1) * 11.25, abs=0.4)
+        assert y == pytest.approx(0.025 * 11.25, abs=0.4)
+
+    @pytest.mark.parametrize(("deep", "status"), [(2.0, "pass"), (2.04, "warn"), (4.0, "warn"), (4.04, "fail")])
+    def test_slender_ridges(self, deep, status):
+        finding = found(Morphology.straight(1), "slenderness", with_settings({"deep_ridge_height_mm": deep}))
+        assert (finding.status, finding.measured) == (status, pytest.approx(deep / 0.4))
+        assert finding.places_mm == (() if status == "pass" else ((0.0, 0.0),))
+
+    def test_numbers_without_room(self):
+        finding = found(Morphology.straight(2, 4.0), "numbers", with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
+        assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 0, 4)
+
+    @pytest.mark.parametrize(("silicone", "status"), [(6.0, "pass"), (2.2, "pass"), (2.19, "warn"), (2.0, "warn")])
+    def test_silicone_beyond_the_tracks(self, silicone, status):
+        finding = found(Morphology.straight(1), "cover", with_settings({"silicone_mm": silicone}))
+        assert (finding.status, finding.measured) == (status, pytest.approx(silicone - 1.2))
+
+    def test_many_depths_make_a_thicker_pad(self):
+        """Three depths of 0.4, 1.2 and 2.0 mm need 3 mm of silicone."""
+        for silicone, status, cover in ((3.2, "pass", 1.2), (2.5, "warn", 1.0)):
+            finding = found(level_pad(1.8, 1.2), "cover", with_settings({"silicone_mm": silicone}))
+            assert (finding.status, finding.measured) == (status, pytest.approx(cover))
+
+    @pytest.mark.parametrize(("grid", "named"), [(4, "numbers 1, 2, 3, 4, 5, 6, 7, 8"), (5, "10 numbers")])
+    def test_more_than_eight_are_counted_instead_of_named(self, grid, named):
+        finding = found(Morphology.straight(grid, 4.0), "numbers", with_settings({"number_mm": 9.0, "exit_mm": 0.0}))
+        assert finding.message == f"no room beside the fibre's start for {named}"
+
+
+class TestSilicone:
+    @pytest.mark.parametrize(("gap_mm", "status"), [(2.0, "pass"), (0.42, "pass"), (0.38, "warn"), (0.1, "warn")])
+    def test_wall_between_two_tracks(self, gap_mm, status):
+        away = (gap_mm + 0.4) / 20
+        finding = found(level_pad(1.5 - away, 1.5 + away), "silicone_wall")
+        assert finding.status == status
+        assert finding.measured == pytest.approx(gap_mm, abs=max(0.015, 0.02 * gap_mm))
+        assert all(abs(y) < gap_mm for _, y in finding.places_mm)
+        assert bool(finding.places_mm) == (status != "pass")
+
+    @pytest.mark.parametrize(("length", "patches"), [(0.02, 0), (0.05, 1)])
+    def test_corners_of_less_than_a_hundredth_of_a_square_millimetre_are_no_walls(self, length, patches):
+        """A peg 0.3 mm wide on a block: 0.006 and 0.015 mm² of it are thinner than 0.4 mm."""
+        block, peg = shapely.box(0, 0, 10, 5), shapely.box(4, 5, 4.3, 5 + length)
+        assert len(_thinner(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
+
+    def test_tracks_of_different_depths_may_come_near(self):
+        """Two horizontals that cross lie at two depths, and their verticals far apart."""
+        assert found(level_pad(1.8, 1.2), "silicone_wall").status == "pass"
+
+    def test_a_fibre_that_turns_back_on_itself(self):
+        turns = np.array([[0, 1], [0.95, 1], [0.98, 1.8], [1.04, 0.2], [1.07, 1], [2, 1]])
+        pad = Morphology(np.stack([turns, np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=1)]), 11.25)
+        assert found(pad, "silicone_wall").status != "pass"
+
+    @pytest.mark.parametrize(
+        ("from_wall_mm", "status"),
+        [(0.7, "pass"), (0.62, "pass"), (0.58, "warn"), (0.4, "warn"), (0.22, "warn"), (0.1, "fail")],
+    )
+    def test_a_track_beside_the_tray_wall(self, from_wall_mm, status):
+        finding = found(level_pad(from_wall_mm / 10, 2.0), "tray_wall")
+        assert finding.status == status
+        assert finding.measured == pytest.approx(from_wall_mm - 0.2, abs=0.01)
+        assert all(y == pytest.approx(-15 + from_wall_mm, abs=0.01) for _, y in finding.places_mm)
+
+    def test_a_border_keeps_tracks_off_the_wall(self):
+        finding = found(level_pad(0.01, 2.0), "tray_wall", with_settings({"border_mm": 2.0}))
+        assert (finding.status, finding.places_mm) == ("pass", ())
+
+
+def test_findings_are_plain_json():
+    document = found(level_pad(1.8, 1.2), "same_family_crossings").document()
+    assert list(document) == ["name", "status", "measured", "limit", "message", "places_mm"]
+    assert all(isinstance(value, float) for place in document["places_mm"] for value in place)

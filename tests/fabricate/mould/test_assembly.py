@@ -1,0 +1,284 @@
+import math
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from manifold3d import Manifold, Mesh64
+
+from design.common.errors import InputError
+from design.pad.morphology import Morphology
+from fabricate.checks.plan_checks import check_plan
+from fabricate.mould.assembly import (
+    WELL_MM,
+    build_mould,
+    conductive_body,
+    conductive_plan,
+    lid_body,
+    mould_body,
+    plan_mesh,
+    sizes,
+    valid_solid,
+)
+from fabricate.mould.benchmark import fused_solid
+from fabricate.mould.cad_solid import faceted_solid
+from fabricate.mould.mesh import arrays, mesh
+from fabricate.mould.plan import Plan
+from fabricate.mould.prisms import Body, Prism
+from tests.fabricate.planted import with_settings
+
+EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}
+
+
+def as_read(body: Body) -> trimesh.Trimesh:
+    """The mesh as whoever reads its STL finds it: single precision, equal vertices joined."""
+    return trimesh.Trimesh(*arrays(mesh(body)))
+
+
+def assert_one_closed_body(read: trimesh.Trimesh, genus: int = 0) -> None:
+    assert read.is_watertight
+    assert read.is_winding_consistent
+    assert read.body_count == 1
+    assert read.euler_number == 2 - 2 * genus
+
+
+def assert_all_ways_agree(body: Body) -> None:
+    """The CAD kernel's own Boolean operations are the oracle for the mesh and for the solid made of it."""
+    solid, oracle, volume = valid_solid(mesh(body)), fused_solid(body), mesh(body).volume()
+    assert oracle.volume == pytest.approx(volume, rel=1e-6)
+    assert solid.volume == pytest.approx(volume, rel=1e-9)
+    box = np.array([[*solid.bounding_box().min], [*solid.bounding_box().max]])
+    assert box == pytest.approx(as_read(body).bounds, abs=1e-4)
+
+
+def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
+    """z of the mould's surface seen from above."""
+    corners = solid.triangles
+    a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
+    area = np.cross(b - a, c - a)
+    up = area > 1e-12
+    w = np.stack([np.cross(c - b, (x, y) - b), np.cross(a - c, (x, y) - c), np.cross(b - a, (x, y) - a)])[:, up]
+    w = w / area[up]
+    inside = (w >= -1e-9).all(axis=0)
+    return float((w[:, inside] * corners[up][inside][:, :, 2].T).sum(axis=0).max())
+
+
+def test_straight_pad_has_the_volume_that_arithmetic_gives():
+    plain = with_settings({"exit_mm": 0.0, "number_mm": 0.0})
+    plan = Plan(Morphology.straight(4), plain)
+    inner, ridge, lean = 56.25, 0.4, 2 * 6 * math.tan(math.radians(2))
+    ridges = 4 * inner * ridge * (1.2 + 0.4) - 16 * ridge * ridge * 0.4  # the shallow ones end at the deep ones
+    rim = inner + lean
+    hollow = 6 * (inner**2 + inner * rim + rim**2) / 3
+    behind = 2 * ridge * math.tan(math.radians(2)) * 4 * (1.2**2 + 0.4**2) / 2  # where the wall leans off a ridge's end
+    expected = (rim + 4) ** 2 * 8 - hollow + ridges + behind
+    assert plan_mesh(plan).volume() == pytest.approx(expected, rel=1e-9)
+    assert build_mould(plan.pad, plain).volume == pytest.approx(expected, rel=1e-9)
+    assert sizes(plan)["tray_mm"] == pytest.approx(rim + 4)
+
+
+@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
+def test_published_moulds_are_closed(published, name):
+    plan = Plan(Morphology.load(published / f"{name}.mat"))
+    assert_one_closed_body(as_read(mould_body(plan)))
+    if name == "1para":
+        assert_all_ways_agree(mould_body(plan))
+
+
+@pytest.mark.parametrize(("grid", "knots", "seed"), [(1, 1, 0), (2, 3, 1), (4, 10, 2), (4, 30, 1032), (9, 4, 4)])
+def test_random_moulds_are_closed(grid, knots, seed):
+    plan = Plan(Morphology.random(grid, knots, seed))
+    assert_one_closed_body(as_read(mould_body(plan)))
+    solid = (
+        valid_solid if knots < 5 and grid < 5 else faceted_solid
+    )  # the CAD kernel's check of dense pads takes seconds
+    assert solid(plan_mesh(plan)).volume == pytest.approx(plan_mesh(plan).volume(), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
+        with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
+        with_settings(EVERYTHING, printer={"layer_mm": 0.4}),
+    ],
+)
+def test_all_ways_to_the_solid_agree(settings):
+    tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
+    plan = Plan(Morphology.straight(1) if tapered else Morphology.random(2, 3, seed=5), settings)
+    bodies = [mould_body(plan), lid_body(plan), conductive_body(conductive_plan(plan))]
+    for body in bodies if settings.mould.lid else bodies[:1]:
+        assert_all_ways_agree(body)
+    assert_one_closed_body(as_read(bodies[0]))
+
+
+@pytest.mark.parametrize(("family", "heights"), [("horizontal", (1.2, 0.4)), ("vertical", (0.4, 1.2))])
+def test_each_family_gets_its_height(family, heights):
+    plan = Plan(Morphology.straight(2, pitch_mm=10.0), with_settings({"number_mm": 0.0}, pad={"deep_family": family}))
+    read = as_read(mould_body(plan))
+    for place, height in (
+        ((0.1, -5.1), heights[0]),
+        ((-5.1, 0.1), heights[1]),
+        ((-5.05, -5.1), 1.2),
+        ((0.1, 0.2), 0.0),
+        ((15.9, 0.1), 6.0),
+    ):
+        assert height_at(read, *place) == pytest.approx(2 + height, abs=1e-4), place
+
+
+def test_tracks_run_out_of_the_pad_through_its_tongues():
+    plan = Plan(Morphology.straight(1, pitch_mm=10.0), with_settings({"number_mm": 0.0, "border_mm": 1.0}))
+    read = as_read(mould_body(plan))
+    edge = 10 + 1.0
+    for place, z in (
+        ((edge + 1.9, 0.1), 2 + 1.2),  # the ridge, to the end of its slot
+        ((edge + 1.9, 1.4), 2.0),  # the floor of the slot beside it
+        ((edge + 1.9, 1.8), 8.0),  # the wall beside the slot
+        ((edge + 2.4, 0.1), 8.0),  # and behind it
+        ((0.1, -edge - 1.9), 2 + 0.4),
+    ):
+        assert height_at(read, *place) == pytest.approx(z, abs=1e-4), place
+    assert {round(2 * side, 6) for side in plan.tray.bounds[2:]} == {round(2 * (edge + 2 + 2 + plan.flare_mm), 6)}
+
+
+def test_walls_and_ridges_lean_as_set():
+    plan = Plan(
+        Morphology.straight(1, pitch_mm=20.0),
+        with_settings({"number_mm": 0.0, "exit_mm": 0.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 10.0}),
+    )
+    read = as_read(mould_body(plan))
+    slope = math.tan(math.radians(10))
+    for z in (3.0, 5.0, 7.5):  # on a wall clear of ridges
+        assert height_at(read, 7.0, 20 + slope * (z - 2)) == pytest.approx(z, abs=1e-3)
+    section = read.section(plane_origin=[0, 0, 2.05], plane_normal=[0, 0, 1])
+    assert section is not None
+    across = np.abs(section.vertices[(np.abs(section.vertices[:, 0]) < 15) & (np.abs(section.vertices[:, 1]) < 2)])
+    foot = 0.2 + 1.1 * slope  # the lowest terrace, one layer high, is as wide as the taper at its top
+    assert across[:, 1].max() == pytest.approx(foot, abs=0.011)
+    assert sizes(plan)["ridge_foot_mm"] == pytest.approx(0.4 + 2 * 1.2 * slope)
+
+
+def test_lid_has_the_holes_that_fit_the_pins():
+    plan = Plan(Morphology.straight(2), with_settings({"lid": True, "pins": True}))
+    pin = sizes(plan)["pin_mm"]
+    assert pin == 2.0
+    assert_one_closed_body(as_read(lid_body(plan)), genus=4 + 3)
+    read = as_read(mould_body(plan))
+    assert read.bounds[1, 2] == pytest.approx(8 + pin)
+    assert_one_closed_body(read)
+    spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
+    assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
+
+
+@pytest.mark.parametrize("tapered", [5.0, 17.0])
+def test_tapered_moulds_with_wells_are_valid_solids(tapered):
+    plan = Plan(Morphology.random(2, 4, seed=3), with_settings({"ridge_draft_deg": tapered, "pins": True}))
+    for body in (mould_body(plan), conductive_body(conductive_plan(plan))):
+        assert valid_solid(mesh(body)).volume == pytest.approx(mesh(body).volume(), rel=1e-9)
+        assert_one_closed_body(as_read(body))
+
+
+def test_a_spout_needs_room_between_the_vents():
+    with pytest.raises(InputError, match=r"spout: got true for a pad 7 mm wide, allowed from 19"):
+        lid_body(Plan(Morphology.straight(1, 3.5), with_settings({"lid": True, "spout": True})))
+    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))
+
+
+def test_pins_need_room():
+    plan = Plan(Morphology.straight(2), with_settings({"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}))
+    with pytest.raises(InputError, match=r"pins.*1 mm wide"):
+        mould_body(plan)
+
+
+def test_the_second_mould_has_a_well_at_every_ridge_end():
+    plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
+    read = as_read(conductive_body(plan))
+    assert_one_closed_body(read)
+    edge = 1.5 * 15
+    for x in (-edge - 2.5, edge + 2.5):
+        for offset in (0.0, 0.9 * WELL_MM / 2):
+            assert height_at(read, x, -7.5 + offset + 0.01) == pytest.approx(2 + 1.2, abs=1e-4)
+        assert height_at(read, x, -7.5 + 1.1 * WELL_MM / 2) == pytest.approx(2.0, abs=1e-4)
+    with pytest.raises(InputError, match="exit_width_mm"):
+        conductive_plan(Plan(Morphology.straight(2, pitch_mm=5.0)))
+
+
+class TestFacets:
+    def test_a_box(self):
+        solid = faceted_solid(mesh(Body((Prism(shapely.box(0, 0, 1, 2), 0, 3),))))
+        assert solid.is_valid
+        assert (len(solid.faces()), len(solid.edges()), len(solid.vertices())) == (6, 12, 8)
+        assert solid.volume == pytest.approx(6)
+
+    def test_a_hole_through_it(self):
+        ring = shapely.box(0, 0, 3, 3).difference(shapely.box(1, 1, 2, 2))
+        solid = faceted_solid(mesh(Body((Prism(ring, 0, 2),))))
+        assert solid.is_valid
+        assert len(solid.faces()) == 4 + 4 + 2
+        assert solid.volume == pytest.approx(16)
+
+    def test_edges_too_short_for_the_kernel_are_contracted(self):
+        notched = shapely.Polygon([(0, 0), (1, 0), (1, 1), (0.5, 1), (0.5, 1 - 1e-7), (0, 1 - 1e-7)])
+        solid = faceted_solid(mesh(Body((Prism(notched, 0, 1),))))
+        assert solid.is_valid
+        assert solid.volume == pytest.approx(1, abs=1e-6)
+
+    def test_a_vertex_inside_a_face(self):
+        """Meshes of others may have a face divided from within: none of its edges there bounds anything."""
+        fine = trimesh.creation.box((2, 2, 2)).subdivide().subdivide()
+        solid = faceted_solid(Manifold(Mesh64(fine.vertices, fine.faces.astype(np.uint64))))
+        assert solid.is_valid
+        assert len(solid.faces()) == 6
+        assert solid.volume == pytest.approx(8)
+
+    @pytest.mark.parametrize("low", [1.0, 0.5])
+    def test_parts_that_meet_in_one_upright_line(self, low):
+        """Two blocks on a plate that touch along an edge: the faces around it pass the same places twice."""
+        blocks = (Prism(shapely.box(0, 0, 1, 1), 0, 2), Prism(shapely.box(1, 1, 2, 2), 0, 1 + low))
+        body = Body((Prism(shapely.box(-1, -1, 3, 3), -1, 0.5), *blocks))
+        solid = faceted_solid(mesh(body))
+        assert solid.is_valid
+        assert solid.volume == pytest.approx(16 * 1.5 + 1.5 + 0.5 + low, rel=1e-9)
+
+    @given(st.integers(0, 2**32 - 1))
+    @settings(max_examples=15, deadline=None)
+    def test_any_union_of_boxes(self, seed):
+        rng = np.random.default_rng(seed)
+        low, size = rng.uniform(0, 3, (6, 3)), rng.uniform(0.5, 3, (6, 3))
+        boxes = [
+            Prism(shapely.box(*a[:2], *(a + d)[:2]), float(a[2]), float((a + d)[2]))
+            for a, d in zip(low, size, strict=True)
+        ]
+        body = Body(tuple(boxes[:3]), (boxes[3],), tuple(boxes[4:]))
+        if len(mesh(body).decompose()) != 1:
+            return
+        solid = faceted_solid(mesh(body))
+        assert solid.is_valid
+        assert solid.volume == pytest.approx(fused_solid(body).volume, rel=1e-7)
+
+
+def test_corners_that_meet_by_chance_are_drawn_apart():
+    """Two blocks that share one upright line: joined there, the line would have four faces."""
+    touching = Body((Prism(shapely.box(0, 0, 1, 1), 0, 1), Prism(shapely.box(1, 1, 2, 2), 0, 1)))
+    vertices, triangles = arrays(mesh(touching))
+    assert len(np.unique(vertices, axis=0)) == len(vertices)
+    assert trimesh.Trimesh(vertices, triangles).is_watertight
+    assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(2, abs=2e-3)
+
+
+@pytest.mark.parametrize(("knots", "seed"), [(1, 3), (5, 4), (20, 5)])
+def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
+    """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
+    plan = Plan(Morphology.random(3, knots, seed))
+    read, fibre = as_read(mould_body(plan)), plan.settings.pad.fibre_diameter_mm
+    floors = []
+    for line in plan.lines:
+        places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 60))
+        # Deeper tracks that cross are seen too: the least is the fibre's own.
+        floors.append(min(height_at(read, *place) for place in shapely.get_coordinates(places)))
+    (stated,) = [f.measured for f in check_plan(plan) if f.name == "crossing_gap"]
+    assert isinstance(stated, float)
+    for c in plan.crossings:
+        assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4

@@ -1,0 +1,191 @@
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.interpolate import PchipInterpolator
+
+from design.pad.morphology import Morphology
+from fabricate.mould.assembly import mould_body, plan_mesh
+from fabricate.mould.mesh import mesh
+from fabricate.mould.plan import Plan
+from fabricate.report import laying_guide as laying
+from fabricate.settings import DEFAULTS, Settings
+from tests.fabricate.planted import level_pad, with_settings
+
+
+def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
+    """A fabrication document as far as the page reads it."""
+    volume = plan_mesh(plan).volume()
+    return {
+        "size_mm": [64.669, 64.669, 8.0],
+        "mould_volume_ml": volume / 1000,
+        "findings": list(findings),
+        "settings": {
+            "mould": plan.settings.mould.model_dump(),
+            "printer": plan.settings.printer.model_dump(),
+        },
+        **laying.document(plan, volume),
+    }
+
+
+def straight_volume_mm3(draft_deg: float) -> float:
+    """What fills the default mould of the straight pad of 4 + 4 without numbers, by integration over its height."""
+    lean, half, height = math.tan(math.radians(draft_deg)), 28.125, 6.0
+
+    def layer(z: float) -> float:
+        reach = half + 2 + lean * z
+        open_mm2 = 4 * (half + lean * z) ** 2 + 16 * 2 * (3 + 2 * lean * z)
+        deep, shallow = 4 * (z < 1.2), 4 * (z < 0.4)
+        return open_mm2 - (deep + shallow) * 2 * reach * 0.4 + deep * shallow * 0.4**2
+
+    bounds = [0, 0.4, 1.2, height]
+    return sum(quad(layer, *stretch)[0] for stretch in pairwise(bounds))
+
+
+@pytest.mark.parametrize("draft_deg", [0.0, 2.0, 10.0])
+def test_silicone_of_a_straight_pad(draft_deg):
+    plan = Plan(Morphology.straight(4), with_settings({"wall_draft_deg": draft_deg, "number_mm": 0.0}))
+    silicone = laying.document(plan, plan_mesh(plan).volume())["silicone"]
+    expected = straight_volume_mm3(draft_deg) / 1000
+    assert silicone["volume_ml"] == pytest.approx(expected, abs=1e-3)
+    assert silicone["mass_g"] == pytest.approx(expected * 1.07 * 1.1, abs=0.02)
+    assert silicone["part_a_g"] == silicone["part_b_g"] == pytest.approx(silicone["mass_g"] / 2)
+
+
+def test_a_thicker_pad_takes_more_silicone(published):
+    plan = Plan(Morphology.load(published / "20para.mat"))
+    silicone = laying.document(plan, plan_mesh(plan).volume())["silicone"]
+    assert silicone["thickness_mm"] == plan.silicone_mm == 7.0
+    empty = plan.silicone.area * 7
+    tracks = sum(area.area * height for area, height in zip(plan.ridges, plan.heights_mm, strict=True))
+    assert empty - tracks < 1000 * silicone["volume_ml"] < empty * 1.02
+
+
+def test_pins_take_no_silicone():
+    pad = Morphology.straight(3)
+    with_pins = Plan(pad, with_settings({"pins": True}))
+    height = DEFAULTS.mould.floor_mm + with_pins.silicone_mm
+    inner = mesh(mould_body(with_pins)).trim_by_plane((0, 0, -1), -height)
+    plain = Plan(pad)
+    volumes = [
+        laying.document(p, v)["silicone"]["volume_ml"]
+        for p, v in ((with_pins, inner.volume()), (plain, plan_mesh(plain).volume()))
+    ]
+    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
+
+
+@pytest.mark.parametrize("mould", [{}, {"border_mm": 1.5, "exit_mm": 0.0, "lead_mm": 12.5}])
+def test_lengths_are_those_of_the_curves(mould):
+    plan = Plan(Morphology.random(3, 4, seed=3), with_settings(mould))
+    tongue = plan.settings.mould.border_mm + plan.settings.mould.exit_mm
+    for fibre, entry in enumerate(laying.document(plan, 1.0)["fibres"]):
+        axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
+        slope = PchipInterpolator(knots[:, axis], knots[:, 1 - axis]).derivative()
+        stretches = zip(knots[:-1, axis], knots[1:, axis], strict=True)
+        course = sum(quad(lambda t, slope=slope: np.hypot(1, slope(t)), *ends, limit=200)[0] for ends in stretches)
+        assert entry["in_pad_mm"] == pytest.approx(course + 2 * tongue, abs=0.006)
+        assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
+
+
+def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
+    plan = Plan(Morphology.load(published / "5para_dis.mat"))
+    document = laying.document(plan, 1.0)
+    assert [fibre["number"] for fibre in document["fibres"]] == list(range(1, 9))
+    assert [fibre["fibre"] for fibre in document["fibres"]][::7] == ["horizontal 1", "vertical 4"]
+    depths = [{document["fibres"][n - 1]["depth_mm"] for n in step} for step in document["laying_order"]]
+    assert depths == [{2.8}, {2.0}, {1.2}, {0.4}]
+    assert sorted(n for step in document["laying_order"] for n in step) == list(range(1, 9))
+    assert [fibre["level"] for fibre in document["fibres"]] == list(plan.levels)
+
+
+def test_silicone_between_fibres_at_every_crossing(published):
+    plan = Plan(Morphology.load(published / "5para_dis.mat"))
+    crossings = laying.document(plan, 1.0)["crossings"]
+    assert crossings["total"] == len(crossings["table"]) == 30
+    assert crossings["same_family"] == 6
+    assert all(len(row) == len(crossings["columns"]) for row in crossings["table"])
+    for *_, first_mm, second_mm, gap in crossings["table"]:
+        assert gap == pytest.approx(abs(first_mm - second_mm) - 0.3)
+    assert crossings["gap_mm"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "gap"),
+    [
+        (DEFAULTS, 0.5),
+        (with_settings(pad={"fibre_diameter_mm": 1.0}), -0.2),
+        (with_settings({"levels": "two"}), -0.3),
+    ],
+)
+def test_fibres_that_touch_are_told(settings: Settings, gap: float):
+    crossings = laying.document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
+    assert crossings["gap_mm"] == pytest.approx(gap)
+    assert crossings["same_family"] == 2
+
+
+@pytest.mark.parametrize("draft_deg", [0.0, 5.0])
+def test_adhesive_fills_the_tracks(draft_deg):
+    plan = Plan(Morphology.straight(4), with_settings({"ridge_draft_deg": draft_deg}))
+    steps = laying.document(plan, 1.0)["adhesive"]["steps_ml"]
+    for step, height in zip(steps, (1.2, 0.4), strict=True):
+        width = 0.4 + height * math.tan(math.radians(draft_deg))
+        assert 1000 * step == pytest.approx(4 * 60.25 * width * height, abs=0.06)
+
+
+def rows(page: str, head: str) -> list[list[str]]:
+    """The rows of the table whose first column is called `head`."""
+    lines = page.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith(f"| {head} "))
+    body = lines[start + 2 :]
+    end = next((i for i, line in enumerate(body) if not line.startswith("|")), len(body))
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in body[:end]]
+
+
+def test_the_page_has_what_to_mix_and_to_cut():
+    plan = Plan(level_pad(1.8, 1.2))
+    document = whole(plan)
+    page = laying.page(document)
+    ((_, a, b, _),) = rows(page, "EcoFlex 00-20")
+    assert a == b == f"{document['silicone']['part_a_g']:.1f} g"
+    table = rows(page, "step")
+    assert [row[1] for row in table] == [str(n) for step in document["laying_order"] for n in step]
+    for row in table:
+        fibre = document["fibres"][int(row[1]) - 1]
+        assert row[2:4] == [fibre["fibre"], f"{fibre['depth_mm']:g} mm"]
+        assert float(row[5].split()[0]) == pytest.approx(fibre["cut_mm"], abs=0.051)
+    assert "of PLA" in page
+    assert "4 hours" in page
+
+
+def test_the_page_has_places_as_on_the_pad_turned_over():
+    plan = Plan(Morphology.straight(2))
+    table = rows(laying.page(whole(plan)), "fibres")
+    assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
+    assert table[0][1:3] == ["5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
+
+
+def test_many_crossings_are_counted_by_depth(published):
+    page = laying.page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
+    table = rows(page, "depths")
+    assert sum(int(count) for *_, count in table) == 30
+    assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
+
+
+def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
+    findings = (
+        {"name": "bed", "status": "pass", "message": "fits", "places_mm": []},
+        {"name": "thin", "status": "warn", "message": "thin walls", "places_mm": [[1.0, 2.0]]},
+        {"name": "wall", "status": "fail", "message": "no wall", "places_mm": []},
+    )
+    lid = with_settings({"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True})
+    page = laying.page(whole(Plan(Morphology.straight(2), lid), findings))
+    assert "1 of 3 checks pass" in page
+    assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 place,")
+    assert "pour through its spout" in page
+    assert "of resin" in page
+    assert "read the right way" not in page
+    plain = laying.page(whole(Plan(Morphology.straight(2)), findings[:1]))
+    assert "1 of 1 checks pass.\n" in plain
+    assert "the lid" not in plain

@@ -1,0 +1,201 @@
+"""What a press tells of every fault, against SciPy's densities in plain loops."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from sense.health import alarm_thresholds
+from sense.health import fault_likelihoods as evidence
+from sense.health.alarm_thresholds import Tail
+from sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, Evidence, noise_of
+from sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE
+
+PRESSES, FIBRES = 5, 3
+OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
+
+
+_CONSTANT = math.lgamma(3) - math.lgamma(2.5) - math.log(5 * math.pi) / 2
+
+
+def log_density(value: float, mean: float = 0.0, spread: float = 1.0) -> float:
+    """Of Student's t with 5 degrees of freedom, as `test_constants_of_students_t` finds it in SciPy."""
+    return _CONSTANT - 3 * math.log1p(((value - mean) / spread) ** 2 / 5) - math.log(spread)
+
+
+def shift_ratio(value: float, shift: float) -> float:
+    """Of a mean of at least `shift` against 0."""
+    value = min(value, shift)
+    return log_density(value, shift) - log_density(value)
+
+
+def by_hand(seed: int) -> tuple[Evidence, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Evidence of drawn numbers, and traces, targets, means and spreads of some presses."""
+    rng = np.random.default_rng(seed)
+    model = Evidence(
+        scale=rng.uniform(0.8, 1.5, (FIBRES, TARGETS)),
+        extra=rng.uniform(0.0, 0.3, (FIBRES, TARGETS)),
+        floor=rng.uniform(0.05, 0.2, (FIBRES, COMPONENTS)),
+        other_mean=rng.normal(0, 1, (LIBRARY, FIBRES, COMPONENTS)),
+        other_spread=rng.uniform(0.2, 0.6, (LIBRARY, FIBRES, COMPONENTS)),
+        noise=rng.uniform(0.5, 1.5, FIBRES),
+        noise_centre=rng.uniform(-0.2, 0.4, FIBRES),
+        noise_spread=rng.uniform(0.2, 0.5, FIBRES),
+        constant=rng.uniform(0.001, 0.2, FIBRES),
+        filters=rng.normal(0, 0.1, (FIBRES, len(evidence.STEPS), TRACE)),
+        persistence=np.array([0.6]),
+        innovation=np.array([0.7]),
+    )
+    traces = rng.normal(0, 1, (PRESSES, FIBRES, TRACE))
+    traces[1, 0] = 0.25  # stuck
+    mean, spread = rng.normal(0, 1, (PRESSES, FIBRES, TARGETS)), rng.uniform(0.2, 0.5, (PRESSES, FIBRES, TARGETS))
+    targets = mean + spread * rng.standard_t(5, mean.shape)
+    targets[2, 1, :COMPONENTS] *= 0.05  # nearly silent
+    targets[3, 2, :COMPONENTS] += 3.0  # odd
+    targets[3:, 0, -1] += 4.0  # its rest has moved
+    return model, traces, targets, mean, spread
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ratios_are_those_of_densities(seed: int) -> None:
+    model, traces, targets, mean, spread = by_hand(seed)
+    stay, begin = model.ratios(traces, targets, mean, spread)
+    assert stay.shape == begin.shape == (PRESSES, FIBRES, len(HYPOTHESES))
+    steps, persistence, innovation = model.steps(traces), 0.6, 0.7
+    for q, c in np.ndindex(PRESSES, FIBRES):
+        honest = np.hypot(spread[q, c] * model.scale[c], model.extra[c])
+        y, m, s = targets[q, c, :COMPONENTS], mean[q, c, :COMPONENTS], honest[:COMPONENTS]
+
+        def fit(means: np.ndarray, spreads: np.ndarray, y: np.ndarray = y) -> float:
+            return sum(log_density(*numbers) for numbers in zip(y, means, spreads, strict=True))
+
+        healthy, floor = fit(m, s), model.floor[c]
+        others = [math.exp(fit(a, b)) for a, b in zip(model.other_mean[:, c], model.other_spread[:, c], strict=True)]
+        odd = (sum(others) / LIBRARY + math.exp(fit(m, 4 * s))) / 2
+        log_noise = math.log(noise_of(traces[q, c]) / model.noise[c] + 0.25)
+        loud = (log_noise - model.noise_centre[c]) / model.noise_spread[c]
+        common = [
+            -math.log(model.constant[c]) if np.ptp(traces[q, c]) == 0 else -6.0,
+            fit(0 * m, floor) - healthy,
+            fit(0.5 * m, np.hypot(0.5 * s, floor)) - healthy,
+            math.log(odd) - healthy,
+            shift_ratio(float(loud), float(math.log(5) / model.noise_spread[c])),
+        ]
+
+        def rest(press: int, c: int = c) -> float:
+            own = np.hypot(spread[press, c, -1] * model.scale[c, -1], model.extra[c, -1])
+            return float((targets[press, c, -1] - mean[press, c, -1]) / own)
+
+        new = (rest(q) - persistence * rest(max(q - 1, 0))) / innovation
+        staying, beginning = list(common), [float(np.clip(ratio, -6, 6)) for ratio in common]
+        for offset in OFFSETS:
+            sign, size = math.copysign(1, offset), abs(offset) / innovation
+            staying.append(shift_ratio(sign * new, (1 - persistence) * size))
+            jump = max(sign * steps[q, c], sign * steps[max(q - 1, 0), c], 0.0)
+            stepped = float(np.clip(3 * math.log1p(jump**2 / 5) - 4, 0, 12))
+            beginning.append(float(np.clip(shift_ratio(sign * new, size), -6, 6)) + stepped)
+        np.testing.assert_allclose(stay[q, c], np.clip(staying, -6, 6), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(begin[q, c], beginning, rtol=1e-9, atol=1e-9)
+
+
+def test_what_is_missing_speaks_neither_for_nor_against() -> None:
+    model, traces, targets, mean, spread = by_hand(0)
+    traces[2, 1, 7] = targets[2, 1, 0] = np.nan
+    stay, begin = model.ratios(traces, targets, mean, spread)
+    assert not stay[2, 1].any()
+    assert not begin[2, 1].any()
+    assert stay[2, 0].any()
+
+
+def test_the_likeliest_step_is_that_of_the_filter_that_answers_most() -> None:
+    model, traces, *_ = by_hand(1)
+    answers = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
+    for q, c in np.ndindex(PRESSES, FIBRES):
+        found = model.filters[c] @ answers[q, c]
+        assert model.steps(traces)[q, c] == pytest.approx(found[np.abs(found).argmax()])
+
+
+def healthy(rng: np.random.Generator, presses: int) -> dict[str, np.ndarray]:
+    """Traces of noise alone, and targets whose rest hangs together from press to press by 0.5."""
+    error = rng.standard_t(5, (presses, FIBRES, TARGETS))
+    for press in range(1, presses):
+        error[press, :, -1] = 0.5 * error[press - 1, :, -1] + error[press, :, -1]
+    spread = np.full((presses, FIBRES, TARGETS), 0.1)
+    mean = rng.normal(0, 1, spread.shape)
+    traces = np.array([0.1, 0.2, 0.3])[:, None] * rng.standard_normal((presses, FIBRES, TRACE))
+    return {"traces": traces, "targets": mean + 0.2 * error, "mean": mean, "spread": spread}
+
+
+def test_evidence_is_learnt_from_healthy_presses() -> None:
+    """Errors are twice as wide as predicted, and rests are correlated by 0.5 with those before."""
+    rng = np.random.default_rng(5)
+    parts = healthy(rng, 1500)
+    parts["traces"][:3, 1] = 0.5
+    size = np.full((FIBRES, TARGETS), 2.0)
+    model = Evidence.fit(**parts, size=size, rng=rng)
+    honest = np.hypot(0.1 * model.scale, model.extra)
+    np.testing.assert_allclose(honest[:, :COMPONENTS], 0.2, rtol=0.15)
+    assert model.persistence == pytest.approx([0.5], abs=0.1)
+    whole = np.hypot(0.1 * model.scale[:, -1], model.extra[:, -1]).mean()
+    assert model.innovation == pytest.approx([0.2 / whole], rel=0.15)  # the rest is 0.2 wide but for what stays
+    noise = [np.median([noise_of(trace) for trace in parts["traces"][:, c]]) for c in range(FIBRES)]
+    np.testing.assert_allclose(model.noise, noise)
+    np.testing.assert_allclose(model.floor, np.repeat(np.array(noise)[:, None] / 2, COMPONENTS, axis=1))
+    logs = np.log(np.array([[noise_of(trace) for trace in press] for press in parts["traces"]]) / noise + 0.25)
+    np.testing.assert_allclose(model.noise_centre, np.median(logs, axis=0))
+    np.testing.assert_allclose(model.noise_centre, math.log(1.25), atol=0.01)
+    width = np.median(np.abs(logs - np.median(logs, axis=0)), axis=0) / 0.6745
+    np.testing.assert_allclose(model.noise_spread, np.maximum(width, 0.1))
+    np.testing.assert_allclose(model.constant, np.array([1, 4, 1]) / 1502)
+    assert model.other_mean.shape == model.other_spread.shape == (LIBRARY, FIBRES, COMPONENTS)
+
+
+def test_step_filters_answer_a_step_of_healthy_noise_by_its_spread() -> None:
+    """White noise: the filter answers 1 to the spread of what is healthy, or its far quantile that of Student's t."""
+    rng = np.random.default_rng(2)
+    traces = rng.standard_normal((4000, 1, TRACE))
+    (filters,) = evidence._step_filters(traces, np.array([0.01]))
+    answers = (traces - traces[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
+    np.testing.assert_allclose(answers.std(axis=0), 1, rtol=0.05)
+    for number, at in enumerate(evidence.STEPS):
+        step = (np.arange(TRACE) >= at).astype(float)
+        step -= step[:REST].mean()
+        assert np.argmax(np.abs(filters @ step) / 1) in range(max(number - 2, 0), number + 3)
+    wild = traces * np.where(rng.random(4000) < 0.01, 30.0, 1.0)[:, None, None]
+    (filters,) = evidence._step_filters(wild, np.array([0.01]))
+    answers = (wild - wild[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
+    np.testing.assert_allclose(np.quantile(np.abs(answers), 0.999, axis=0), student.ppf(0.9995, 5), rtol=1e-3)
+
+
+def test_constants_of_students_t_are_its_quantiles() -> None:
+    assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == evidence._MEDIAN_T
+    assert pytest.approx(student.ppf(0.9995, 5), abs=1e-3) == evidence._FAR_T
+
+
+def test_peaks_are_the_greatest_heights_of_climbs() -> None:
+    assert alarm_thresholds._peaks(np.array([0.0, 1, 3, 2, 0, 0, 5, 0, 0.5])).tolist() == [3, 5, 0.5]
+    assert alarm_thresholds._peaks(np.array([2.0, 1, 0])).tolist() == [2]
+    assert alarm_thresholds._peaks(np.zeros(4)).tolist() == []
+
+
+def test_a_tail_is_read_by_the_number_of_fibres_lost() -> None:
+    tail = Tail(level=np.array([[1.0, 2.0], [3.0, 4.0]]), slope=np.array([[1.0, 2.0], [2.0, 4.0]]))
+    heights = np.array([[5.0, 8.0]])
+    np.testing.assert_allclose(tail.rarity(heights, 0), [[4.0, 3.0]])
+    np.testing.assert_allclose(tail.rarity(heights, 1), [[1.0, 1.0]])
+    np.testing.assert_allclose(tail.rarity(heights, 7), [[1.0, 1.0]])
+
+
+def test_the_slope_of_a_tail_is_the_mean_excess_of_the_highest_tenth() -> None:
+    """400 climbs of one press each to known heights, of which the level makes the highest no rarer than once."""
+    heights = np.random.default_rng(0).permutation(np.linspace(0.1, 40, 400))
+    ratios = np.full((1000, 1, 1), -100.0)
+    ratios[: 2 * 400 : 2, 0, 0] = heights
+    tail = Tail.fit([(ratios, ratios)])
+    top = np.sort(heights)
+    slope = (top[-40:] - top[-41]).mean()
+    assert tail.slope[0, 0] == pytest.approx(slope)
+    levels = [top[-41] + slope * math.log(40 / 1000), top[-1] + slope * math.log(1 / 1000)]
+    assert tail.level[0, 0] == pytest.approx(max(levels))
+    assert Tail.fit([(-ratios * 0 - 1, -ratios * 0 - 1)]).slope[0, 0] == 1

@@ -1,0 +1,186 @@
+"""The page of `padforge sense live`: what its server says to whom, and what a browser makes of it."""
+
+import json
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection, HTTPResponse
+from pathlib import Path
+
+import pytest
+
+from design.common.errors import InputError
+from sense.live.page_server import HOST, LivePage
+from tests.chromium import CHROMIUM, Chromium
+
+HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
+VIEW = {
+    "title": HOSTILE,
+    "middle_mm": [1.0, -2.0],
+    "half_mm": 20.0,
+    "pressed": True,
+    "ended": "",
+    "fibres": [{"swing": 0.5, "state": "sound"}, {"swing": -3.0, "state": "silent"}, {"swing": None, "state": HOSTILE}],
+    "presses": [
+        {"press": 7 + k, "x_mm": 1.0 + k, "y_mm": -2.0, "r50_mm": 1.5, "r90_mm": 3.0, "final": k == 0} for k in (0, 1)
+    ],
+    "findings": [HOSTILE],
+}
+
+
+@pytest.fixture
+def page() -> Iterator[LivePage]:
+    with LivePage(0) as page:
+        yield page
+
+
+def get(page: LivePage, path: str, host: str | None = None) -> HTTPResponse:
+    connection = HTTPConnection(HOST, port_of(page), timeout=10)
+    connection.request("GET", path, headers={} if host is None else {"Host": host})
+    return connection.getresponse()
+
+
+def port_of(page: LivePage) -> int:
+    return int(page.url.rstrip("/").rsplit(":", 1)[1])
+
+
+@contextmanager
+def told(page: LivePage) -> Iterator[Iterator[dict]]:
+    """The messages that a browser gets."""
+    with get(page, "/events") as response:
+        lines = (line.decode() for line in response)
+        yield (json.loads(line[6:]) for line in lines if line.startswith("data: "))
+
+
+def test_the_page_is_served_and_allows_its_own_script_alone(page: LivePage) -> None:
+    response = get(page, "/")
+    text = response.read().decode()
+    assert response.status == 200
+    assert text.startswith("<!doctype html>")
+    policy = response.headers["Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'")
+    assert "unsafe" not in policy
+    # One page, nothing from elsewhere: no address but the namespace of SVG, and no markup made from data.
+    assert [part.split('"')[0] for part in text.split("http://")[1:]] == ["www.w3.org/2000/svg"]
+    assert not any(word in text for word in ("https://", "innerHTML", "outerHTML", "insertAdjacentHTML", "eval("))
+
+
+def test_nothing_else_is_served(page: LivePage) -> None:
+    for path in ("/x", "/../pyproject.toml", "/events/"):
+        assert get(page, path).status == 404
+    # A page of another host, whose name was made to mean this machine, gets nothing.
+    for path in ("/", "/events"):
+        assert get(page, path, host="elsewhere.example").status == 403
+    assert get(page, "/", host=f"localhost:{port_of(page)}").status == 200
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is another address of this machine on Linux alone")
+def test_only_one_address_is_listened_at(page: LivePage) -> None:
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.2", port_of(page)), timeout=5)
+
+
+def test_every_browser_is_told_all_whenever_it_comes(page: LivePage) -> None:
+    page.show(VIEW)
+    with told(page) as first, told(page) as second:
+        assert next(first) == next(second) == VIEW
+        page.show(VIEW | {"pressed": False})
+        assert next(first) == next(second) == VIEW | {"pressed": False}
+    with told(page) as again:
+        assert next(again) == VIEW | {"pressed": False}
+
+
+def test_a_slow_browser_is_told_the_latest_and_holds_up_nobody(page: LivePage) -> None:
+    page.show({"at": 0})
+    with told(page) as messages:
+        assert next(messages) == {"at": 0}
+        for at in range(1, 2001):
+            page.show({"at": at})
+        seen = [message["at"] for message in iter(lambda: next(messages), {"at": 2000})]
+    assert seen == sorted(seen)
+    assert len(seen) < 1000
+
+
+def test_the_end_is_told() -> None:
+    with LivePage(0) as page:
+        page.show({"at": 0})
+        browser = get(page, "/events")
+        page.show({"ended": "ended"})
+    assert browser.read().decode().endswith('data: {"ended": "ended"}\n\n')
+
+
+def test_a_browser_that_goes_away_is_forgotten(page: LivePage, capfd: pytest.CaptureFixture[str]) -> None:
+    page.show({"at": 0})
+    with socket.create_connection((HOST, port_of(page))) as browser:
+        browser.sendall(f"GET /events HTTP/1.0\r\nHost: {HOST}:{port_of(page)}\r\n\r\n".encode())
+        assert browser.recv(10)
+    with socket.create_connection((HOST, port_of(page))) as browser:
+        browser.sendall(b"\x00\xff nonsense\r\n\r\n")
+    with told(page) as messages:
+        assert next(messages) == {"at": 0}
+        page.show({"at": 1})
+        assert next(messages) == {"at": 1}
+    assert capfd.readouterr().err == ""
+
+
+def test_what_is_no_json_is_refused(page: LivePage) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        page.show({"swing": float("nan")})
+
+
+def test_a_port_that_is_taken_is_one_clear_line(page: LivePage) -> None:
+    port = port_of(page)
+    with pytest.raises(InputError, match=rf"^port {port} of 127.0.0.1: another program uses it; .*--port"):
+        LivePage(port)
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Chromium]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    with Chromium(tmp_path, "--disable-gpu") as browser:
+        yield browser
+
+
+def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
+    page.show(VIEW)
+    browser.open(page.url)
+    browser.wait_for("document.querySelectorAll('.fibre').length == 3")
+    shown = browser.ask("document.body.innerText")
+    assert "2.0, -2.0 mm" in shown
+    assert "press 8: within 1.5 mm at 50 %, 3.0 mm at 90 %, to be refined" in shown
+    assert shown.count(HOSTILE) == 3
+    assert browser.ask("document.images.length") == 0
+    count = "document.querySelectorAll('{}').length"
+    assert [browser.ask(count.format(f"#pad .{name}")) for name in ("trail", "r50", "r90", "early")] == [1, 1, 1, 1]
+    # The pad is 40 mm wide and as wide on the page as its edge; y goes up.
+    edge, latest, before = (
+        browser.ask(f"(({{x, y, width, height}}) => [x, y, width, height])(document.querySelector('{part}').getBBox())")
+        for part in ("#pad .edge", "#pad .r90", "#pad .trail")
+    )
+    assert latest[2] / edge[2] == pytest.approx(2 * 3.0 / 40)
+    assert (latest[0] + latest[2] / 2 - before[0] - before[2] / 2) / edge[2] == pytest.approx(1 / 40)
+    assert latest[1] + latest[3] / 2 == pytest.approx(edge[1] + edge[3] / 2)
+    bars = browser.ask(
+        "[...document.querySelectorAll('.bar rect:not(.back)')].map(bar => bar.getBBox()).map(b => [b.x, b.width])"
+    )
+    assert bars == [[0, 0.5], [-1, 1], [0, 0]]
+    assert browser.ask("[...document.querySelectorAll('.fibre')].map(row => row.classList.contains('bad'))") == [
+        False,
+        True,
+        True,
+    ]
+
+
+def test_a_browser_comes_back_to_a_page_that_was_away(browser: Chromium) -> None:
+    with LivePage(0) as page:
+        port = port_of(page)
+        page.show(VIEW | {"title": "before"})
+        browser.open(page.url)
+        browser.wait_for("document.getElementById('title').textContent == 'before'")
+    browser.wait_for("document.getElementById('link').textContent.includes('trying again')")
+    with LivePage(port) as page:
+        page.show(VIEW | {"title": "after"})
+        browser.wait_for("document.getElementById('title').textContent == 'after'")
+        assert browser.ask("document.getElementById('link').textContent") == "pressed"

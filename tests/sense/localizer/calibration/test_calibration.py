@@ -1,0 +1,236 @@
+"""Calibration: the test share is never learnt from, and what is learnt is worth something."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.common.errors import InputError
+from design.common.settings import validated
+from design.criteria.fibre_loss import lost_subsets
+from sense import Localizer, Recording, Rig, calibrate, evaluate, import_mat, locate
+from sense.health.health_model import FELT, RECORDED, HealthModel
+from sense.health.learning import learn_health
+from sense.health.monitor import Finding
+from sense.localizer.calibration.calibration import split_presses
+from sense.settings import Localizer as Options
+
+SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
+
+
+@given(
+    presses=st.integers(3, 3000),
+    share=st.floats(0.01, 0.6),
+    split=st.sampled_from(["random", "chronological"]),
+    seed=st.integers(0, 99),
+)
+def test_a_split_holds_back_a_share_and_uses_the_rest(presses: int, share: float, split: str, seed: int) -> None:
+    if not 1 <= round(share * presses) <= presses - 3:
+        with pytest.raises(InputError, match="holds"):
+            split_presses(presses, split, share, np.random.default_rng(seed))
+        return
+    training, test = split_presses(presses, split, share, np.random.default_rng(seed))
+    assert len(test) == round(share * presses)
+    assert np.array_equal(np.sort(np.concatenate([training, test])), np.arange(presses))
+    assert split == "random" or training.max() < test.min()
+
+
+@pytest.mark.parametrize("split", ["random", "chronological"])
+def test_presses_held_back_leave_no_trace_in_the_localizer(recording: Recording, split: str) -> None:
+    plain, _ = calibrate(recording, SHORT, split=split)
+    test = np.array(plain.test)
+    readings, places = np.array(recording.readings), np.array(recording.presses_mm)
+    places[test] = 5e4 + np.arange(len(test))[:, None]
+    if split == "chronological":  # of random ones, the readings are what came before the presses learnt from
+        readings[recording.begun[test[0]] + 20 :] = 77.0
+    spoilt, _ = calibrate(replace(recording, readings=readings, presses_mm=places), SHORT, split=split)
+    assert spoilt.test == plain.test
+    assert np.array_equal(spoilt.factors, plain.factors)
+    assert all(np.array_equal(spoilt.weights[name], weight) for name, weight in plain.weights.items())
+    assert np.array_equal(spoilt.scaling.spread, plain.scaling.spread)
+
+
+def test_training_presses_do_leave_a_trace(recording: Recording) -> None:
+    plain, _ = calibrate(recording, SHORT)
+    places = np.array(recording.presses_mm)
+    places[sorted(set(range(len(places))) - set(plain.test))[:50]] *= 0.5
+    changed, _ = calibrate(replace(recording, presses_mm=places), SHORT)
+    assert not np.array_equal(changed.weights["last.w"], plain.weights["last.w"])
+
+
+def test_the_same_seed_gives_the_same_result(recording: Recording) -> None:
+    first, document = calibrate(recording, SHORT, seed=7)
+    again, same = calibrate(recording, SHORT, seed=7)
+    assert document == same
+    assert all(np.array_equal(again.weights[name], weight) for name, weight in first.weights.items())
+    assert calibrate(recording, SHORT, seed=8)[0].test != first.test
+
+
+def test_it_beats_the_guess_that_knows_no_reading(calibrated: tuple[Localizer, dict], recording: Recording) -> None:
+    localizer, document = calibrated
+    test = np.array(localizer.test)
+    guess = np.median(np.delete(recording.presses_mm, test, axis=0), axis=0)
+    trivial = np.hypot(*(recording.presses_mm[test] - guess).T).mean()
+    assert document["errors"][0]["mean_mm"] < 0.5 * trivial
+    assert document["errors"][1]["mean_mm"] < 0.8 * trivial
+
+
+def test_the_document_says_what_was_measured(calibrated: tuple[Localizer, dict], recording: Recording) -> None:
+    localizer, document = calibrated
+    assert document["format"] == "padforge-calibration/1"
+    assert document["split"] == "random"
+    assert document["test_presses"] == 45
+    assert document["training_presses"] == 255
+    assert [(row["lost"], row["subsets"]) for row in document["errors"]] == [(0, 1), (1, 4), (2, 6), (3, 4)]
+    assert set(document["errors"][0]) == {
+        *("lost", "subsets", "mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm", "within_r50", "within_r90")
+    }
+    assert localizer.errors == document["errors"]
+    test = np.array(localizer.test)
+    found = [locate(localizer, recording, [fibre]).places_mm[test] for fibre in range(4)]
+    means = [np.hypot(*(places - recording.presses_mm[test]).T).mean() for places in found]
+    row = document["errors"][1]
+    assert row["mean_mm"] == pytest.approx(np.mean(means))
+    assert row["std_mm"] == pytest.approx(np.std(means))
+    assert row["max_mm"] == pytest.approx(np.max(means))
+    assert document["errors"][0]["std_mm"] == 0
+
+
+def test_evaluation_counts_held_back_presses_of_its_own_recording_and_all_of_another(
+    calibrated: tuple[Localizer, dict], recording: Recording
+) -> None:
+    localizer, document = calibrated
+    own = evaluate(localizer, recording, [0, 2])
+    assert own["errors"] == [document["errors"][0], document["errors"][2]]
+    assert own["split"] == "random"
+    other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
+    assert other["test_presses"] == 300
+    assert other["split"] == "none"
+    with pytest.raises(InputError, match="lost is 4, allowed is a whole number from 0 to 3"):
+        evaluate(localizer, recording, [4])
+
+
+@given(fibres=st.integers(1, 40), lost=st.integers(0, 3))
+def test_lost_fibres_come_in_different_sets_of_the_size(fibres: int, lost: int) -> None:
+    subsets = lost_subsets(fibres, min(lost, fibres))
+    assert len(set(subsets)) == len(subsets) <= 256
+    assert all(len(set(subset)) == min(lost, fibres) and max(subset, default=0) < fibres for subset in subsets)
+
+
+def test_options_out_of_range_are_refused(recording: Recording) -> None:
+    with pytest.raises(InputError, match=r"\[localizer\] split: got 'alphabetical'"):
+        calibrate(recording, SHORT, split="alphabetical")
+    with pytest.raises(InputError, match="holds 0 back"):
+        calibrate(recording, SHORT.model_copy(update={"test_share": 1e-4}))
+
+
+@pytest.mark.parametrize(("features", "size"), [("causal", 9), ("early", 6), ("published", 3)])
+def test_other_inputs_can_be_learnt_from_too(recording: Recording, features: str, size: int) -> None:
+    localizer, document = calibrate(recording, SHORT.model_copy(update={"features": features}))
+    assert localizer.scaling.centre.shape == (4, size)
+    assert np.isfinite(document["errors"][0]["mean_mm"])
+
+
+def test_the_published_preset_knows_all_fibres_only(recording: Recording, tmp_path: Path) -> None:
+    localizer, document = calibrate(recording, Options(method="published"))
+    guess = np.hypot(*(recording.presses_mm - np.median(recording.presses_mm, axis=0)).T).mean()
+    assert [row["lost"] for row in document["errors"]] == [0]
+    assert document["errors"][0]["mean_mm"] < 0.75 * guess
+    assert localizer.features == "published"
+    localizer.save(tmp_path)
+    again = locate(Localizer.load(tmp_path), recording)
+    assert np.array_equal(again.places_mm, locate(localizer, recording).places_mm)
+    with pytest.raises(InputError, match="a published localizer knows none"):
+        locate(localizer, recording, [1])
+
+
+def test_presses_of_unknown_place_are_left_out(recording: Recording) -> None:
+    places = np.array(recording.presses_mm)
+    places[::3] = np.nan
+    part = replace(recording, presses_mm=places)
+    localizer, document = calibrate(part, SHORT)
+    assert all(press % 3 for press in localizer.test)
+    assert document["training_presses"] + document["test_presses"] == 200
+    assert np.isfinite(locate(localizer, part).places_mm).all()
+
+
+def test_radii_hold_their_shares_on_presses_never_seen(calibrated: tuple[Localizer, dict]) -> None:
+    """45 test presses, radii from 20: their shares are right within three standard errors of so few."""
+    row = calibrated[1]["errors"][0]
+    assert 0.5 - 0.4 < row["within_r50"] < 0.5 + 0.4
+    assert row["within_r90"] > 0.9 - 0.25
+
+
+def test_errors_by_place_make_up_the_mean(calibrated: tuple[Localizer, dict]) -> None:
+    document = calibrated[1]
+    cells = document["by_place"]
+    assert sum(cell["presses"] for cell in cells) == document["test_presses"]
+    mean = sum(cell["presses"] * cell["mean_mm"] for cell in cells) / document["test_presses"]
+    assert mean == pytest.approx(document["errors"][0]["mean_mm"])
+    assert len(document["idle_share"]) == 4
+    assert all(0 <= share <= 1 for share in document["idle_share"])
+
+
+def test_a_short_training_on_the_published_recording_is_already_near(published: Path) -> None:
+    recording = import_mat(published / "para5_long_first4500.mat")
+    _, document = calibrate(recording, Options(members=1, hidden=96, epochs=40, lost=1))
+    assert document["test_presses"] == 675
+    assert document["errors"][0]["mean_mm"] < 2.4
+
+
+def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sense.localizer.calibration.training
+
+    train = sense.localizer.calibration.training.train
+
+    def diverged(*arguments: Any) -> Any:
+        return {name: weight * np.float32(np.nan) for name, weight in train(*arguments).items()}
+
+    monkeypatch.setattr(sense.localizer.calibration.training, "train", diverged)
+    with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate 0.004, try a lower one"):
+        calibrate(recording, SHORT)
+
+
+@pytest.mark.parametrize("volts", [0.0, 1e-160, 1000.0])
+def test_readings_at_the_limits_give_finite_errors(recording: Recording, volts: float) -> None:
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], recording.readings.shape)
+    places = np.sign(recording.presses_mm) * 1e5
+    found, document = calibrate(replace(recording, readings=volts * signs, presses_mm=places), SHORT)
+    for row in (*document["errors"], *evaluate(found, recording)["errors"]):
+        assert np.isfinite(list(row.values())).all()
+
+
+def test_levels_and_test_presses_that_are_not_there_are_refused(localizer: Localizer, recording: Recording) -> None:
+    with pytest.raises(InputError, match="lost names no number of fibres"):
+        evaluate(localizer, recording, [])
+    with pytest.raises(InputError, match="test press 300 of the localizer: no such press, allowed are 0 to 299"):
+        evaluate(replace(localizer, test=(0, 300)), recording, [0])
+
+
+def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Localizer, recording: Recording) -> None:
+    whole, without = (locate(localizer, recording, lost).places_mm for lost in ((), (1,)))
+    found = locate(localizer, recording, findings=[Finding(9, 5, (1,), "weak", 6.0)]).places_mm
+    assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
+    np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)
+    np.testing.assert_allclose(found[5:], without[5:], atol=1e-4)
+
+
+def test_health_is_learnt_from_the_presses_that_were_not_held_back(
+    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(HealthModel, "fit", lambda readings, times_s, begun, lifted, **options: (begun, lifted))
+    learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
+    edges: dict[str, Any] = {**learn_health(recording, localizer)}
+    assert 0 < len(localizer.test) < len(learnt)
+    np.testing.assert_array_equal(edges[RECORDED], (recording.begun[learnt], recording.lifted[learnt]))
+    assert len(edges[FELT][0]) == len(edges[FELT][1]) == len(learnt)
+
+
+@pytest.mark.parametrize("rate_hz", [1e-300, 0.0999, np.inf])
+def test_a_rate_no_rig_has_is_refused(rate_hz: float) -> None:
+    with pytest.raises(InputError, match=r"\[rig\] rate_hz: got"):
+        validated(Rig, {"rate_hz": rate_hz}, "[rig]")

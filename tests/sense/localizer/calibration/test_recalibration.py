@@ -1,0 +1,274 @@
+"""Recalibration: a changed pad is followed, an unchanged one not spoilt, and radii never shrink."""
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as checked
+from hypothesis import strategies as st
+
+import padforge
+from design.common.errors import InputError
+from sense import Localizer, Recording, evaluate
+from sense.localizer.calibration import fine_tuning as adaptation
+from sense.localizer.calibration.affine_correction import _corrected, _parts, fit_correction
+from sense.localizer.calibration.fine_tuning import FAR_NOISE, _Presses, adapt
+from sense.localizer.calibration.recalibration import _Trial, recalibrate
+from sense.localizer.calibration.training import INPUT_NOISE, MOVED, Samples
+from sense.localizer.evaluation import distances
+from sense.localizer.localizer import Found
+
+ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])
+GAINS = np.array([0.8, 1.2, 1.1, 0.9])
+
+
+def remade(recording: Recording) -> Recording:
+    """The same presses on a pad whose fibres answer by other factors, and which lies shifted and turned."""
+    turn = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
+    return replace(recording, readings=recording.readings * GAINS, presses_mm=recording.presses_mm @ turn.T + SHIFT)
+
+
+def known_only(recording: Recording, presses: slice) -> Recording:
+    places = np.full_like(recording.presses_mm, np.nan)
+    places[presses] = recording.presses_mm[presses]
+    return replace(recording, presses_mm=places)
+
+
+def error(localizer: Localizer, recording: Recording, presses: slice, lost: tuple[int, ...] = ()) -> float:
+    found = localizer.locate(localizer.inputs(recording)[presses], lost)
+    return float(distances(found.places_mm, recording.presses_mm[presses]).mean())
+
+
+NEW, LATER = slice(0, 60), slice(60, 300)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Few steps of adapting, which are slow."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(adaptation, "STEPS", 15)
+        yield
+
+
+def off_by(*amounts: float, radius: float = 1.0) -> Found:
+    """Presses in the middle, found to the side by so many mm."""
+    count = len(amounts)
+    radii = np.full(count, radius)
+    return Found(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
+
+
+def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> _Trial:
+    places = np.zeros((4, 2))
+    return _Trial(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
+
+
+def test_a_gain_counts_every_number_of_lost_fibres_alike() -> None:
+    """With all fibres errors shrink by 1, 2, 3, 4 mm, with one lost by 0 and by 4 mm: by 1.5 to 3 in the mean."""
+    before = {(): off_by(2, 4, 6, 8), (0,): off_by(5, 5, 5, 5), (1,): off_by(5, 5, 5, 5)}
+    after = {(): off_by(1, 2, 3, 4), (0,): off_by(5, 5, 5, 5), (1,): off_by(1, 1, 1, 1)}
+    gain, error = trial_of([[0, 1], [2, 3]]).gain(before, after)
+    assert gain == pytest.approx(2.25)
+    assert error == pytest.approx(np.std([1.5, 2.0, 2.5, 3.0], ddof=1) / 2)
+    assert trial_of([[0, 1], [2, 3]]).gain(after, before)[0] == pytest.approx(-2.25)
+
+
+def test_a_fold_is_changed_by_the_other_presses_only() -> None:
+    trial = trial_of([[1, 3], [0, 2]], np.arange(4))
+    seen: list[list[int]] = []
+
+    def change(localizer: int, raw: np.ndarray, places_mm: np.ndarray) -> int:
+        assert places_mm.shape == (2, 2)
+        seen.append(raw.tolist())
+        return localizer + 1
+
+    assert trial.changed([10, 20], change) == [11, 21]  # pyright: ignore
+    assert seen == [[0, 2], [1, 3]]
+
+
+def test_radii_that_hold_are_not_narrowed_and_others_widened() -> None:
+    found = {(): off_by(0.1, 0.1, 0.1, 0.1), (0,): off_by(3, 3, 3, 3), (1,): off_by(3, 3, 3, 3)}
+    widened = trial_of([[0, 1], [2, 3]]).widened(found)
+    np.testing.assert_allclose(widened, [[1, 1, 1], [3 / np.sqrt(2), 3, 3]])
+
+
+@pytest.fixture(scope="module")
+def followed(localizer: Localizer, recording: Recording) -> tuple[Localizer, dict]:
+    return recalibrate(localizer, known_only(remade(recording), NEW))
+
+
+def test_a_remade_pad_is_followed_with_any_fibre_lost(
+    localizer: Localizer, recording: Recording, followed: tuple[Localizer, dict]
+) -> None:
+    now, document = followed
+    pad = remade(recording)
+    for lost in ((), (0,), (2,), (1, 3)):
+        before, after, usual = (
+            error(localizer, pad, LATER, lost),
+            error(now, pad, LATER, lost),
+            error(localizer, recording, LATER, lost),
+        )
+        # Of the error with fibres lost, little is the change's: most of it no recalibration can take away.
+        assert after - usual < (1.0 if lost else 0.3) * (before - usual)
+    assert "corrected" in document["changes"]
+    assert document["gain_mm"] > 2 * document["standard_error_mm"] > 0
+    for old, new in zip(document["before"], document["after"], strict=True):
+        assert new["mean_mm"] < old["mean_mm"]
+
+
+def test_an_unchanged_pad_is_not_spoilt(localizer: Localizer, recording: Recording) -> None:
+    now, document = recalibrate(localizer, known_only(recording, NEW))
+    assert "corrected" not in document["changes"]
+    assert document["gain_mm"] >= 0
+    assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
+    if not document["changes"]:
+        assert document["before"] == document["after"]
+
+
+def test_radii_only_grow_and_hold_for_the_new_presses(
+    localizer: Localizer, recording: Recording, followed: tuple[Localizer, dict]
+) -> None:
+    now, document = followed
+    assert (now.factors >= localizer.factors).all()
+    assert np.allclose(now.factors, localizer.factors * document["widened"])
+    pad = remade(recording)
+    found = now.locate(now.inputs(pad)[LATER])
+    assert (distances(found.places_mm, pad.presses_mm[LATER]) <= found.r90_mm).mean() > 0.8
+
+
+def test_the_same_seed_gives_the_same(localizer: Localizer, recording: Recording) -> None:
+    few = known_only(remade(recording), slice(0, 20))
+    (one, document), (two, again) = recalibrate(localizer, few), recalibrate(localizer, few)
+    assert document == again
+    assert all(np.array_equal(one.weights[name], two.weights[name]) for name in one.weights)
+
+
+def test_it_is_a_model_like_any_other(followed: tuple[Localizer, dict], recording: Recording, tmp_path: Path) -> None:
+    now, document = followed
+    now.save(tmp_path)
+    again = Localizer.load(tmp_path)
+    assert np.array_equal(again.table, now.table)
+    assert again.recalibrated_by == (known_only(remade(recording), NEW).digest,)
+    pad = remade(recording)
+    assert np.array_equal(again.locate(again.inputs(pad)).places_mm, now.locate(now.inputs(pad)).places_mm)
+    json.dumps(document, allow_nan=False)
+
+
+def test_presses_seen_are_no_test(followed: tuple[Localizer, dict], recording: Recording) -> None:
+    with pytest.raises(InputError, match="recalibrated by"):
+        evaluate(followed[0], known_only(remade(recording), NEW))
+
+
+@pytest.mark.parametrize("presses", [0, 1, 3, 9])
+def test_too_few_presses_are_one_line(localizer: Localizer, recording: Recording, presses: int) -> None:
+    with pytest.raises(InputError, match=f"has {presses} presses of known place, expected at least 10"):
+        recalibrate(localizer, known_only(recording, slice(0, presses)))
+
+
+@given(numbers=st.lists(st.floats(-2, 2), min_size=8, max_size=8))
+@checked(max_examples=20)
+def test_a_correction_does_what_it_says(localizer: Localizer, recording: Recording, numbers: list[float]) -> None:
+    gains, turn, shift = _parts(localizer, np.array(numbers))
+    found = _corrected(localizer, np.array(numbers))
+    scaled = replace(recording, readings=recording.readings * gains)
+    # Gains of the readings are taken off again: what enters the network is the same.
+    np.testing.assert_allclose(found.inputs(scaled).inputs, localizer.inputs(recording).inputs, atol=2e-3)
+    scaling = localizer.scaling
+    before, after = (
+        (each.locate(each.inputs(readings)).places_mm - scaling.middle_mm) / scaling.span_mm
+        for each, readings in ((localizer, recording), (found, scaled))
+    )
+    np.testing.assert_allclose(after, before @ turn.T + shift, atol=1e-2)
+
+
+def test_a_known_correction_is_found(localizer: Localizer, recording: Recording) -> None:
+    scaling, numbers = localizer.scaling, np.array([1.0, -1.0, 0.5, -0.5, 1.0, 0.4, 0.6, -0.8])
+    gains, turn, shift = _parts(localizer, numbers)
+    pad = replace(recording, readings=recording.readings * gains)
+    # Places are those that the localizer itself finds, so that nothing but the correction is to be found.
+    places = localizer.locate(localizer.inputs(recording)).places_mm
+    moved = ((places - scaling.middle_mm) / scaling.span_mm) @ turn.T + shift
+    moved = moved * scaling.span_mm + scaling.middle_mm
+    found = fit_correction(localizer, localizer.raw_inputs(pad), moved)
+    ratios = found.scaling.spread[:, 0] / scaling.spread[:, 0]
+    np.testing.assert_allclose(ratios, gains, rtol=0.02)
+    off = distances(found.locate(found.inputs(pad)).places_mm, moved)
+    assert off.mean() < 0.1 * distances(localizer.locate(localizer.inputs(pad)).places_mm, moved).mean()
+
+
+def test_the_table_of_a_turned_pad_is_turned(localizer: Localizer) -> None:
+    from sense.localizer.calibration.affine_correction import _moved_table
+
+    assert np.allclose(_moved_table(localizer, np.eye(2), np.zeros(2)), localizer.table, atol=1e-6)
+    cells = len(localizer.table) - 1
+    moved = _moved_table(localizer, np.eye(2), np.array([4 / cells, 0.0]))  # a step of the grid is 2 / cells
+    np.testing.assert_allclose(moved[2:], localizer.table[:-2], atol=1e-4)
+
+
+def test_adapting_leaves_lost_fibres_alone(localizer: Localizer, recording: Recording) -> None:
+    presses = localizer.inputs(recording)[NEW]
+    targets = localizer.scaling.targets(recording.presses_mm[NEW])
+    spoilt, dead = presses.inputs.copy(), presses.alive.copy()
+    spoilt[:, 1], dead[:, 1] = np.nan, False
+    samples = Samples(spoilt, dead, targets)
+    weights = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
+    assert all(np.isfinite(weight).all() for weight in weights.values())
+    assert not np.array_equal(weights["last.w"], localizer.weights["last.w"])
+
+
+@pytest.mark.parametrize(("old", "moved"), [(0.0, True), (1e18, False)])
+def test_the_more_was_learnt_before_the_less_new_presses_count(
+    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch, old: float, moved: bool
+) -> None:
+    """Of what was learnt before nothing is kept where it counts nothing, and all where it alone counts."""
+    presses = localizer.inputs(recording)[NEW]
+    samples = Samples(presses.inputs, presses.alive, localizer.scaling.targets(recording.presses_mm[NEW]))
+    monkeypatch.setattr(adaptation, "OLD_PRESSES", old)
+
+    def adapted(slope: float) -> np.ndarray:
+        monkeypatch.setattr(adaptation, "_change", lambda found, before: slope * found.sum())
+        rng = np.random.default_rng(0)
+        return adapt(localizer.weights, samples, localizer.table, 2, rng)["last.b"]
+
+    before = localizer.weights["last.b"]
+    assert np.allclose(adapted(0.0), before, atol=1e-6) != moved
+    assert np.array_equal(adapted(0.0), adapted(1.0)) == moved
+
+
+def test_presses_are_moved_nearby_or_to_anywhere_on_the_pad() -> None:
+    """Of a fibre that reads the place itself, from presses all made at one place."""
+    grid = np.linspace(-1, 1, 9, dtype=np.float32)
+    table = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)[:, :, None]
+    at = np.tile(np.array([0.25, -0.5], dtype=np.float32), (5, 1))
+    presses = _Presses(Samples(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0))
+    entries, places = presses.nearby()
+    assert (entries[0, :, :2] - places).std().item() == pytest.approx(INPUT_NOISE, rel=0.2)
+    np.testing.assert_allclose(places.std(dim=0), [MOVED] * 2, rtol=0.2)
+    np.testing.assert_allclose(places.mean(dim=0), at[0], atol=0.05)
+    far = torch.cat([presses.anywhere()[0, :, :2] for _ in range(20)]).numpy()
+    np.testing.assert_allclose(far.mean(axis=0), 0, atol=0.06)
+    np.testing.assert_allclose(np.square(far).mean(axis=0), 1 / 3 + FAR_NOISE**2, rtol=0.06)
+
+
+def test_the_command_writes_a_whole_model(
+    localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    localizer.save(tmp_path / "old")
+    (tmp_path / "old" / "health.json").write_text("{}")
+    known_only(remade(recording), slice(0, 20)).save(tmp_path / "new", {})
+    command = ["recalibrate", "--model", "old", "new", "--out", "now", "--json"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["padforge", "sense", *command])
+    with pytest.raises(SystemExit) as caught:
+        padforge.main()
+    assert not caught.value.code
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads(Path("now/recalibration.json").read_text())
+    assert (document["format"], document["presses"]) == ("padforge-recalibration/1", 20)
+    assert Localizer.load("now").fibres == 4
+    assert Path("now/health.json").exists()

@@ -1,0 +1,192 @@
+"""Robustness and size curve: one test for all ways, resumed work is the same work, and forecasts that follow."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import padforge
+from design.common.errors import InputError
+from sense import Localizer, Recording, evaluate
+from sense.localizer.calibration import fibre_loss_study as loss_study
+from sense.localizer.calibration.fibre_loss_study import MANY, ONE, robustness
+from sense.localizer.calibration.learning_curve import fit_power_law, power_law, size_curve
+from sense.settings import Localizer as Options
+
+QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A published network of three neurons."""
+    monkeypatch.setattr("sense.localizer.calibration.published_training.HIDDEN", 3)
+
+
+def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
+    document, expected = robustness(recording, localizer, lost=2), evaluate(localizer, recording, (0, 1, 2))
+    (way,) = document["ways"].items()
+    assert way[0] == ONE
+    assert {name: way[1][name] for name in ("errors", "by_subset")} == {
+        name: expected[name] for name in ("errors", "by_subset")
+    }
+    assert way[1]["maps"][0] == {"lost": [], "by_place": expected["by_place"]}
+    worst = max((each for each in expected["by_subset"] if len(each["lost"]) == 2), key=lambda each: each["mean_mm"])
+    assert way[1]["maps"][2]["lost"] == worst["lost"]
+    cells = way[1]["maps"][2]["by_place"]
+    assert np.average(
+        [cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells]
+    ) == pytest.approx(worst["mean_mm"])
+    assert document["test_presses"] == expected["test_presses"]
+
+
+def test_both_ways_stand_side_by_side_on_the_same_presses(localizer: Localizer, recording: Recording) -> None:
+    document = robustness(recording, localizer, retrain=True, lost=1)
+    assert list(document["ways"]) == [ONE, MANY]
+    for way in document["ways"].values():
+        assert [row["subsets"] for row in way["errors"]] == [1, 4]
+        assert [each["lost"] for each in way["by_subset"]] == [[], [0], [1], [2], [3]]
+    assert document["test_presses"] == len(localizer.test)
+    assert document["training_presses"] == 300 - len(localizer.test)
+    json.dumps(document, allow_nan=False)
+    assert len(loss_study.lines(document)) == 6
+
+
+def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recording: Recording) -> None:
+    plain = robustness(recording, retrain=True, lost=0)["ways"][MANY]
+    test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
+    places = recording.presses_mm.copy()
+    places[test] += 5.0
+    moved = robustness(replace(recording, presses_mm=places), retrain=True, lost=0)["ways"][MANY]
+    assert moved["errors"][0]["mean_mm"] != plain["errors"][0]["mean_mm"]
+    training = np.setdiff1d(np.arange(300), test)
+    found = loss_study._train_without(
+        (2,), recording, training, test, Options(method="published", features="published")
+    )
+    spoilt = recording.readings.copy()
+    spoilt[:, 2] = np.random.default_rng(1).uniform(0, 3, len(spoilt))
+    again = loss_study._train_without(
+        (2,), replace(recording, readings=spoilt), training, test, Options(method="published", features="published")
+    )
+    assert np.array_equal(found.places_mm, again.places_mm)
+
+
+def test_broken_off_work_goes_on_and_gives_the_same(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = robustness(recording, retrain=True, lost=1)
+    kept, real, trained = tmp_path / "unfinished", loss_study._train_without, []
+
+    def interrupted(done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    def counted(lost: tuple[int, ...], *rest: object) -> object:
+        trained.append(lost)
+        return real(lost, *rest)  # type: ignore[arg-type]
+
+    with pytest.raises(KeyboardInterrupt):
+        robustness(recording, retrain=True, lost=1, keep_in=kept, progress=interrupted)
+    finished = len(list(kept.glob("start_*.npz")))
+    assert finished >= 2
+    monkeypatch.setattr(loss_study, "_train_without", counted)
+    assert robustness(recording, retrain=True, lost=1, keep_in=kept) == whole
+    assert len(trained) == 5 - finished
+    assert not kept.exists()
+
+
+def test_work_of_other_settings_is_not_gone_on_with(recording: Recording, tmp_path: Path) -> None:
+    def interrupted(done: int, total: int) -> None:
+        if done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        robustness(recording, retrain=True, lost=0, keep_in=tmp_path / "k", progress=interrupted)
+    with pytest.raises(InputError, match="begun with robustness"):
+        robustness(recording, retrain=True, lost=0, options=Options(seed=1), keep_in=tmp_path / "k")
+
+
+def test_no_way_is_one_line(recording: Recording) -> None:
+    with pytest.raises(InputError, match="neither a localizer nor retraining"):
+        robustness(recording)
+
+
+@given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
+def test_a_power_law_is_found_again(floor: float, factor: float, exponent: float) -> None:
+    presses = np.array([50.0, 100, 200, 400, 800])
+    errors = power_law(presses, (floor, factor, exponent))
+    found = fit_power_law(presses, errors)
+    ahead = np.array([1600.0])
+    np.testing.assert_allclose(power_law(ahead, found), power_law(ahead, (floor, factor, exponent)), rtol=1e-3)
+
+
+@given(errors=st.lists(st.floats(0.1, 10), min_size=5, max_size=5))
+def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
+    presses = np.array([50.0, 100, 200, 400, 800])
+    fit = fit_power_law(presses, np.array(errors))
+    along = power_law(np.geomspace(50, 3200, 9), fit)
+    assert (np.diff(along) <= 1e-9).all()
+    assert min(fit) >= 0
+
+
+def test_a_size_curve_says_what_more_would_bring(recording: Recording) -> None:
+    document = size_curve(recording, QUICK)
+    assert document == size_curve(recording, QUICK)
+    assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
+    ahead = document["forecast"]
+    assert ahead["presses"] == 510
+    assert 0 < ahead["low_mm"] <= ahead["mean_mm"] <= ahead["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
+    assert "255 more presses" in document["advice"]
+    assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
+    json.dumps(document, allow_nan=False)
+
+
+def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
+    places = recording.presses_mm.copy()
+    places[100:] = np.nan
+    with pytest.raises(InputError, match="85 presses to learn from, expected at least 160"):
+        size_curve(replace(recording, presses_mm=places), QUICK)
+
+
+def test_the_commands_write_documents_and_figures(
+    localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    localizer.save(tmp_path / "model")
+    recording.save(tmp_path / "rec", {})
+    monkeypatch.chdir(tmp_path)
+    Path("pad.toml").write_text("[localizer]\nhidden = 24\nlayers = 1\nepochs = 2\nbatch = 64\n")
+
+    def run(*arguments: str) -> tuple[object, str, str]:
+        monkeypatch.setattr(sys, "argv", ["padforge", "sense", *arguments])
+        with pytest.raises(SystemExit) as caught:
+            padforge.main()
+        return caught.value.code or 0, *capsys.readouterr()
+
+    for name, arguments in (
+        ("robustness", ("robustness", "rec", "--model", "model", "--retrain", "--lost", "1")),
+        ("size_curve", ("size-curve", "rec")),
+    ):
+        code, out, _ = run(*arguments, "--out", "out", "--json")
+        assert code == 0
+        assert json.loads(out) == json.loads(Path("out", f"{name}.json").read_text())
+        assert Path("out", f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    code, out, err = run("robustness", "rec", "--out", "other")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "neither --model nor --retrain" in err
+    assert not Path("other").exists()
+
+
+def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
+    long, heard = QUICK.model_copy(update={"epochs": 100_000}), []
+
+    def interrupted(done: int, total: int) -> None:
+        heard.append(done / total)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        size_curve(recording, long, progress=interrupted)
+    assert max(heard) < 0.5

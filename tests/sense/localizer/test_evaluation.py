@@ -1,0 +1,78 @@
+"""How far off a localizer is: what is told of errors that are known."""
+
+import numpy as np
+import pytest
+
+from design.common.errors import InputError
+from sense import Recording
+from sense.localizer.evaluation import by_place, conformal, distances, errors_by_loss, idle_share, summary
+from sense.localizer.localizer import Found
+
+PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
+
+
+def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0) -> Found:
+    """The four presses found to the side by so many mm."""
+    away = np.column_stack([amounts, np.zeros(4)])
+    return Found(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
+
+
+def test_distances_are_euclidean() -> None:
+    np.testing.assert_allclose(distances(np.array([[3.0, 4.0], [1.0, 1.0]]), np.array([[0, 0], [1, 3.0]])), [5, 2])
+
+
+def test_a_row_of_errors_is_made_of_the_means_of_each_set_and_of_all_presses() -> None:
+    row = summary(2, [off_by(0, 1, 2, 3), off_by(1, 1, 1, 9, r50=1.5, r90=8.0)], PLACES)
+    assert (row["lost"], row["subsets"]) == (2, 2)
+    assert (row["mean_mm"], row["std_mm"], row["max_mm"]) == pytest.approx((2.25, 0.75, 3.0))
+    assert row["median_mm"] == 1
+    assert row["p95_mm"] == pytest.approx(3 + 0.65 * 6)
+    assert (row["within_r50"], row["within_r90"]) == pytest.approx((5 / 8, 6 / 8))
+
+
+def test_every_set_of_a_size_is_tried_and_told() -> None:
+    def locate(lost: tuple[int, ...]) -> Found:
+        return off_by(*[float(sum(lost))] * 4)
+
+    rows, by_subset = errors_by_loss(3, (0, 2), locate, PLACES)
+    assert [(row["lost"], row["subsets"], row["mean_mm"]) for row in rows] == [(0, 1, 0.0), (2, 3, 2.0)]
+    assert [(each["lost"], each["mean_mm"]) for each in by_subset] == [([], 0), ([0, 1], 1), ([0, 2], 2), ([1, 2], 3)]
+    for level in (-1, 3):
+        with pytest.raises(InputError, match=f"lost is {level}, allowed is a whole number from 0 to 2"):
+            errors_by_loss(3, (level,), locate, PLACES)
+
+
+def test_radii_grow_by_a_quantile_a_rank_higher_than_their_share() -> None:
+    """Ninety-nine presses off by 0.01, 0.02 ... of their radius: the 50th and the 90th of the hundred."""
+    ranks = np.random.default_rng(0).permutation(np.arange(1, 100) / 100)
+    places = np.zeros((99, 2))
+    found = Found(np.column_stack([6 * ranks, 0 * ranks]), np.full((99, 2), 3.0), np.full(99, 2.0), np.full(99, 4.0))
+    spread, r50, r90 = conformal([found], places)
+    assert spread == pytest.approx(np.sqrt((np.square(2 * ranks)).mean() / 2))
+    assert r50 == pytest.approx(np.quantile(3 * ranks, 50 / 99))
+    assert r90 == pytest.approx(np.quantile(1.5 * ranks, 90 / 99))
+    few = Found(found.places_mm[:5], found.sd_mm[:5], found.r50_mm[:5], found.r90_mm[:5])
+    assert conformal([few], places[:5])[2] == pytest.approx((1.5 * ranks[:5]).max())
+
+
+def test_errors_by_place_are_those_of_a_fifth_of_either_side() -> None:
+    pressed = np.array([[0.0, 0.0], [1.9, 0.9], [2.1, 0.0], [10.0, 5.0], [9.9, 4.9]])
+    found = pressed + np.array([[1, 0], [3, 0], [0, 2], [0, 0], [0, 4]])
+    rows = by_place(found, pressed)
+    keys = ("x_mm", "y_mm", "presses", "mean_mm", "max_mm")
+    np.testing.assert_allclose(
+        [[row[key] for key in keys] for row in rows], [[1, 0.5, 2, 2, 3], [3, 0.5, 1, 2, 2], [9, 4.5, 2, 2, 4]]
+    )
+    (row,) = by_place(PLACES[:1] + 1, PLACES[:1])
+    assert (row["x_mm"], row["y_mm"], row["presses"]) == (0.5, 0.5, 1)
+
+
+def test_a_fibre_is_idle_that_changes_by_less_than_two_percent_of_its_range() -> None:
+    """Five presses of 20 readings, of which the first fibre moves by 0 to 1 V and the second by far less in one."""
+    steps = np.array([[0.0, 1.0], [0.015, -1.0], [0.025, 0.03], [1.0, 0.05], [0.5, 0.5]])
+    readings = np.zeros((200, 2))
+    begun, lifted = np.arange(5) * 40 + 15, np.arange(5) * 40 + 36
+    for step, down, up in zip(steps, begun, lifted, strict=True):
+        readings[down:up] = step
+    recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), begun, lifted)
+    np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])

@@ -1,0 +1,323 @@
+"""Filters of whole recordings against optimality conditions, exhaustive search, numpy, and on hostile readings."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from design.common.errors import InputError
+from sense import open_recording
+from sense.processing.benchmark import fibre, linear_program, objective
+from sense.processing.filters import running_median, stretches, total_variation
+from sense.processing.kernels import clipping as clips
+from sense.processing.kernels import interval_heap
+from sense.processing.kernels import total_variation_l1 as robust_variation
+from sense.processing.stream_filters import TotalVariation
+
+STEP_V = 3.3 / 1023
+LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])
+FIDELITY = st.sampled_from(["robust", "squares"])
+VALUES = st.one_of(
+    st.integers(-3, 3).map(float),
+    st.integers(0, 1023).map(STEP_V.__mul__),
+    st.floats(-10, 10).map(lambda v: round(v, 9)),
+)
+"""Many ties, a converter's steps, or any but the very smallest."""
+PRESENT = hnp.arrays(np.float64, st.integers(1, 40), elements=VALUES)
+READINGS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.one_of(VALUES, VALUES, st.just(np.nan)))
+
+
+def excess_robust(y, x, lam):
+    """How far x is from a minimum of the robust objective: 0 exactly where it is one, by whatever way it was found.
+
+    x is a minimiser if there are signs s_i in the subdifferential of |x_i - y_i| whose running sums are lam where x
+    rises, -lam where it falls, between where it is level, and 0 at the end. The interval the sums can be in is
+    followed.
+    """
+    here = ~np.isnan(y)
+    y, x = y[here], x[here]
+    if len(x) == 0:
+        return 0.0
+    turn = np.sign(np.diff(x))
+    least, greatest = np.where(turn > 0, lam, -lam), np.where(turn < 0, -lam, lam)
+    least, greatest = np.append(least, 0.0), np.append(greatest, 0.0)
+    low = high = worst = 0.0
+    for up, down, a, b in zip((x > y).tolist(), (x < y).tolist(), least.tolist(), greatest.tolist(), strict=True):
+        low, high = low + (1 if up else -1), high + (-1 if down else 1)
+        worst = max(worst, a - high, low - b)
+        low, high = min(max(low, a), b), min(max(high, a), b)
+    return worst
+
+
+def excess_squares(y, x, lam):
+    """The same for squares: the running sums are those of x - y."""
+    here = ~np.isnan(y)
+    sums, turn = np.cumsum(x[here] - y[here]), np.sign(np.diff(x[here]))
+    beyond = np.where(turn == 0, np.abs(sums[:-1]) - lam, np.abs(sums[:-1] - lam * turn))
+    return max(abs(sums[-1]), beyond.max(initial=0)) if len(sums) else 0.0
+
+
+def least_by_search(y, lam):
+    """The least robust objective, over all choices of x_i among the readings: a minimiser is always among them."""
+    levels = np.unique(y)
+    cost = np.zeros(len(levels))
+    for reading in y:
+        cost = (cost[:, None] + lam * np.abs(levels[:, None] - levels)).min(axis=0) + np.abs(levels - reading)
+    return cost.min()
+
+
+@given(READINGS, LAMS)
+def test_total_variation_meets_the_conditions_of_the_minimum(y, lam):
+    # heights of stairs are multiples of 2^-40, which the sums of the check do not know
+    assert excess_robust(y, total_variation(y, lam), lam) <= 1e-10
+    # sums of 40 readings up to 10, or of shares of lam, to rounding
+    assert excess_squares(y, total_variation(y, lam, "squares"), lam) <= 1e-12 * (1 + min(lam, 400))
+
+
+@given(PRESENT, LAMS)
+def test_robust_objective_is_the_least_of_an_exhaustive_search(y, lam):
+    found = objective(y, total_variation(y, lam), lam)
+    assert found == pytest.approx(least_by_search(y, lam), rel=1e-9, abs=1e-9)
+
+
+def test_robust_objective_is_that_of_a_linear_program():
+    _, y = fibre(2000, np.random.default_rng(3))
+    for lam in (1.0, 4.0, 17.3):
+        expected = objective(y, linear_program(y, lam), lam)
+        assert objective(y, total_variation(y, lam), lam) == pytest.approx(expected, rel=1e-9)
+
+
+@given(READINGS, LAMS, FIDELITY)
+def test_missing_readings_count_for_nothing_and_take_the_next_level(y, lam, fidelity):
+    x = total_variation(y, lam, fidelity)
+    here = ~np.isnan(y)
+    np.testing.assert_array_equal(x[here], total_variation(y[here], lam, fidelity))
+    if here.any():
+        present = np.flatnonzero(here)
+        following = np.minimum(np.searchsorted(present, np.arange(len(y))), len(present) - 1)
+        np.testing.assert_array_equal(x, x[present[following]])
+    else:
+        assert np.isnan(x).all()
+
+
+@given(READINGS, LAMS, FIDELITY)
+def test_upside_down_and_in_another_unit_it_is_the_same_filter(y, lam, fidelity):
+    x = total_variation(y, lam, fidelity)
+    np.testing.assert_allclose(total_variation(-y, lam, fidelity), -x, rtol=0, atol=1e-13 * (fidelity == "squares"))
+    unit = 2.0**20  # a power of two, so that nothing is rounded
+    other_lam = lam if fidelity == "robust" else unit * lam
+    np.testing.assert_array_equal(total_variation(unit * y, other_lam, fidelity), unit * x)
+
+
+@given(READINGS, LAMS, FIDELITY)
+def test_causal_values_are_the_last_of_each_beginning(y, lam, fidelity):
+    expected = [total_variation(y[: i + 1], lam, fidelity)[-1] for i in range(len(y))]
+    np.testing.assert_array_equal(total_variation(y, lam, fidelity, causal=True), expected)
+
+
+@given(hnp.arrays(np.float64, (12, 2), elements=VALUES), st.sets(st.integers(0, 11)).map(sorted), FIDELITY)
+def test_nothing_is_coupled_across_starts_or_channels(y, starts, fidelity):
+    pieces = np.split(y, starts)
+    for lam, causal in ((0.7, False), (4.0, True)):
+        alone = [total_variation(piece[:, c], lam, fidelity, causal=causal) for piece in pieces for c in (0, 1)]
+        expected = np.concatenate([np.column_stack(alone[i : i + 2]) for i in range(0, len(alone), 2)])
+        np.testing.assert_array_equal(total_variation(y, lam, fidelity, starts, causal), expected)
+    expected = np.concatenate([running_median(piece, 5) for piece in pieces])
+    np.testing.assert_array_equal(running_median(y, 5, starts), expected)
+
+
+def test_a_press_is_kept_or_cut_by_its_length():
+    y = np.zeros(60)
+    y[20:27], y[40:49] = 1, 1  # lam = 4 cuts bumps of fewer than 8 readings, and an end of fewer than 4
+    x = total_variation(y, 4)
+    assert not x[:40].any()
+    np.testing.assert_array_equal(x[40:49], 1)
+    assert not total_variation(np.append(np.zeros(30), np.ones(3)), 4).any()
+    x = total_variation(y, 0.9, "squares")
+    assert x[22] == pytest.approx(1 - 2 * 0.9 / 7)
+    assert x[44] == pytest.approx(1 - 2 * 0.9 / 9)
+
+
+def test_of_several_minimisers_it_is_the_middle_one():
+    y = np.array([0.0, 1, 2, 3, -9, -9, -9, -9, -9])
+    x = total_variation(y, 2)
+    np.testing.assert_array_equal(x[:4], 0.5)
+    levels = [np.append(np.full(4, level), y[4:]) for level in (-0.1, 0.0, 1.0, 1.1)]
+    below, lowest, highest, above = (objective(y, other, 2) for other in levels)
+    assert below > lowest == objective(y, x, 2) == highest < above
+
+
+def hostile(count):
+    rng = np.random.default_rng(0)
+    index = np.arange(count)
+    return {
+        "noise": rng.normal(size=count),
+        "constant": np.full(count, 2.5),
+        "rising": index.astype(float),
+        "falling": -(index**1.5),
+        "alternating": index % 2 * 1.0,
+        "growing": np.where(index % 2, index, -index).astype(float),
+        "shrinking": np.where(index % 2, index, -index)[::-1].astype(float),
+        "walk": np.cumsum(rng.normal(size=count)),
+        "converter": np.round(3 * rng.normal(size=count)) * STEP_V,
+        "offset": 1e6 + 1e-3 * rng.normal(size=count),
+    }
+
+
+@pytest.mark.parametrize("name", hostile(2))
+@pytest.mark.parametrize("lam", [1e-12, 0.7, 4.0, 314.15, 5000.0, 1e12])
+def test_hostile_readings(name, lam):
+    y = hostile(10_000)[name]
+    assert excess_robust(y, total_variation(y, lam), lam) <= 1e-9 * lam
+    x = total_variation(y, lam, "squares")
+    # x itself is rounded by 1e-16 of its greatest value, 10 000 times
+    assert excess_squares(y, x, lam) <= 1e-11 * np.abs(y).max() * len(y)
+    if lam == 1e12:
+        np.testing.assert_allclose(x, y.mean(), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(total_variation(y, lam), np.median(y), rtol=1e-15)
+
+
+def test_a_million_readings():
+    rng = np.random.default_rng(1)
+    y = rng.normal(size=1_000_000)
+    for lam in (4.0, 3000.0):
+        assert excess_robust(y, total_variation(y, lam), lam) <= 1e-9
+    assert excess_squares(y, total_variation(y, 10.0, "squares"), 10.0) <= 1e-8
+
+
+@pytest.mark.parametrize("fidelity", ["robust", "squares"])
+def test_shapes_and_kinds_of_arrays(fidelity):
+    y = np.random.default_rng(2).normal(size=(2000, 6))
+    x = total_variation(y, 2, fidelity)
+    assert x.shape == y.shape
+    np.testing.assert_array_equal(total_variation(np.asfortranarray(y), 2, fidelity), x)
+    np.testing.assert_array_equal(
+        total_variation(y[::2, ::-2], 2, fidelity), total_variation(y[::2, ::-2].copy(), 2, fidelity)
+    )
+    np.testing.assert_array_equal(total_variation(y[:, 3], 2, fidelity), x[:, 3])
+    single = y.astype(np.float32)
+    np.testing.assert_array_equal(
+        total_variation(single, 2, fidelity), total_variation(single.astype(float), 2, fidelity)
+    )
+    assert total_variation(single, 2, fidelity).dtype == np.float64
+    np.testing.assert_array_equal(total_variation([3, 1, 2], 50), [2, 2, 2])
+    for shape in ((0,), (0, 3), (3, 0)):
+        assert total_variation(np.empty(shape), 2, fidelity).shape == shape
+        assert running_median(np.empty(shape), 5).shape == shape
+    assert total_variation([7.0], 2, fidelity) == [7]
+    np.testing.assert_allclose(total_variation([0.0, 1.0], 100, fidelity), 0.5)
+
+
+def test_readings_are_left_as_they_are():
+    y = np.array([1.0, np.nan, 5.0, 2.0])
+    before = y.copy()
+    total_variation(y, 1)
+    running_median(y, 3)
+    np.testing.assert_array_equal(y, before)
+
+
+@given(READINGS, st.sampled_from([1, 3, 5, 15, 99]), st.booleans())
+def test_running_median_is_numpys_of_each_window(y, width, causal):
+    before, after = (width - 1, 0) if causal else (width // 2, width // 2)
+    windows = [y[max(i - before, 0) : i + after + 1] for i in range(len(y))]
+    expected = [np.median(w[~np.isnan(w)]) if (~np.isnan(w)).any() else np.nan for w in windows]
+    np.testing.assert_allclose(running_median(y, width, causal=causal), expected, rtol=1e-15)
+
+
+def test_stretches_begin_after_long_intervals():
+    times = np.array([0, 0.1, 0.2, 5.2, 5.3, 99])
+    np.testing.assert_array_equal(stretches(times, 1), [3, 5])
+    np.testing.assert_array_equal(stretches(times, 1000), [])
+    np.testing.assert_array_equal(stretches([], 1), [])
+    y = np.array([0, 0, 0, 1, 1, 0.0])
+    np.testing.assert_array_equal(total_variation(y, 4, starts=stretches(times, 1)), y)
+
+
+@given(
+    st.lists(st.integers(-9, 9).map(float), max_size=60),
+    st.lists(st.one_of(st.integers(-9, 9).map(float), st.sampled_from(["smallest", "greatest"])), max_size=60),
+)
+def test_the_interval_heap_gives_what_a_sorted_list_gives(there, orders):
+    keys, values = np.empty(121), np.empty(121)
+    listed: list[tuple[float, float]] = []
+    for number, order in enumerate([*there, *orders]):
+        if isinstance(order, float):
+            interval_heap.push(keys, values, len(listed), order, number)
+            listed.append((order, number))
+        elif listed:
+            end = interval_heap.HIGH if order == "greatest" else interval_heap.LOW
+            slot = interval_heap.end_slot(len(listed), end)
+            key, value = keys[slot], values[slot]
+            assert key == (max if order == "greatest" else min)(listed)[0]
+            interval_heap.pop(keys, values, len(listed), end)
+            listed.remove((key, value))
+        assert sorted(zip(keys[: len(listed)], values[: len(listed)], strict=True)) == sorted(listed)
+
+
+def test_the_staircase_keeps_its_height_exactly():
+    """Stairs are cut 100 000 times; what is left of them still sums to 2 lam, to the last digit."""
+    y = np.random.default_rng(4).normal(size=100_000)
+    low, high = np.empty((2, len(y)))
+    for lam in (0.6, 4.3, np.pi, 1000 / 7):
+        _, (_, below, above) = robust_variation.forward(y, lam, robust_variation.silent(), low, high, np.empty(0))
+        snapped = round(lam * robust_variation.GRAIN) / robust_variation.GRAIN
+        assert math.fsum([*below[1], *above[1]]) == 2 * snapped
+        assert below.shape[1] + above.shape[1] <= 2 * lam + 1
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: total_variation([1, np.inf], 4), r"readings hold inf \(first at \[1\]\), allowed is"),
+        (lambda: total_variation([[0, 1], [0, -1e200]], 4), r"-1e\+200 \(first at \[1, 1\]\)"),
+        (lambda: total_variation(np.zeros((2, 2, 2)), 4), r"shape \(2, 2, 2\), expected \(R,\) or \(R, C\)"),
+        (lambda: total_variation(3.0, 4), r"shape \(\), expected"),
+        (lambda: total_variation(["a"], 4), "readings are .* expected an array of real numbers"),
+        (lambda: total_variation([1j], 4), "expected an array of real numbers"),
+        (lambda: total_variation([1], 0), "lam is 0, allowed is a number above 0"),
+        (lambda: total_variation([1], np.nan), "lam is nan"),
+        (lambda: total_variation([1], np.inf), "lam is inf"),
+        (lambda: total_variation([1], 4, "huber"), "fidelity is 'huber', allowed is robust or squares"),  # type: ignore[arg-type]
+        (lambda: total_variation([1, 2], 4, starts=[2]), "starts are .*, allowed are ascending indices of 2 readings"),
+        (lambda: total_variation([1, 2], 4, starts=[1, 1]), "ascending"),
+        (lambda: total_variation([1, 2], 4, starts=[0.5]), "starts are .* whole numbers"),
+        (lambda: running_median([1], 4), "width is 4, allowed is an odd whole number above 0"),
+        (lambda: running_median([1], 3.0), "width is 3.0"),  # type: ignore[arg-type]
+        (lambda: running_median([1], -1), "width is -1"),
+        (lambda: running_median([-np.inf], 3), "readings hold -inf"),
+        (lambda: stretches([0, 2, 1], 1), "times_s are .*, expected finite numbers that ascend"),
+        (lambda: stretches([np.inf, np.inf], 1), "finite"),
+        (lambda: stretches([[0]], 1), "shape"),
+        (lambda: stretches([0], 0), "longest_s is 0, allowed is a number above 0"),
+    ],
+)
+def test_what_cannot_be_filtered_is_refused_in_one_line(call, message):
+    with pytest.raises(InputError, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)
+
+
+def test_the_real_recording(published):
+    recording = open_recording(published / "para5_long_first4500.mat")
+    y = recording.readings
+    x = total_variation(y, 4)
+    for c in range(recording.fibres):
+        assert excess_robust(y[:, c], x[:, c], 4) == 0
+    stream = TotalVariation(recording.fibres, 4)
+    blocks = [stream.feed(block) for block in np.array_split(y, 180)]
+    assert len(y) - sum(map(len, blocks)) < 40  # readings held back: less than a press
+    np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), x)
+
+
+def test_a_chain_of_clips_goes_back_and_is_decided_where_its_bounds_have_met():
+    low = np.array([0.0, -1.0, 2.0, -np.inf, 1.0])
+    high = np.array([5.0, 1.0, 3.0, np.inf, 4.0])
+    for last, expected in ((9.0, [1, 1, 3, 4, 4]), (-9.0, [1, 1, 2, 1, 1]), (2.5, [1, 1, 2.5, 2.5, 2.5])):
+        out = np.empty(5)
+        assert clips.clip_back(low, high, last, out) == 2  # 1 from the second on back, whatever follows
+        assert out.tolist() == expected
+    assert clips.clip_back(low[2:], high[2:], 9.0, np.empty(3)) == 0
+    assert clips.clip_back(np.append(low, 7.0), np.append(high, 7.0), 9.0, np.empty(6)) == 6

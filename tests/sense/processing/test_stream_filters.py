@@ -1,0 +1,133 @@
+"""Filters of streams: the same values as of the whole, however the readings come in blocks."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from design.common.errors import InputError
+from sense.processing.filters import running_median, total_variation
+from sense.processing.stream_filters import RunningMedian, TotalVariation
+
+VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))
+RECORDINGS = hnp.arrays(np.float64, st.tuples(st.integers(0, 60), st.integers(1, 3)), elements=VALUES)
+CUTS = st.lists(st.integers(0, 60), max_size=8).map(sorted)
+LAMS = st.sampled_from([0.3, 1.0, 2.3, 4.0, 30.0, 1e6])
+FIDELITY = st.sampled_from(["robust", "squares"])
+
+
+def streamed(stream, readings, cuts=()):
+    return np.concatenate([*(stream.feed(block) for block in np.split(readings, cuts)), stream.finish()])
+
+
+@given(RECORDINGS, CUTS, LAMS, FIDELITY)
+def test_total_variation_of_blocks_is_that_of_the_whole(y, cuts, lam, fidelity):
+    x = streamed(TotalVariation(y.shape[1], lam, fidelity), y, cuts)
+    np.testing.assert_array_equal(x, total_variation(y, lam, fidelity))
+
+
+@given(RECORDINGS, CUTS, st.sampled_from([1, 3, 7, 99]), st.booleans())
+def test_running_median_of_blocks_is_that_of_the_whole(y, cuts, width, causal):
+    x = streamed(RunningMedian(y.shape[1], width, causal), y, cuts)
+    np.testing.assert_array_equal(x, running_median(y, width, causal=causal))
+
+
+@given(RECORDINGS, RECORDINGS, LAMS, FIDELITY)
+def test_what_is_given_stands_whatever_follows(y, follows, lam, fidelity):
+    given = TotalVariation(y.shape[1], lam, fidelity).feed(y)
+    follows = np.repeat(follows[:, :1], y.shape[1], axis=1)
+    np.testing.assert_array_equal(given, total_variation(np.concatenate([y, follows]), lam, fidelity)[: len(given)])
+
+
+@given(RECORDINGS, LAMS, FIDELITY)
+def test_what_is_held_back_could_still_change(y, lam, fidelity):
+    """Nothing waits longer than it must: of what is held, the first value does depend on what follows."""
+    y = y[:, :1]
+    given = TotalVariation(1, lam, fidelity).feed(y)
+    if len(given) < len(y):
+        high, low = (np.concatenate([y, np.full((4000, 1), end)]) for end in (1e9, -1e9))
+        if lam < 1e3:  # enough readings to outweigh the coupling
+            first = [total_variation(z, lam, fidelity)[len(given), 0] for z in (high, low)]
+            assert first[0] > first[1]
+
+
+@given(RECORDINGS, LAMS, FIDELITY)
+def test_latest_is_the_causal_value(y, lam, fidelity):
+    stream = TotalVariation(y.shape[1], lam, fidelity)
+    assert np.isnan(stream.latest).all()
+    causal = total_variation(y, lam, fidelity, causal=True)
+    for i, reading in enumerate(y):
+        stream.feed([reading])
+        np.testing.assert_array_equal(stream.latest, causal[i])
+
+
+def test_at_the_cap_a_channel_is_decided_as_if_it_ended():
+    """0 1 0 1 ... stays undecided for ever, a constant never; each channel has a cap of its own."""
+    y = np.column_stack([np.arange(35) % 2, np.ones(35)]).astype(float)
+    expected = total_variation(y, 2, starts=[10, 20, 30])
+    for size in (1, 7, 10, 35):
+        stream = TotalVariation(2, 2, most_held=10)
+        blocks = [stream.feed(y[i : i + size]) for i in range(0, 35, size)]
+        assert sum(map(len, blocks)) == 30
+        np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), expected)
+
+
+@given(RECORDINGS, CUTS, LAMS, FIDELITY, st.integers(1, 12))
+def test_at_the_cap_the_size_of_blocks_makes_no_difference(y, cuts, lam, fidelity, most):
+    x = streamed(TotalVariation(y.shape[1], lam, fidelity, most), y, cuts)
+    np.testing.assert_array_equal(x, streamed(TotalVariation(y.shape[1], lam, fidelity, most), y))
+    columns = [streamed(TotalVariation(1, lam, fidelity, most), column[:, None]) for column in y.T]
+    np.testing.assert_array_equal(x, np.hstack(columns))
+
+
+def test_a_dead_channel_holds_the_others_back_up_to_the_cap():
+    y = np.column_stack([np.full(30, np.nan), np.ones(30)])
+    stream = TotalVariation(2, 2, most_held=20)
+    assert len(stream.feed(y[:19])) == 0
+    np.testing.assert_array_equal(stream.feed(y[19:]), y[:20])
+    np.testing.assert_array_equal(stream.finish(), y[20:])
+
+
+@pytest.mark.parametrize("fidelity", ["robust", "squares"])
+def test_a_long_recording_is_filtered_in_little_memory(fidelity):
+    """200 000 readings in blocks of 1000: less than 3000 are ever held, by the sizes of all arrays of the stream."""
+    rng = np.random.default_rng(0)
+    stream, most, count = TotalVariation(1, 4, fidelity), 0, 0
+    for _ in range(200):
+        count += len(stream.feed(np.cumsum(rng.normal(size=(1000, 1)))[:, None]))
+        channel = stream._channels[0]
+        most = max(most, channel._low.size, channel.decided.size, *(part.size for part in channel._message))
+    assert most < 3000
+    assert count > 199_000
+
+
+@pytest.mark.parametrize("make", [lambda: TotalVariation(2, 4), lambda: RunningMedian(2, 5)])
+def test_what_follows_the_end_begins_anew(make):
+    y = np.random.default_rng(0).normal(size=(50, 2))
+    stream = make()
+    first, second = streamed(stream, y[:20]), streamed(stream, y[20:])
+    np.testing.assert_array_equal(first, streamed(make(), y[:20]))
+    np.testing.assert_array_equal(second, streamed(make(), y[20:]))
+    assert stream.finish().shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: TotalVariation(0, 4), "channels is 0, allowed is a whole number from 1 to 512"),
+        (lambda: TotalVariation(2.0, 4), "channels is 2.0"),  # type: ignore[arg-type]
+        (lambda: TotalVariation(2, -1), "lam is -1"),
+        (lambda: TotalVariation(2, 4, "cubes"), "fidelity is 'cubes'"),  # type: ignore[arg-type]
+        (lambda: TotalVariation(2, 4, most_held=0), "most_held is 0"),
+        (lambda: TotalVariation(2, 4).feed([1, 2]), r"shape \(2,\), expected \(n, 2\)"),
+        (lambda: TotalVariation(2, 4).feed([[1, 2, 3]]), r"shape \(1, 3\), expected \(n, 2\)"),
+        (lambda: TotalVariation(1, 4).feed([[np.inf]]), "readings hold inf"),
+        (lambda: RunningMedian(0, 3), "channels is 0"),
+        (lambda: RunningMedian(1, 2), "width is 2"),
+        (lambda: RunningMedian(1, 3).feed([[1, 2]]), r"expected \(n, 1\)"),
+    ],
+)
+def test_what_a_stream_cannot_take_is_refused(call, message):
+    with pytest.raises(InputError, match=message):
+        call()

@@ -1,0 +1,100 @@
+"""The stream: whole rows come back to the last bit, a torn end is cut, other damage is an error."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.common.errors import InputError
+from sense.recordings.block_file import BlockWriter, block_dtype, read_blocks
+
+
+def write(path: Path, rows: np.ndarray, cuts: Sequence[int] = ()) -> None:
+    with path.open("wb") as file:
+        writer = BlockWriter(file, rows.shape[1] - 1)
+        for part in np.split(rows, cuts):
+            writer.append(part)
+        writer.flush()
+
+
+def some_rows(count: int, fibres: int) -> np.ndarray:
+    return np.random.default_rng(count).standard_normal((count, 1 + fibres))
+
+
+@given(count=st.integers(0, 60), fibres=st.integers(1, 40), cuts=st.lists(st.integers(0, 60), max_size=5))
+def test_rows_come_back_whatever_the_portions(tmp_path_factory, count: int, fibres: int, cuts: list[int]) -> None:
+    path = tmp_path_factory.mktemp("stream") / "readings.bin"
+    rows = some_rows(count, fibres)
+    write(path, rows, sorted(cuts))
+    found, torn = read_blocks(path, fibres)
+    assert np.array_equal(found, rows)
+    assert not torn
+
+
+def test_blocks_are_a_multiple_of_256_bytes_and_hold_four_rows() -> None:
+    for fibres in (1, 6, 8, 128, 512):
+        dtype = block_dtype(fibres)
+        assert dtype.itemsize % 256 == 0
+        assert dtype["rows"].shape[0] >= 4
+    assert block_dtype(6).itemsize == 256
+
+
+def test_flushing_between_writes_a_short_block_that_reads_back(tmp_path: Path) -> None:
+    rows = some_rows(11, 6)
+    with (tmp_path / "s").open("wb") as file:
+        writer = BlockWriter(file, 6)
+        for row in rows:
+            writer.append(row[None])
+            writer.flush()
+    assert np.array_equal(read_blocks(tmp_path / "s", 6)[0], rows)
+
+
+@given(kept=st.integers(0, 10 * 256))
+def test_a_torn_tail_leaves_all_whole_blocks_before_it(tmp_path_factory, kept: int) -> None:
+    path = tmp_path_factory.mktemp("stream") / "readings.bin"
+    rows = some_rows(40, 6)
+    write(path, rows)
+    path.write_bytes(path.read_bytes()[:kept])
+    found, torn = read_blocks(path, 6)
+    assert np.array_equal(found, rows[: kept // 256 * 4])
+    assert torn == bool(kept % 256)
+
+
+def test_a_tail_of_zeros_as_a_crashed_disk_leaves_it_is_torn_too(tmp_path: Path) -> None:
+    rows = some_rows(40, 6)
+    write(tmp_path / "s", rows)
+    content = (tmp_path / "s").read_bytes()
+    (tmp_path / "s").write_bytes(content[: 7 * 256 + 13] + bytes(3 * 256 - 13))
+    found, torn = read_blocks(tmp_path / "s", 6)
+    assert np.array_equal(found, rows[:28])
+    assert torn
+
+
+@given(byte=st.integers(0, 9 * 256 - 1), bit=st.integers(0, 7))
+def test_a_flipped_bit_before_an_intact_block_is_an_error(tmp_path_factory, byte: int, bit: int) -> None:
+    path = tmp_path_factory.mktemp("stream") / "readings.bin"
+    write(path, some_rows(40, 6))
+    content = bytearray(path.read_bytes())
+    content[byte] ^= 1 << bit
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"block {byte // 256} .*damaged"):
+        read_blocks(path, 6)
+
+
+@pytest.mark.parametrize("change", [lambda c: c[:700] + c[701:], lambda c: c[:700] + b"x" + c[700:]])
+def test_a_lost_or_added_byte_in_the_middle_is_an_error(tmp_path: Path, change) -> None:
+    write(tmp_path / "s", some_rows(40, 6))
+    (tmp_path / "s").write_bytes(change((tmp_path / "s").read_bytes()))
+    with pytest.raises(InputError, match=r"block 2 .*damaged"):
+        read_blocks(tmp_path / "s", 6)
+
+
+def test_a_missing_block_is_an_error(tmp_path: Path) -> None:
+    write(tmp_path / "s", some_rows(40, 6))
+    content = (tmp_path / "s").read_bytes()
+    (tmp_path / "s").write_bytes(content[:512] + content[768:])
+    with pytest.raises(InputError, match=r"block 2 .*damaged"):
+        read_blocks(tmp_path / "s", 6)

@@ -1,0 +1,177 @@
+"""Whatever is left of a run directory, it goes on from there: no finished press lost, nothing else taken for one."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from design.common.errors import InputError
+from sense.recordings.block_file import block_dtype
+from sense.recordings.press_journal import read_journal
+from sense.recordings.recorder import JOURNAL, READINGS, STATES, Recorder
+from sense.recordings.recording import Recording
+
+FIBRES = 3
+
+
+def record(recorder: Recorder, presses: range, time_s: float) -> float:
+    """Twenty readings a press at 10 Hz, and as many states."""
+    for press in presses:
+        times = time_s + np.arange(20) / 10
+        recorder.append(times[:10], np.full((10, FIBRES), press + 0.25))
+        recorder.append_states(np.column_stack([times[:10], np.full((10, 9), float(press))]))
+        recorder.begin((press, -press), recorder.readings, press)
+        recorder.append(times[10:], np.full((10, FIBRES), press + 0.5))
+        recorder.finish(recorder.readings)
+        recorder.sync()
+        time_s += 2
+    return time_s
+
+
+def made(folder, presses=5):
+    with Recorder(folder / "run", FIBRES, {"kind": "made"}, {}) as recorder:
+        record(recorder, range(presses), 0.0)
+    return folder / "run"
+
+
+def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
+    path = made(tmp_path)
+    before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
+    with Recorder.resume(path) as recorder:
+        assert recorder.done == set(range(5))
+        assert recorder.readings == 100
+        assert recorder.last_s == pytest.approx(9.9)
+    assert {name: (path / name).read_bytes() for name in before} == before
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_kill_at_any_byte_loses_no_finished_press(tmp_path_factory, data):
+    """Files grow in the order readings, states, journal; a kill leaves any prefix of what came after the last sync."""
+    path = made(tmp_path_factory.mktemp("killed"))
+    whole = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
+    lines = whole[JOURNAL].splitlines(keepends=True)
+    finished = data.draw(st.integers(0, 4))
+    synced = {JOURNAL: sum(map(len, lines[: 2 * finished]))}
+    for name, columns, rows in ((READINGS, FIBRES, 20), (STATES, 9, 10)):
+        dtype = block_dtype(columns)
+        blocks = np.frombuffer(whole[name], dtype)
+        kept = int(np.searchsorted(np.cumsum(blocks["count"]), rows * finished, side="right")) if finished else 0
+        synced[name] = kept * dtype.itemsize
+    for name, content in whole.items():
+        cut = data.draw(st.integers(synced[name], len(content)))
+        (path / name).write_bytes(content[: cut if name != JOURNAL else min(cut, synced[name] + 40)])
+    with Recorder.resume(path) as recorder:
+        assert recorder.done >= set(range(finished))
+        assert len(recorder.done) <= finished + 1
+        left = [press for press in range(5) if press not in recorder.done]
+        for press in left:
+            record(recorder, range(press, press + 1), max(recorder.last_s, 0.0) + 1)
+    recording = Recording.open(path)
+    assert recording.presses_mm.tolist() == [[press, -press] for press in range(5)]
+    for press, (begun, lifted) in enumerate(zip(recording.begun, recording.lifted, strict=True)):
+        assert (recording.readings[begun:lifted] == press + 0.5).all()
+    assert (np.diff(recording.times_s) > 0).all()
+
+
+def test_an_aborted_press_is_made_again(tmp_path):
+    with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+        time_s = record(recorder, range(2), 0.0)
+        recorder.append([time_s], np.zeros((1, FIBRES)))
+        recorder.begin((2, -2), recorder.readings, 2)
+        recorder.abort("the arm was stopped")
+        recorder.abort("told twice")
+    events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
+    assert events[-2:] == ["begun", "aborted"]
+    assert set(read_journal(tmp_path / "run" / JOURNAL)) == {0, 1}
+    with Recorder.resume(tmp_path / "run") as recorder:
+        record(recorder, range(2, 4), time_s + 1)
+    assert len(Recording.open(tmp_path / "run").presses_mm) == 4
+
+
+@pytest.mark.parametrize("name", [READINGS, JOURNAL])
+def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
+    path = made(tmp_path)
+    content = bytearray((path / name).read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    (path / name).write_bytes(bytes(content))
+    with pytest.raises(InputError, match=name):
+        Recorder.resume(path)
+    assert (path / name).read_bytes() == bytes(content)
+
+
+def test_no_recording_to_resume(tmp_path):
+    with pytest.raises(InputError, match="no recording"):
+        Recorder.resume(tmp_path)
+
+
+def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
+    """The journal says they are done; once other readings fill the gap, it must not say so any more."""
+    path = made(tmp_path)
+    content = (path / READINGS).read_bytes()
+    (path / READINGS).write_bytes(content[: len(content) // 2])
+    with Recorder.resume(path) as recorder:
+        kept = set(recorder.done)
+        assert kept < set(range(5))
+        times = recorder.last_s + 1 + np.arange(100) / 10
+        recorder.append(times, np.zeros((100, FIBRES)))
+    with Recorder.resume(path) as recorder:
+        assert recorder.done == kept
+        recorder.begin((9, 9), recorder.readings, max(kept) + 1)
+        recorder.abort("broken off")
+    assert set(read_journal(path / JOURNAL)) == kept
+    assert len(Recording.open(path).presses_mm) == len(kept)
+
+
+def test_two_programs_cannot_record_into_one_folder(tmp_path):
+    path = made(tmp_path)
+    with Recorder.resume(path):
+        before = (path / READINGS).read_bytes()
+        with pytest.raises(InputError, match="another program is recording"):
+            Recorder.resume(path)
+        assert (path / READINGS).read_bytes() == before
+
+
+def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    def broken():
+        with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+            recorder.sync = full
+            raise RuntimeError("the first thing")
+
+    with pytest.raises(RuntimeError, match="the first thing"):
+        broken()
+
+
+def test_a_press_that_was_not_begun_cannot_be_finished(tmp_path):
+    """Its line would make the whole journal one that nobody can read."""
+    path = made(tmp_path)
+    with Recorder.resume(path) as recorder, pytest.raises(InputError, match="was not begun"):
+        recorder.finish(recorder.readings)
+    assert len(Recording.open(path).begun) == 5
+
+
+def test_presses_without_a_number_count_on_from_the_last(tmp_path):
+    """One that was aborted is made again under its number; after a break the count goes on."""
+    with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
+        for number in range(2):
+            recorder.append(np.arange(5) / 10 + number, np.zeros((5, FIBRES)))
+            recorder.begin((0, 0), recorder.readings)
+            recorder.finish(recorder.readings)
+        recorder.begin((0, 0), recorder.readings)
+        recorder.abort("the arm stopped")
+        recorder.begin((0, 0), recorder.readings)
+        recorder.finish(recorder.readings)
+        recorder.begin((0, 0), recorder.readings, press=7)
+        recorder.finish(recorder.readings)
+        assert recorder.done == {0, 1, 2, 7}
+        with pytest.raises(InputError, match="press 8 was not begun"):
+            recorder.finish(recorder.readings)
+    with Recorder.resume(tmp_path / "run") as recorder:
+        recorder.begin((0, 0), recorder.readings)
+        recorder.finish(recorder.readings)
+        assert recorder.done == {0, 1, 2, 7, 8}

@@ -1,0 +1,303 @@
+"""Recordings and their run directory."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sense.recordings.recording
+from design.common.errors import InputError
+from sense import Recorder, Recording
+from sense.cli.rig import describe
+
+
+@pytest.fixture
+def folder(recording: Recording, tmp_path: Path) -> Path:
+    recording.save(tmp_path / "run", {"command": "test"})
+    return tmp_path / "run"
+
+
+def test_a_run_directory_gives_back_the_recording(recording: Recording, folder: Path) -> None:
+    found = Recording.open(folder)
+    assert found == recording
+    assert found.digest == recording.digest
+    assert found.source == recording.source
+    assert found.torn_presses == 0
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["run"]
+
+
+def test_a_torn_stream_loses_the_presses_it_had(recording: Recording, folder: Path) -> None:
+    stream = folder / "readings.bin"
+    stream.write_bytes(stream.read_bytes()[: -10 * 256 - 3])
+    found = Recording.open(folder)
+    left = len(found.presses_mm)
+    assert 0 < found.torn_presses <= 2
+    assert left + found.torn_presses == len(recording.presses_mm)
+    assert np.array_equal(found.presses_mm, recording.presses_mm[:left])
+    assert np.array_equal(found.readings, recording.readings[: len(found.readings)])
+
+
+def test_a_torn_journal_line_loses_its_press_only(recording: Recording, folder: Path) -> None:
+    journal = folder / "journal.ndjson"
+    journal.write_text(journal.read_text()[:-9])
+    assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
+
+
+def test_a_damaged_journal_is_one_clear_error(folder: Path) -> None:
+    journal = folder / "journal.ndjson"
+    lines = journal.read_text().splitlines(keepends=True)
+    journal.write_text("".join([*lines[:4], lines[4].replace("begun", "began"), *lines[5:]]))
+    with pytest.raises(InputError, match="line 5 is no journal entry"):
+        Recording.open(folder)
+
+
+def test_a_damaged_middle_of_the_stream_is_an_error(folder: Path) -> None:
+    stream = bytearray((folder / "readings.bin").read_bytes())
+    stream[len(stream) // 2] ^= 1
+    (folder / "readings.bin").write_bytes(stream)
+    with pytest.raises(InputError, match="damaged"):
+        Recording.open(folder)
+
+
+def test_a_recording_is_never_written_over(recording: Recording, folder: Path, tmp_path: Path) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(InputError, match="never written over"):
+        recording.save(folder, {})
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    (tmp_path / "empty").mkdir()
+    recording.save(tmp_path / "empty", {})
+    assert Recording.open(tmp_path / "empty") == recording
+
+
+@pytest.mark.parametrize("fibres", [None, 0, "6", 1e3, True])
+def test_a_start_document_without_a_count_of_fibres_is_refused(folder: Path, fibres: object) -> None:
+    document = json.loads((folder / "start.json").read_text())
+    (folder / "start.json").write_text(json.dumps(document | {"fibres": fibres}))
+    with pytest.raises(InputError, match="fibres is"):
+        Recording.open(folder)
+
+
+def test_what_a_live_recorder_synced_can_be_read_before_it_ends(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    readings = rng.standard_normal((30, 3))
+    recorder = Recorder(tmp_path / "live", 3, {}, {})
+    for i in range(30):
+        recorder.append([float(i)], readings[i : i + 1])
+        if i == 9:
+            recorder.begin((1.5, -2.5), i + 1)
+        if i == 19:
+            recorder.finish(i + 1)
+            recorder.sync()
+        if i == 25:
+            recorder.begin((3.0, 4.0), i + 1)
+            recorder.sync()
+    found = Recording.open(tmp_path / "live")
+    recorder.__exit__(None, None, None)
+    assert np.array_equal(found.readings, readings[: len(found.readings)])
+    assert len(found.readings) == 26
+    assert found.presses_mm.tolist() == [[1.5, -2.5]]
+    assert (found.begun.tolist(), found.lifted.tolist()) == ([10], [20])
+
+
+def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
+    array = array.copy()
+    array[index] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: {"readings": spoiled(r.readings, (7, 0), np.inf)}, r"readings hold infinity.*row 7"),
+        (lambda r: {"readings": np.full_like(r.readings, np.nan)}, "readings are all missing"),
+        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.inf)}, r"presses hold infinity.*row 3"),
+        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.nan)}, "press 3 has one of x and y"),
+        (lambda r: {"times_s": spoiled(r.times_s, 9, 0.0)}, "do not ascend at reading 9"),
+        (lambda r: {"times_s": r.times_s[:-1]}, r"times have shape"),
+        (lambda r: {"readings": r.readings[:, :0]}, r"readings have shape"),
+        (lambda r: {"presses_mm": r.presses_mm[:0]}, "at least one press"),
+        (lambda r: {"begun": spoiled(r.begun, 2, 70)}, "press 2 goes from"),
+        (lambda r: {"begun": spoiled(r.begun, 0, 0)}, "press 0 goes from reading 0"),
+        (lambda r: {"lifted": spoiled(r.lifted, -1, len(r.readings) + 1)}, "press 299 goes from"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(recording: Recording, change, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(recording, **change(recording))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: {"readings": spoiled(r.readings, (7, 0), -1e30)}, r"readings hold -1e\+30 V \(first in row 7\)"),
+        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), 1e6)}, r"presses hold 1e\+06 mm .*row 3.*allowed"),
+        (lambda r: {"times_s": spoiled(r.times_s, -1, 1e30)}, r"times hold 1e\+30 s .*allowed"),
+        (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e-300}, "times give .* readings a second, allowed"),
+        (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e5}, "times give 1e-05 readings a second, allowed"),
+        (lambda r: {"readings": "x"}, "readings are 'x'"),
+        (lambda r: {"readings": [[1.0], [1.0, 2.0]]}, "readings are .*expected an array of real numbers"),
+        (lambda r: {"readings": r.readings + 1j}, "readings are .*complex128"),
+        (lambda r: {"times_s": None}, "times_s are None"),
+        (lambda r: {"begun": r.begun + np.where(r.begun == 20, np.nan, 0)}, "begun are .*whole numbers"),
+        (lambda r: {"lifted": r.lifted + 0.5}, "lifted are .*whole numbers"),
+        (lambda r: {"lifted": [10**20] * len(r.lifted)}, "lifted are .*whole numbers"),
+        (lambda r: {"source": "a rig"}, "source is 'a rig', expected a mapping"),
+        (lambda r: {"source": {"gain": np.nan}}, "source is .*expected what JSON can hold"),
+    ],
+)
+def test_what_no_rig_records_is_refused(recording: Recording, change, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        replace(recording, **change(recording))
+    assert "\n" not in str(caught.value)
+
+
+def test_one_missing_reading_is_as_another(recording: Recording) -> None:
+    other_nan = np.array([0x7FF8000000000001], dtype=np.uint64).view(np.float64)[0]
+    one, other = (
+        replace(recording, readings=spoiled(recording.readings, (7, 0), nan), presses_mm=spoiled(places, 3, nan))
+        for nan, places in ((np.nan, recording.presses_mm), (-other_nan, recording.presses_mm))
+    )
+    assert one == other
+    assert one.digest == other.digest
+    assert one != recording
+    assert one.digest != recording.digest
+    assert one.known.tolist() == [press != 3 for press in range(len(recording.presses_mm))]
+
+
+def test_uneven_times_are_fine_and_a_missing_one_is_told(recording: Recording) -> None:
+    uneven = np.cumsum(np.random.default_rng(0).exponential(0.07, len(recording.times_s)))
+    assert replace(recording, times_s=uneven).rate_hz == pytest.approx(1 / 0.07 / np.log(2), rel=0.1)
+    with pytest.raises(InputError, match=r"times hold NaN or infinity \(first in row 11\), expected finite numbers"):
+        replace(recording, times_s=spoiled(recording.times_s, 11, np.nan))
+
+
+def test_a_recording_of_one_press_and_two_readings_is_one(tmp_path: Path) -> None:
+    least = Recording(np.ones((2, 1)), np.arange(2.0), np.full((1, 2), np.nan), np.array([1]), np.array([2]))
+    least.save(tmp_path / "run", {})
+    assert Recording.open(tmp_path / "run") == least
+
+
+def test_a_recording_tells_in_one_line_what_it_lacks(recording: Recording) -> None:
+    whole = describe(recording, Path("out"))
+    assert whole == f"300 presses, 12000 readings of 4 fibres at {recording.rate_hz:.1f} Hz -> out"
+    holed = replace(
+        recording,
+        readings=spoiled(recording.readings, slice(3), np.nan),
+        presses_mm=spoiled(recording.presses_mm, [3, 5], np.nan),
+    )
+    assert describe(holed, Path("out")) == (
+        f"300 presses (2 of unknown place), 12000 readings of 4 fibres, 12 values missing, "
+        f"at {recording.rate_hz:.1f} Hz -> out"
+    )
+
+
+def test_indices_may_be_whole_floats(recording: Recording) -> None:
+    assert replace(recording, begun=recording.begun.astype(float)) == recording
+
+
+def test_implausible_readings_in_the_stream_are_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run", 2, {}, {}) as recorder:
+        recorder.append(np.arange(9.0), np.full((9, 2), 1e300))
+        recorder.begin((0.0, 0.0), 3)
+        recorder.finish(6)
+    with pytest.raises(
+        InputError, match=r"run: readings hold 1e\+300 V \(first in row 0\), allowed is -1000 to 1000 V"
+    ):
+        Recording.open(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *(
+            ('"reading": 20,', f'"reading": {value},')
+            for value in ("1e999", "1e30", "20.0", "true", '"20"', "-1", "NaN")
+        ),
+        *(('"press": 0,', f'"press": {value},') for value in ("1e999", "0.0", "false", '"0"', "null", "9" * 30)),
+        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"')),
+        ('"event": "begun", ', ""),
+        ('{"event"', "[" * 100_000 + '{"event"'),
+        ('{"event"', '3\n{"event"'),
+    ],
+)
+def test_a_journal_entry_of_other_values_is_refused(folder: Path, old: str, new: str) -> None:
+    journal = folder / "journal.ndjson"
+    text = journal.read_text()
+    assert old in text
+    journal.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=r"journal\.ndjson: line 1 is no journal entry") as caught:
+        Recording.open(folder)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("source", [[1], "simulated", None, 3])
+def test_a_source_that_is_no_mapping_is_refused(folder: Path, source: object) -> None:
+    document = json.loads((folder / "start.json").read_text())
+    (folder / "start.json").write_text(json.dumps(document | {"source": source}))
+    with pytest.raises(InputError, match=r"source is .*expected a mapping"):
+        Recording.open(folder)
+
+
+def test_a_folder_that_is_no_recording_is_said_to_be_none(folder: Path, tmp_path: Path) -> None:
+    for path in (tmp_path / "absent", tmp_path, folder / "start.json"):
+        with pytest.raises(InputError, match=r"no recording, expected a folder with start\.json, journal\.ndjson and"):
+            Recording.open(path)
+    (folder / "journal.ndjson").unlink()
+    (folder / "journal.ndjson").mkdir()
+    with pytest.raises(InputError, match=r"journal\.ndjson: cannot be read \(Is a directory\)"):
+        Recording.open(folder)
+
+
+@pytest.mark.parametrize("made_before", [False, True])
+def test_of_two_saves_into_one_folder_the_first_stays_and_the_second_is_told(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_before: bool
+) -> None:
+    path = tmp_path / "run"
+    if made_before:
+        path.mkdir()
+    late = replace(recording, times_s=recording.times_s + 1)
+    sync = Recorder.sync
+
+    def overtaken(recorder: Recorder) -> None:
+        sync(recorder)
+        monkeypatch.setattr(Recorder, "sync", sync)
+        recording.save(path, {})
+
+    monkeypatch.setattr(Recorder, "sync", overtaken)
+    with pytest.raises(InputError, match="never written over"):
+        late.save(path, {})
+    assert Recording.open(path) == recording
+    assert [found.name for found in tmp_path.iterdir()] == ["run"]
+
+
+def test_of_two_recorders_in_one_folder_the_second_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Recorder(tmp_path / "run", 3, {}, {})
+    before = (tmp_path / "run" / "start.json").read_bytes()
+    refuse_existing = sense.recordings.recording.refuse_existing
+
+    def looked_too_early(path: Path) -> None:
+        monkeypatch.setattr(sense.recordings.recording, "refuse_existing", refuse_existing)
+
+    monkeypatch.setattr(sense.recordings.recording, "refuse_existing", looked_too_early)
+    with pytest.raises(InputError, match="never written over"):
+        Recorder(tmp_path / "run", 4, {}, {})
+    first.__exit__(None, None, None)
+    assert (tmp_path / "run" / "start.json").read_bytes() == before
+
+
+def test_a_place_that_cannot_be_written_is_one_clear_line(recording: Recording, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    for path in (tmp_path / "file", tmp_path / "file" / "below" / "run"):
+        with pytest.raises(InputError, match="file is a file, expected a folder"):
+            recording.save(path, {})
+        with pytest.raises(InputError, match="file is a file, expected a folder"):
+            Recorder(path, 3, {}, {})
+    with pytest.raises(InputError, match=r"cannot be written \(File name too long\)"):
+        recording.save(tmp_path / ("n" * 300), {})
+    assert (tmp_path / "file").read_text() == "kept"
+    assert [found.name for found in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,147 @@
+"""The simulated pad behaves like one: touched fibres answer, creep, overshoot, drift; the ADC counts."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design import Contact, Morphology, signals, signals_quantized
+from sense import Rig, simulate
+from sense.recordings.pad_model import (
+    ADC_STEPS,
+    SUPPLY_V,
+    Answer,
+    Cycle,
+    Lag,
+    LivePad,
+    Wander,
+    digitised,
+    divider,
+    indentation,
+    strain,
+)
+
+PAD = Morphology.straight(4)
+CYCLE = Cycle(40, 13.3)
+
+
+def test_the_same_seed_gives_the_same_recording_and_another_another() -> None:
+    first = simulate(PAD, Rig(presses=20, seed=3))
+    assert simulate(PAD, Rig(presses=20, seed=3)) == first
+    assert simulate(PAD, Rig(presses=20, seed=4)) != first
+
+
+def test_it_has_the_published_form() -> None:
+    recording = simulate(PAD, Rig(presses=400))
+    assert recording.readings.shape == (16_000, 8)
+    assert np.array_equal(recording.begun, 40 * np.arange(400) + 20)
+    assert np.array_equal(recording.lifted, recording.begun + 20)
+    assert np.abs(recording.presses_mm).max() <= 22.5
+    assert np.abs(recording.presses_mm).max(axis=0).min() > 21
+    assert recording.rate_hz == pytest.approx(13.3, rel=0.02)
+
+
+def test_touched_fibres_answer_and_others_do_not() -> None:
+    recording = simulate(PAD, Rig(presses=200, noise_mv=0.0, drift_mv=0.0, creep=0.0, hysteresis=0.0))
+    touched = signals_quantized(PAD, PAD.to_grid(recording.presses_mm)) > 0
+    cycles = recording.readings.reshape(200, 40, 8)
+    change = cycles[:, 35] - cycles[:, 15]
+    assert (change[~touched] == 0).all()
+    assert (change[touched] < 0).mean() > 0.98  # a graze can stay below one step
+
+
+def test_untouched_fibres_stay_within_noise() -> None:
+    recording = simulate(PAD, Rig(presses=300, drift_mv=0.0, creep=0.0, hysteresis=0.0))
+    touched = signals_quantized(PAD, PAD.to_grid(recording.presses_mm)) > 0
+    cycles = recording.readings.reshape(300, 40, 8)
+    change = cycles[:, 28:38].mean(axis=1) - cycles[:, 8:18].mean(axis=1)
+    expected = 1.6e-3 * np.sqrt(2 / 10)
+    assert change[~touched].std() == pytest.approx(expected, rel=0.15)
+    assert np.abs(change[touched]).mean() > 20 * expected
+
+
+def one_press(creep: float, hysteresis: float) -> np.ndarray:
+    indented = np.vstack([indentation(CYCLE, np.full((1, 2), 0.1)), np.zeros((9, 80))])
+    return Answer(CYCLE.rate_hz, creep, hysteresis)(strain(np.vstack([[1.0], np.zeros((9, 1))]), indented))[:, 0]
+
+
+def test_without_creep_and_hysteresis_the_answer_is_the_indentation() -> None:
+    shown = one_press(0.0, 0.0)
+    assert (shown[:20] == 0).all()
+    assert np.allclose(shown[25:40], 1)
+    assert np.allclose(shown[45:], 0)
+
+
+def test_creep_grows_in_the_press_and_dies_away_after_it() -> None:
+    shown = one_press(0.2, 0.0)
+    assert (np.diff(shown[25:40]) > 0).all()
+    assert 0.8 < shown[25] < shown[39] < 1
+    assert (np.diff(shown[46:]) < 0).all()
+    assert 0 < shown[-1] < 0.1 * shown[46]
+
+
+def test_unloading_overshoots_and_loading_does_not() -> None:
+    shown = one_press(0.0, 0.25)
+    assert shown[:40].min() == 0
+    assert -0.25 < shown[40:].min() < -0.15
+    assert (np.diff(shown[45:]) > 0).all()
+    assert abs(shown[-1]) < 0.01
+
+
+def test_strain_of_a_press_reaches_into_the_next_cycle() -> None:
+    late = indentation(CYCLE, np.full((2, 2), 0.2))
+    found = strain(np.array([[1.0, 0.0], [0.0, 1.0]]), late)
+    assert found.shape == (80, 2)
+    assert found[42, 0] == 1
+    assert found[79].tolist() == [0, 1]
+    assert np.array_equal(found[:40, 0], found[40:, 1])
+
+
+@given(value=st.floats(-5, 5), steps=st.floats(0.5, 1e4))
+def test_a_lag_keeps_what_is_constant(value: float, steps: float) -> None:
+    assert np.allclose(Lag(steps)(np.full((50, 2), value)), value)
+
+
+@given(volts=st.floats(-1, 5))
+def test_the_adc_gives_whole_steps_within_half_a_step(volts: float) -> None:
+    found = digitised(np.array([volts]))[0]
+    counts = found / SUPPLY_V * ADC_STEPS
+    assert counts == pytest.approx(round(counts), abs=1e-9)
+    assert abs(found - np.clip(volts, 0, SUPPLY_V)) <= SUPPLY_V / ADC_STEPS / 2 * (1 + 1e-9)
+
+
+@given(rest=st.floats(0.5, 3), change=st.floats(0, 2))
+def test_the_divider_rests_where_it_should_and_falls_with_resistance(rest: float, change: float) -> None:
+    assert divider(np.array(rest), np.array(0.0)) == pytest.approx(rest)
+    assert 0 < divider(np.array(rest), np.array(change)) <= rest * (1 + 1e-12)
+
+
+def test_the_rest_wanders_slowly_about_its_place() -> None:
+    drift = Wander(200, 13.3, np.random.default_rng(0))(20_000)
+    assert drift.std() == pytest.approx(1, rel=0.05)
+    assert np.diff(drift, axis=0).std() == pytest.approx(np.sqrt(2 / (13.3 * 600)), rel=0.02)
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
+def test_asked_bit_by_bit_the_model_gives_the_same(pieces: list[int], seed: int) -> None:
+    strained = np.random.default_rng(seed).uniform(0, 2, (sum(pieces), 3))
+    whole = Answer(13.3, 0.2, 0.3)(strained)
+    model = Answer(13.3, 0.2, 0.3)
+    parts = np.split(strained, np.cumsum(pieces)[:-1])
+    assert np.allclose(np.vstack([model(part) for part in parts]), whole)
+    drift, again = (Wander(2, 13.3, np.random.default_rng(seed)) for _ in range(2))
+    assert np.allclose(np.vstack([drift(n) for n in pieces]), again(sum(pieces)))
+
+
+def test_the_live_pad_answers_where_and_as_deep_as_the_tip_presses() -> None:
+    quiet = Rig(noise_mv=0, drift_mv=0, creep=0, hysteresis=0)
+    pad = Morphology.straight(2)
+    model = LivePad(pad, Contact(), quiet, 1000.0, np.random.default_rng(0))
+    depths = np.repeat([-5.0, 0.0, 2.5, 5.0], 20)
+    volts = model.volts(np.tile([-5.0, 7.0], (80, 1)), depths)
+    rest, above, half, full = (volts[20 * i + 10] for i in range(4))
+    assert np.array_equal(rest, above)
+    touched = signals(pad, pad.to_grid([[-5.0, 7.0]]), Contact())[0] > 0
+    assert touched.any()
+    assert ((full < half) & (half < rest))[touched].all()
+    assert np.array_equal(full[~touched], rest[~touched])

@@ -1,0 +1,60 @@
+import numpy as np
+
+from sense.localizer.calibration.calibration import calibrate
+from sense.recordings.recorder import Recorder
+from sense.recordings.recording import Recording
+from sense.rig.planning.adaptive_plan import EVERY, Steering, uncertainty
+from sense.rig.planning.press_plan import PressPlan, planned
+from sense.rig.session.press_loop import Session
+from sense.settings import Localizer as LocalizerSettings
+from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
+
+
+def test_presses_go_where_errors_are_large_and_nothing_was_pressed():
+    known = np.array([[x, y] for x in range(-4, 5) for y in range(-4, 5)], float)
+    errors = np.where(known[:, 0] > 0, 5.0, 0.5)
+    here, there, beside = [3.5, 0.5], [-3.5, 0.5], [3.0, 0.05]
+    worth = uncertainty(np.array([here, there, beside]), known, errors, known)
+    assert worth[0] > 5 * worth[1]
+    assert worth[0] > 5 * worth[2]
+
+
+def test_what_there_is_to_learn_is_the_mean_error_of_five_presses_times_the_way_to_the_nearest():
+    known = np.column_stack([np.arange(1.0, 8.0), np.zeros(7)])
+    errors = np.array([1.0, 2.0, 3.0, 4.0, 10.0, 100.0, 1000.0])
+    worth = uncertainty(np.array([[0.0, 0.0], [1.0, 3.0]]), known, errors, known)
+    np.testing.assert_allclose(worth, [4.0 * 1, 4.0 * 3])
+    few = uncertainty(np.array([[0.0, 0.0]]), known[:2], errors[:2], np.array([[0.0, 0.5]]))
+    np.testing.assert_allclose(few, [1.5 * 0.5])
+
+
+def test_a_place_just_chosen_is_not_chosen_again():
+    known, errors = np.zeros((1, 2)), np.ones(1)
+    candidates = np.array([[3.0, 0.0], [-3.0, 0.0]])
+    first = uncertainty(candidates, known, errors, known)
+    again = uncertainty(candidates, known, errors, np.vstack([known, candidates[:1]]))
+    assert first[0] == first[1]
+    assert again[0] == 0 < again[1]
+
+
+def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
+    """Two presses in three of those chosen lie in the half of the pad the localizer never saw."""
+    time = Time()
+    arm = FakeArm(time)
+    options = RIG.model_copy(update={"presses": 60, "plan": "adaptive"})
+    plan = planned(PAD, options, np.random.default_rng(3))
+    learnt = planned(PAD, options, np.random.default_rng(4))
+    known = PressPlan(np.column_stack([-np.abs(learnt.places_mm[:, 0]), learnt.places_mm[:, 1]]), learnt.depths_mm)
+    converter = FakeConverter(arm)
+    with Recorder(tmp_path / "known", RIG.channels, {}, {}) as recorder:
+        Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(known)
+    small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=60, lost=0)
+    localizer, _ = calibrate(Recording.open(tmp_path / "known"), small)
+    with Recorder(tmp_path / "run", RIG.channels, {}, {}) as recorder:
+        steering = Steering(localizer, tmp_path / "run", np.random.default_rng(5))
+        Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(plan, steer=steering)
+    made = Recording.open(tmp_path / "run").presses_mm
+    assert np.array_equal(made[:EVERY], plan.places_mm[:EVERY])
+    assert (made[EVERY:] != plan.places_mm[EVERY:]).any(axis=1).all()
+    assert np.abs(made).max() <= np.abs(plan.places_mm).max()
+    assert (made[EVERY:, 0] > 0).mean() > 2 / 3

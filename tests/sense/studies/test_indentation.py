@@ -1,0 +1,121 @@
+"""The studies of force and shape, in small: what they find is better than guessing, and the same when resumed."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import InputError, Morphology
+from design.pad.indentation import Indenter
+from sense.studies.indentation import shape
+from sense.studies.indentation.force import COUNTS, force_study, readings
+from sense.studies.indentation.shape import FOOTPRINTS, SETS, shape_study
+from sense.studies.study import Study, lines, run
+
+PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
+
+
+def small_force() -> Study:
+    return force_study(PADS, presses=300, test=120, noise_counts=(1.0, 30.0), hidden=12, epochs=25)
+
+
+def small_shape() -> Study:
+    return shape_study(PADS, presses=500, test=200, hidden=12, epochs=25)
+
+
+@pytest.fixture(scope="module")
+def force(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    return run(small_force(), tmp_path_factory.mktemp("force"))
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    return run(small_shape(), tmp_path_factory.mktemp("shape"))
+
+
+def test_depth_and_force_are_found_better_than_guessed(force: dict) -> None:
+    for row in force["rows"]:
+        assert 0 < row["depth_mm"] < 0.7 * row["depth_guessed_mm"]
+        assert 0 < row["force_percent"] < 0.7 * row["force_guessed_percent"]
+        assert row["depth_mm"] == pytest.approx(11.25 * row["depth_grid"])
+        assert row["place_mm"] < 11.25 * 0.38  # the middle of the pad is that far off on average
+        assert row["place_one_depth_mm"] < row["place_mm"]
+
+
+def test_noise_costs_accuracy(force: dict) -> None:
+    for quiet, loud in zip(force["rows"][::2], force["rows"][1::2], strict=True):
+        assert quiet["pad"] == loud["pad"]
+        assert quiet["depth_mm"] < loud["depth_mm"]
+        assert quiet["place_one_depth_mm"] < loud["place_one_depth_mm"]
+
+
+def test_rows_are_alike_and_the_force_is_that_of_the_depth(force: dict) -> None:
+    assert len({tuple(row) for row in force["rows"]}) == 1
+    assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == [
+        (label, noise) for label in PADS for noise in (1.0, 30.0)
+    ]
+    curve, row, press = force["curves"][0], force["rows"][0], Indenter()
+    made, found = (press.force_n(np.array(curve[key]) / 11.25, 11.25) for key in ("pressed_mm", "found_mm"))
+    assert np.abs(found - made).mean() == pytest.approx(row["force_n"], rel=1e-3)
+    assert len(curve["place_mm"]) == len(curve["middles_mm"])
+
+
+def test_depths_an_indenter_does_not_allow_are_refused() -> None:
+    with pytest.raises(InputError, match=r"depth is 0\.9, allowed is 0 to the sphere's radius"):
+        force_study(PADS, depths=(0.1, 0.9))
+
+
+def test_readings_are_whole_counts_within_the_full_scale() -> None:
+    signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 2.0, 0.0]])
+    read = readings(signals, np.array([0.5, 1.0, 0.0]), 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(read, [[0, 2048, 0], [2048, COUNTS, 0], [COUNTS, COUNTS, 0]])
+    noisy = readings(np.full((4000, 1), 0.5), np.ones(1), 4.0, np.random.default_rng(0))
+    assert noisy.std() == pytest.approx(4, rel=0.1)
+
+
+def test_shapes_are_named_better_than_by_chance(shapes: dict) -> None:
+    assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, of) for label in PADS for of in SETS]
+    assert len({tuple(row) for row in shapes["rows"]}) == 1
+    for row, each in zip(shapes["rows"], shapes["confusions"], strict=True):
+        counts = np.array(each["counts"])
+        assert counts.sum() == 200
+        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 200)
+        assert row["accuracy_percent"] > row["guessed_percent"] + 5
+        assert row["worst_percent"] == pytest.approx((100 * np.diag(counts) / counts.sum(axis=1)).min())
+        assert row["worst"] in SETS[row["shapes"]]
+        assert 0 < row["place_mm"] < 11.25 * 0.38
+        assert 0 < row["place_shape_known_mm"] < 11.25 * 0.38
+
+
+def test_footprints_of_a_size_have_one_area() -> None:
+    for sides in FOOTPRINTS.values():
+        radius = shape._circumradius(sides)
+        area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
+        assert area == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize(("make", "expected"), [(small_force, "force"), (small_shape, "shapes")])
+def test_a_resumed_study_gives_the_same(
+    make: Callable[[], Study], expected: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    def broken_off(done: int, total: int, name: str) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(make(), tmp_path, jobs=1, progress=broken_off)
+    seen: list[int] = []
+    again = run(make(), tmp_path, resume=True, progress=lambda done, total, name: seen.append(done))
+    assert seen[0] >= 2
+    assert again == request.getfixturevalue(expected)
+
+
+@pytest.mark.parametrize("name", ["force", "shapes"])
+def test_a_study_is_told_in_a_table_sentences_and_json(name: str, request: pytest.FixtureRequest) -> None:
+    document = request.getfixturevalue(name)
+    json.dumps(document, allow_nan=False)
+    text = "\n".join(lines(document))
+    for row in document["rows"]:
+        assert row["pad"] in text

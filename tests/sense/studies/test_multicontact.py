@@ -1,0 +1,117 @@
+"""Several contacts at once, in small: pairs without an order are found better, and as well whichever is named first."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import Morphology, signals
+from design.common.computing import one_torch_thread
+from sense.studies.multicontact.pairs import LABELLED, WAYS, learnt, moments, pairs_of_moments, unordered_distances
+from sense.studies.multicontact.study import COUNTED, multicontact_study
+from sense.studies.study import Study, lines, run
+
+PADS = {"square": Morphology.straight(4), "random": Morphology.random(4, 3, 0)}
+BAR = 0.7
+"""Of the error of fixed labels, what that of a free order may be at most."""
+
+
+def small() -> Study:
+    return multicontact_study(PADS, presses=1500, test=300, hidden=20, members=2, epochs=20)
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    return run(small(), tmp_path_factory.mktemp("multicontact"))
+
+
+@pytest.fixture
+def places() -> np.ndarray:
+    return np.random.default_rng(1).uniform(1, 4, (400, 2, 2))
+
+
+def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels(document: dict) -> None:
+    rows = {(row["pad"], row["way"]): row for row in document["rows"]}
+    assert list(rows) == [(label, way) for label in PADS for way in [*WAYS, COUNTED]]
+    assert len({tuple(row) for row in document["rows"]}) == 1
+    for label, pad in PADS.items():
+        labelled = rows[label, LABELLED]
+        assert labelled["of_fixed_labels"] == 1
+        assert labelled["error_mm"] <= labelled["error_by_labels_mm"]
+        for way in ("free", "moments"):
+            row = rows[label, way]
+            assert 0 < row["error_grid"] < BAR * labelled["error_grid"]
+            assert row["of_fixed_labels"] == pytest.approx(row["error_grid"] / labelled["error_grid"])
+            assert row["error_mm"] == pytest.approx(pad.pitch_mm * row["error_grid"])
+            assert row["error_mm"] < row["midpoint_named_mm"]
+            assert row["error_by_labels_mm"] is None
+
+
+def test_the_error_by_distance_has_the_mean_of_the_table(document: dict) -> None:
+    located = [row for row in document["rows"] if row["way"] != COUNTED]
+    for row, curve in zip(located, document["curves"], strict=True):
+        assert (row["pad"], row["way"]) == (curve["pad"], curve["way"])
+        assert curve["apart_mm"] == sorted(curve["apart_mm"])
+        assert np.mean(curve["error_mm"]) == pytest.approx(row["error_mm"], rel=0.05)
+        assert np.mean(curve["apart_mm"]) / 2 == pytest.approx(row["midpoint_named_mm"], rel=0.05)
+        if row["told_apart_from_mm"] is not None:
+            at = curve["apart_mm"].index(row["told_apart_from_mm"])
+            assert np.all(np.array(curve["error_mm"]) < np.array(curve["apart_mm"]) / 4, where=np.arange(16) >= at)
+
+
+def test_contacts_are_counted_better_than_guessed(document: dict) -> None:
+    counted = [row for row in document["rows"] if row["way"] == COUNTED]
+    for row, each in zip(counted, document["confusions"], strict=True):
+        counts = np.array(each["counts"])
+        assert counts.shape == (4, 4)
+        assert counts.sum() == 300
+        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 300)
+        assert row["accuracy_percent"] > row["guessed_percent"] + 30
+        assert row["error_mm"] is None
+
+
+def test_the_error_does_not_depend_on_which_contact_is_named_first(places: np.ndarray) -> None:
+    found = np.random.default_rng(2).uniform(1, 4, places.shape)
+    off = unordered_distances(found, places)
+    np.testing.assert_allclose(unordered_distances(found[:, ::-1], places), off)
+    np.testing.assert_allclose(unordered_distances(found, places[:, ::-1]), off)
+    as_named = [np.linalg.norm(each - places, axis=2).mean(axis=1) for each in (found, found[:, ::-1])]
+    np.testing.assert_allclose(off, np.minimum(*as_named))
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_learnt_without_an_order_does_not_depend_on_it(way: str, places: np.ndarray) -> None:
+    given = signals(PADS["random"], places)
+    turned = np.where(np.random.default_rng(3).random((len(places), 1, 1)) < 0.5, places, places[:, ::-1])
+    with one_torch_thread():
+        found, again = (
+            learnt(WAYS[way], given, each, np.random.default_rng(0), members=2, hidden=8, epochs=10)(given)
+            for each in (places, turned)
+        )
+    assert np.allclose(found, again, atol=1e-6) == (way != LABELLED)
+
+
+def test_moments_hold_all_of_a_pair_but_its_order(places: np.ndarray) -> None:
+    np.testing.assert_array_equal(moments(places), moments(places[:, ::-1]))
+    assert unordered_distances(pairs_of_moments(moments(places)), places).max() < 1e-7
+
+
+def test_a_resumed_study_gives_the_same(document: dict, tmp_path: Path) -> None:
+    def broken_off(done: int, total: int, name: str) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(small(), tmp_path, jobs=1, progress=broken_off)
+    seen: list[int] = []
+    again = run(small(), tmp_path, resume=True, progress=lambda done, total, name: seen.append(done))
+    assert seen[0] >= 3
+    assert again == document
+
+
+def test_the_study_is_told_in_a_table_sentences_and_json(document: dict) -> None:
+    json.dumps(document, allow_nan=False)
+    text = "\n".join(lines(document))
+    for label in PADS:
+        assert f"{label}: " in text
