@@ -114,7 +114,7 @@ def test_imports_stay_light(module, heavy):
 
 def test_a_build_without_step_and_png_loads_neither_cad_nor_plots(morphology, tmp_path):
     code = (
-        "import sys; from pathlib import Path; from design.morphology import Morphology; import fabricate;"
+        "import sys; from pathlib import Path; from design.pad.morphology import Morphology; import fabricate;"
         f"fabricate.build(Morphology.load({str(morphology)!r}), Path({str(tmp_path)!r}), ['stl', '3mf', 'svg']);"
         "print(*(name for name in ('build123d', 'OCP', 'torch', 'matplotlib') if name in sys.modules))"
     )

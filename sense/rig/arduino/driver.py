@@ -20,7 +20,7 @@ FIRMWARE_MAJOR = 1
 """Boards with another first number of the firmware version speak another wire format."""
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 
-_FIRMWARE = "sense/rig/firmware/padforge_due"
+_FIRMWARE = "sense/rig/arduino/firmware/padforge_due"
 _ANSWER_S = 1.0
 _SETTLE_S = 0.5
 """Blocks gathered before the first reading is given, so that its time rests on more than one arrival."""

@@ -8,7 +8,7 @@ import pytest
 from design.common.computing import forget_outdated
 
 KERNELS = {
-    "__init__.py": "from pathlib import Path\nfrom design.compiled import forget_outdated\n"
+    "__init__.py": "from pathlib import Path\nfrom design.common.computing import forget_outdated\n"
     "forget_outdated(Path(__file__).parent)\n",
     "inner.py": "from numba import njit\n@njit(cache=True)\ndef inner(x):\n    return x + 1\n",
     "outer.py": "from numba import njit\nfrom .inner import inner\n@njit(cache=True)\ndef outer(x):\n"

@@ -8,7 +8,7 @@ import pytest
 from design.common.errors import InputError
 from design.common.files import claimed, refuse_unwritable, staged
 
-CLAIM = "import sys\nfrom pathlib import Path\nfrom design.output import claimed\n"
+CLAIM = "import sys\nfrom pathlib import Path\nfrom design.common.files import claimed\n"
 ANOTHER = CLAIM + "try:\n  with claimed(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
 
 

@@ -77,7 +77,7 @@ def test_an_end_from_outside_is_as_ctrl_c_unless_it_is_ignored():
     """As under nohup, which ignores that the terminal hangs up."""
     code = (
         "import signal\n"
-        "from design.endings import _prepare\n"
+        "from design.common.command_line import _prepare\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "_prepare()\n"
         "print(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN)\n"

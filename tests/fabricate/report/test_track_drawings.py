@@ -179,11 +179,11 @@ def test_dxf_is_sound_and_complete(tmp_path):
 
 def test_dxf_is_the_same_in_every_process():
     script = (
-        "import sys; from design.morphology import Morphology; from fabricate.outlines import Plan;"
-        " from fabricate import tracks; assert 'ezdxf' not in sys.modules;"
-        " sys.stdout.write(tracks.tracks_dxf(Plan(Morphology.random(3, 3, seed=7))))"
+        "import sys; from design.pad.morphology import Morphology; from fabricate.mould.plan import Plan;"
+        " from fabricate.report import track_drawings; assert 'ezdxf' not in sys.modules;"
+        " sys.stdout.write(track_drawings.tracks_dxf(Plan(Morphology.random(3, 3, seed=7))))"
     )
-    folder, before = Path(__file__).resolve().parents[2], ezdxf.options.write_fixed_meta_data_for_testing
+    folder, before = Path(__file__).resolve().parents[3], ezdxf.options.write_fixed_meta_data_for_testing
     here = tracks_dxf(Plan(PAD))
     assert ezdxf.options.write_fixed_meta_data_for_testing == before
     for seed in "14":  # sets of strings have an order of their own with each

@@ -253,7 +253,7 @@ def test_mistakes_are_one_line_and_leave_nothing(arguments: list[str], said: str
     done = subprocess.run(
         [sys.executable, "-m", "padforge", "study", *arguments, "--out", "out"],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
         capture_output=True,
         text=True,
         check=False,
@@ -269,7 +269,7 @@ def test_an_interrupt_ends_at_once_and_keeps_what_was_finished(tmp_path: Path) -
     command = [sys.executable, "-m", "padforge", "study", "robustness", "square", "--presses", "4096"]
     study = subprocess.Popen(
         [*command, "--out", str(out)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,

@@ -133,7 +133,7 @@ def test_a_killed_recorder_resumes_to_the_whole_plan(tmp_path):
         f"{key} = {value}\n" for key, value in QUICK.items()
     )
     (tmp_path / "pad.toml").write_text(settings, encoding="utf-8")
-    root = Path(__file__).parents[3]
+    root = Path(__file__).parents[4]
     command = [sys.executable, str(root / "padforge.py"), *["sense", "record", "--through-drivers", "--presses", "8"]]
     command += ["--out", "run", "--resume"]
     environment = os.environ | {"PYTHONPATH": str(root)}

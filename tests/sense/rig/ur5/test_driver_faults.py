@@ -96,8 +96,8 @@ def test_the_child_dies_or_hangs(robot: UrEmulator, arm: UR5, name: str) -> None
 
 PARENT = f"""
 import time
-from sense.rig.ur5 import UR5
-from sense.rig.ur_controller import Series
+from sense.rig.ur5.driver import UR5
+from sense.rig.emulators.ur_controller import Series
 arm = UR5("{HOST}")
 arm.connect()
 arm.move({LOW}, 50, 500)
