@@ -28,12 +28,26 @@ from sense.cli.main import sense
 from sense.studies.cli import study
 
 if TYPE_CHECKING:
-    from design.common.settings import Section, Spec
+    from design.common.settings import Settings, Spec
+
+
+SECTIONS = {
+    "pad": "design.settings:PadSettings",
+    "contact": "design.settings:Contact",
+    "search": "design.settings:SearchSettings",
+    "rules": "design.settings:RulesSettings",
+    "mould": "fabricate.settings:MouldSettings",
+    "printer": "fabricate.settings:PrinterSettings",
+    "rig": "sense.settings:RigSettings",
+    "localizer": "sense.settings:LocalizerSettings",
+}
+"""The sections of a `pad.toml`, and where the settings of each are."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="padforge")
-def cli() -> None:
+@click.pass_context
+def cli(context: click.Context) -> None:
     """From an idea to a calibrated soft strain-sensor pad.
 
     \b
@@ -43,6 +57,7 @@ def cli() -> None:
     padforge sense calibrate out/pad/recording       learn places from presses
     padforge study robustness                        the paper's figures, for pads of your own
     """
+    context.obj = list(SECTIONS)
 
 
 cli.add_command(design)
@@ -144,7 +159,7 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
     from dataclasses import asdict
     from pkgutil import resolve_name
 
-    from design.benchmarking.comparison import compared, lines, read_earlier
+    from design.benchmarking.comparison import compared, comparison_lines, read_earlier
     from design.benchmarking.suite import run_benches
     from design.benchmarking.table import bench_lines, summary_lines
 
@@ -157,45 +172,43 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
         benches = [resolve_name(BENCHES[name]) for name in dict.fromkeys(chosen)]
         summary, changes = run_benches(benches, out, lambda step: bar.update(task, note=step), before)
     tables = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
-    verdict = ["", *lines(changes, compared(before, summary["benches"]))] if against else []
+    verdict = ["", *comparison_lines(changes, compared(before, summary["benches"]))] if against else []
     document = summary | {"worse": [asdict(change) for change in changes]}
     show_result(document, [*tables, *summary_lines(summary["summary"]), *verdict], as_json)
     context.exit(int(bool(changes)))
 
 
-def _sections() -> "dict[str, type[Section]]":
-    from design.settings import MODELS as DESIGN
-    from fabricate.settings import MODELS as FABRICATE
-    from sense.settings import MODELS as SENSE
+def _sections() -> "dict[str, type[Settings]]":
+    from pkgutil import resolve_name
 
-    return DESIGN | FABRICATE | SENSE
+    return {name: resolve_name(where) for name, where in SECTIONS.items()}
 
 
 def _check_ahead(spec: "Spec", out: Path) -> None:
     """Refuse what would fail only after minutes of work: any section, sections that do not fit, a real recording."""
     import numpy as np
 
-    from design.settings import Pad
-    from fabricate import Settings
+    from design.settings import PadSettings
+    from fabricate import FabricationSettings
     from sense.localizer.calibration.calibration import split_presses
-    from sense.settings import Localizer, Rig
+    from sense.settings import LocalizerSettings, RigSettings
 
     for model in _sections().values():
         spec.section(model)
-    Settings.from_spec(spec).require_consistent(spec.section(Pad).pitch_mm)
-    learning = spec.section(Localizer)
-    split_presses(spec.section(Rig).presses, learning.split, learning.test_share, np.random.default_rng(0))
+    FabricationSettings.from_spec(spec).require_consistent(spec.section(PadSettings).pitch_mm)
+    learning = spec.section(LocalizerSettings)
+    split_presses(spec.section(RigSettings).presses, learning.split, learning.test_share, np.random.default_rng(0))
     _require_replaceable(out / "recording")
 
 
 def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     """All stages into `out`, each with its summary on stdout; the exit code: 0, 1 if a rule or check fails, or 130."""
     from design.cli import run_search
-    from design.cli import summary as design_summary
-    from fabricate import Settings, build
-    from fabricate.cli import summary as mould_summary
+    from design.cli import search_lines as design_summary
+    from fabricate import FabricationSettings, build
+    from fabricate.cli import mould_lines as mould_summary
+    from sense.cli.calibration import calibration_lines as calibration_summary
     from sense.cli.calibration import run_calibration
-    from sense.cli.calibration import summary as calibration_summary
     from sense.cli.rig import run_recording
 
     seeds = {"seed": seed}
@@ -204,7 +217,7 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     if found.stopped:
         return INTERRUPTED
     written = [out / "morphology.json"]
-    mould = build(found.morphology, out, settings=Settings.from_spec(spec), inputs=written)
+    mould = build(found.morphology, out, settings=FabricationSettings.from_spec(spec), inputs=written)
     click.echo("\n".join(mould_summary(mould, out)))
     recorded = out / "recording"
     _require_replaceable(recorded)
@@ -240,7 +253,7 @@ def write_report(folder: Path) -> Path:
         InputError: no stage has left anything, or a file is damaged.
     """
     from design.common.files import read_json, write_text
-    from design.common.page.elements import Section, page
+    from design.common.page.elements import PageSection, page
     from design.report.sections import design_sections, origin, provenance_section
     from fabricate.report.sections import fabrication_sections
     from sense.report import sections as sensed
@@ -252,7 +265,7 @@ def write_report(folder: Path) -> Path:
         ("calibration", folder / "calibration.json", sensed.calibration_sections),
         ("robustness", folder / "robustness.json", sensed.robustness_sections),
     )
-    sections: list[Section] = []
+    sections: list[PageSection] = []
     origins: list[list[object]] = []
     for name, path, made_of in stages:
         if path.exists():
@@ -268,7 +281,7 @@ def write_report(folder: Path) -> Path:
     if not origins:
         raise InputError(f"{folder}: no design.json, fabrication.json, calibration.json or study to report on")
     if studies:
-        sections.append(Section("Studies", studies))
+        sections.append(PageSection("Studies", studies))
     lead = "Fibres, mould and calibration of one soft strain-sensor pad."
     title = f"Pad report: {folder.resolve().name}"
     write_text(folder / "report.html", page(title, lead, [*sections, provenance_section(origins)]))

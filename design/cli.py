@@ -79,7 +79,7 @@ def design(
         document, result = run_search(
             load_spec(spec), out, overrides, origin, time_budget=time_budget, resume=resume, executor=executor
         )
-    show_result(document, summary(result, out), as_json)
+    show_result(document, search_lines(result, out), as_json)
     context.exit(INTERRUPTED if result.stopped == "interrupted" else 1 if result.violations else 0)
 
 
@@ -99,16 +99,16 @@ def run_search(
     from design.pad.morphology import Morphology
     from design.report.plan_drawing import draw_plan
 
-    from .settings import Contact, Pad, Rules, Search
+    from .settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-    pad, contact, rules = spec.section(Pad), spec.section(Contact), spec.section(Rules)
+    pad, contact, rules = spec.section(PadSettings), spec.section(Contact), spec.section(RulesSettings)
     begin, inputs = None, []
     if origin == "straight":
         begin = Morphology.straight(pad.grid, pad.pitch_mm)
     elif origin != "random":
         begin, inputs = Morphology.load(origin), [Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
-    settings = spec.section(Search, **overrides)
+    settings = spec.section(SearchSettings, **overrides)
     with progress() as bar:
         tasks: dict[str, Any] = {}
         best: list[float] = []
@@ -165,7 +165,7 @@ def cluster(address: str | None) -> "Iterator[Executor | None]":
         yield executor
 
 
-def summary(result: "SearchResult", out: Path) -> list[str]:
+def search_lines(result: "SearchResult", out: Path) -> list[str]:
     """What a person wants to know of a search, in a few lines."""
     spread = [v for name, v in result.terms.items() if name.startswith("ambiguity")]
     lost = " / ".join(f"{value:.3f}" for value in spread)
@@ -192,17 +192,17 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     """
     from design.common.errors import InputError
     from design.common.figures import save_figure
-    from design.criteria.rules import check as check_rules
+    from design.criteria.rules import check_rules
     from design.pad.morphology import Morphology
     from design.report.plan_drawing import draw_plan
 
-    from .settings import Contact, Rules
+    from .settings import Contact, RulesSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
     path = out or Path(f"{morphology.stem}.svg")
     if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
-    save_figure(draw_plan(pad, settings.section(Contact), check_rules(pad, settings.section(Rules))), path)
+    save_figure(draw_plan(pad, settings.section(Contact), check_rules(pad, settings.section(RulesSettings))), path)
     click.echo(f"plan -> {path}")
 
 
@@ -217,12 +217,12 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     \b
     padforge design check out/pad/morphology.json
     """
-    from design.criteria.rules import check as check_rules
+    from design.criteria.rules import check_rules
     from design.pad.morphology import Morphology
 
-    from .settings import Rules
+    from .settings import RulesSettings
 
-    found = check_rules(Morphology.load(morphology), load_spec(spec).section(Rules))
+    found = check_rules(Morphology.load(morphology), load_spec(spec).section(RulesSettings))
     lines = [str(violation) for violation in found] or ["all rules hold"]
     show_result({"violations": [asdict(violation) for violation in found]}, lines, as_json)
     context.exit(1 if found else 0)
@@ -237,14 +237,18 @@ def score(morphology: Path, spec: Path | None) -> None:
     \b
     padforge design score out/pad/morphology.json
     """
-    from design.criteria.rules import check as check_rules
+    from design.criteria.rules import check_rules
     from design.criteria.score import score as score_terms
     from design.pad.morphology import Morphology
 
-    from .settings import Contact, Rules, Search
+    from .settings import Contact, RulesSettings, SearchSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
-    contact, search, rules = settings.section(Contact), settings.section(Search), settings.section(Rules)
+    contact, search, rules = (
+        settings.section(Contact),
+        settings.section(SearchSettings),
+        settings.section(RulesSettings),
+    )
     terms = score_terms(pad, contact, search.lost, search.noise, rules)
     found = [asdict(violation) for violation in check_rules(pad, rules)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)

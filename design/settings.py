@@ -1,16 +1,13 @@
-"""`pad.toml`: reading, validating and writing settings, and the sections that design owns.
-
-Each package declares its sections as `Section` models; this module reads one file for all of them.
-"""
+"""The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
 
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, field_validator
 
-from design.common.settings import Section
+from design.common.settings import Settings
 
 
-class Pad(Section):
+class PadSettings(Settings):
     """`[pad]`: what the pad is."""
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
@@ -32,7 +29,7 @@ Sides = Annotated[
 ]
 
 
-class Contact(Section):
+class Contact(Settings):
     """`[contact]`: what a press deforms, a regular polygon or circle around its centre, and how a fibre answers.
 
     The signal of a fibre is the integral of `weight` over its length inside the shape (paper, formulas (1), (2)).
@@ -68,7 +65,7 @@ Lost = Annotated[
 ]
 
 
-class Search(Section):
+class SearchSettings(Settings):
     """`[search]`: how the fibres are found.
 
     Attributes:
@@ -114,7 +111,7 @@ MaxCrossings = Annotated[
 ]
 
 
-class Rules(Section):
+class RulesSettings(Settings):
     """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`rules.check` has the formulas).
 
     Attributes:
@@ -138,6 +135,3 @@ class Rules(Section):
     )
     border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
     max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
-
-
-MODELS: dict[str, type[Section]] = {"pad": Pad, "contact": Contact, "search": Search, "rules": Rules}

@@ -4,6 +4,6 @@ from .checks.plan_checks import check as check
 from .export import build as build
 from .mould.assembly import build_mould as build_mould
 from .mould.plan import Plan as Plan
-from .settings import Mould as Mould
-from .settings import Printer as Printer
-from .settings import Settings as Settings
+from .settings import FabricationSettings as FabricationSettings
+from .settings import MouldSettings as MouldSettings
+from .settings import PrinterSettings as PrinterSettings

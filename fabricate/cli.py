@@ -59,18 +59,18 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     from design.pad.morphology import Morphology
 
     from .export import build as build_files
-    from .settings import Settings
+    from .settings import FabricationSettings
 
-    settings = Settings.from_spec(load_spec(spec))
+    settings = FabricationSettings.from_spec(load_spec(spec))
     pad = Morphology.load(morphology)
     folder = out or (Path("out") / morphology.stem if morphology.suffix == ".mat" else morphology.parent)
     wanted = [name.strip() for name in formats.split(",") if name.strip()]
     with claimed(folder):
         document = build_files(pad, folder, wanted, settings, [path for path in (morphology, spec) if path])
-    show_result(document, summary(document, folder), as_json)
+    show_result(document, mould_lines(document, folder), as_json)
 
 
-def summary(document: dict[str, Any], out: Path) -> list[str]:
+def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
     """What a person wants to know of a mould, in a few lines: where it is, and what to look at."""
     size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     remarks = [finding for finding in document["findings"] if finding["status"] != "pass"]
@@ -106,9 +106,9 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     from fabricate.mould.plan import Plan
     from fabricate.report import pictures as drawings
 
-    from .settings import Settings
+    from .settings import FabricationSettings
 
-    settings = Settings.from_spec(load_spec(spec))
+    settings = FabricationSettings.from_spec(load_spec(spec))
     if mesh_or_morphology.suffix.lower() in MESHES:
         vertices, triangles = soundness.read_mesh(mesh_or_morphology)
         findings = soundness.inspect_mesh(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)

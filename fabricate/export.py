@@ -35,7 +35,7 @@ from fabricate.report import pictures as drawings
 from fabricate.report import track_drawings as tracks
 
 from . import mesh_files as writers
-from .settings import DEFAULTS, Settings
+from .settings import DEFAULTS, FabricationSettings
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -64,7 +64,7 @@ def build(
     pad: Morphology,
     out: str | Path,
     formats: Sequence[str] = ("stl", "step", "svg", "png"),
-    settings: Settings = DEFAULTS,
+    settings: FabricationSettings = DEFAULTS,
     inputs: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Make the mould of a pad and write it, with the lid and the second mould the settings ask for.
@@ -109,7 +109,7 @@ def build(
     for name, write in writes:
         with profiling.stage(f"write {name}"), atomic(out / name) as temporary:
             write(temporary)
-    write_text(out / "laying.md", laying.page(document))
+    write_text(out / "laying.md", laying.laying_page(document))
     write_json(out / "fabrication.json", document)
     return document
 

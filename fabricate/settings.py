@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from design.common.errors import InputError, instance
-from design.common.settings import Section, Spec
-from design.settings import Pad, Rules
+from design.common.settings import Settings, Spec
+from design.settings import PadSettings, RulesSettings
 
 
-class Mould(Section):
+class MouldSettings(Settings):
     """`[mould]`: the tray the silicone is cast in and the ridges that leave the tracks.
 
     The pad is cast with its tracks down: a taller ridge leaves a track deeper in the silicone. The defaults keep
@@ -55,7 +55,7 @@ class Mould(Section):
         return self.deep_ridge_height_mm - self.shallow_ridge_height_mm
 
 
-class Printer(Section):
+class PrinterSettings(Settings):
     """`[printer]`: what the mould is printed on."""
 
     nozzle_mm: float = Field(default=0.4, ge=0.01, le=5, description="nozzle diameter (resin: pixel size), mm")
@@ -72,26 +72,34 @@ class Printer(Section):
 STEP_MM = 0.03
 """Width of the terraces of a tapered ridge: no wider than what printers place a line by."""
 
-MODELS: dict[str, type[Section]] = {"mould": Mould, "printer": Printer}
-
 
 @dataclass(frozen=True)
-class Settings:
+class FabricationSettings:
     """All that shapes a mould beside the morphology; of `[pad]` only the fibre and the deep family are used."""
 
-    mould: Mould = field(default_factory=Mould)
-    printer: Printer = field(default_factory=Printer)
-    pad: Pad = field(default_factory=Pad)
-    rules: Rules = field(default_factory=Rules)
+    mould: MouldSettings = field(default_factory=MouldSettings)
+    printer: PrinterSettings = field(default_factory=PrinterSettings)
+    pad: PadSettings = field(default_factory=PadSettings)
+    rules: RulesSettings = field(default_factory=RulesSettings)
 
     def __post_init__(self) -> None:
-        for name, model in (("mould", Mould), ("printer", Printer), ("pad", Pad), ("rules", Rules)):
+        for name, model in (
+            ("mould", MouldSettings),
+            ("printer", PrinterSettings),
+            ("pad", PadSettings),
+            ("rules", RulesSettings),
+        ):
             instance(name, getattr(self, name), model)
 
     @classmethod
-    def from_spec(cls, spec: Spec) -> "Settings":
+    def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """The sections of one `pad.toml`."""
-        return cls(spec.section(Mould), spec.section(Printer), spec.section(Pad), spec.section(Rules))
+        return cls(
+            spec.section(MouldSettings),
+            spec.section(PrinterSettings),
+            spec.section(PadSettings),
+            spec.section(RulesSettings),
+        )
 
     @property
     def flare_mm(self) -> float:
@@ -135,7 +143,7 @@ class Settings:
             raise InputError("[mould] spout: got true, allowed only with lid = true, which it is a part of")
 
 
-DEFAULTS = Settings()
+DEFAULTS = FabricationSettings()
 
 
 def _require_less(key: str, value: float, bound: float, name: str) -> None:

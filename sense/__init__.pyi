@@ -3,8 +3,8 @@ from .health.monitor import Monitor as Monitor
 from .health.monitor import examine as examine
 from .live.pipeline import Live as Live
 from .localizer.calibration.calibration import calibrate as calibrate
-from .localizer.calibration.fibre_loss_study import robustness as robustness
-from .localizer.calibration.learning_curve import size_curve as size_curve
+from .localizer.calibration.fibre_loss_study import fibre_loss_study as fibre_loss_study
+from .localizer.calibration.learning_curve import learning_curve as learning_curve
 from .localizer.calibration.recalibration import recalibrate as recalibrate
 from .localizer.evaluation import evaluate as evaluate
 from .localizer.localizer import Found as Found
@@ -24,4 +24,4 @@ from .recordings.import_export import open_recording as open_recording
 from .recordings.recorder import Recorder as Recorder
 from .recordings.recording import Recording as Recording
 from .recordings.simulation import simulate as simulate
-from .settings import Rig as Rig
+from .settings import RigSettings as RigSettings

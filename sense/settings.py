@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer
 
-from design.common.settings import Section
+from design.common.settings import Settings
 
 Features = Literal["full", "causal", "early", "published"]
 Method = Literal["masked", "published"]
@@ -25,7 +25,7 @@ Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Depth = Annotated[float, Field(gt=0, le=50)]
 
 
-class Rig(Section):
+class RigSettings(Settings):
     """`[rig]`: how presses are recorded, where a real arm may go, and how the simulated pad answers.
 
     Attributes:
@@ -82,7 +82,7 @@ class Rig(Section):
     max_force_n: float = Field(default=60.0, gt=0, le=250, description="force at which the arm is stopped, N")
 
 
-class Localizer(Section):
+class LocalizerSettings(Settings):
     """`[localizer]`: how places are learnt from readings."""
 
     method: Method = Field(
@@ -103,6 +103,3 @@ class Localizer(Section):
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     rate: float = Field(default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")
-
-
-MODELS: dict[str, type[Section]] = {"rig": Rig, "localizer": Localizer}

@@ -6,11 +6,12 @@ from typing import Any
 import pytest
 
 from design import InputError, Spec
+from design.common.settings import Settings
 
 
-def require_ends(model: type, key: str, kept: Iterable[Any], refused: Iterable[Any]) -> None:
+def require_ends(model: type[Settings], key: str, kept: Iterable[Any], refused: Iterable[Any]) -> None:
     """See that a key of a section takes the values `kept`, and that each of those `refused` is named."""
-    name = model.__name__.lower()
+    name = model.section()
     for value in kept:
         Spec({name: {key: value}}).section(model)
     for value in refused:

@@ -17,7 +17,7 @@ from design.common.figures import save_figure
 from design.common.files import provenance
 from design.pad.morphology import Morphology
 from design.report.plan_drawing import draw_plan
-from design.settings import Contact, Pad, Rules, Search
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 from fabricate import build
 from fabricate.report.mould_view import Packed, packed
 from padforge import write_report
@@ -34,7 +34,7 @@ def written(path: Path, document: dict) -> None:
 
 
 def design_document() -> dict:
-    used = {"pad": Pad(grid=2), "contact": Contact(), "search": Search(), "rules": Rules()}
+    used = {"pad": PadSettings(grid=2), "contact": Contact(), "search": SearchSettings(), "rules": RulesSettings()}
     settings = {name: section.model_dump(mode="json") for name, section in used.items()}
     return {
         "format": "padforge-design/1",

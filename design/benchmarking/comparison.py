@@ -110,7 +110,7 @@ def compared(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[
     )
 
 
-def lines(changes: Sequence[Change], trials: int) -> list[str]:
+def comparison_lines(changes: Sequence[Change], trials: int) -> list[str]:
     """A comparison for people."""
     if not changes:
         return [f"{trials} trials compared: none slower, less accurate or looking at more"]

@@ -31,7 +31,7 @@ AGREE = 1.04
 
 
 @dataclass(frozen=True)
-class Trial:
+class BenchTrial:
     """One measurement to take.
 
     Attributes:
@@ -72,7 +72,7 @@ class Bench:
     """
 
     name: str
-    trials: Callable[[], Iterator[Trial]]
+    trials: Callable[[], Iterator[BenchTrial]]
     error: str
     reference: tuple[str, float]
     best: tuple[str, float]

@@ -26,18 +26,33 @@ spec_option = click.option(
     help="Settings file (default: pad.toml in the current folder, if there is one).",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
-seed_option = click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice.")
+seed_option = click.option(
+    "--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice (default: that of the settings, 0)."
+)
 
 
-def out_option(default: str) -> Callable[..., Any]:
-    """`--out DIR`, the folder results go to."""
+def out_option(default: str = "", what: str = "Folder for the results", file: bool = False) -> Callable[..., Any]:
+    """`--out`, the folder (or file) results go to: unless `default` names one, a command takes that of `pad_folder`."""
     return click.option(
         "--out",
-        type=click.Path(file_okay=False, path_type=Path),
-        default=default,
-        show_default=True,
-        help="Folder for the results.",
+        type=click.Path(file_okay=file, dir_okay=not file, path_type=Path),
+        default=default or None,
+        help=f"{what} (default: {default or 'in the folder of the pad'}).",
     )
+
+
+def pad_folder(source: Path | None = None) -> Path:
+    """The one rule for where results go that no `--out` says: to the folder of the pad they belong to.
+
+    Args:
+        source: what a command is given. A morphology.json or a recording's folder lies in the folder of its pad; a file
+            from elsewhere, NAME.mat, makes one of its own, out/NAME; without any it is out/pad.
+    """
+    if source is None:
+        return Path("out/pad")
+    if source.is_dir() or source.suffix.lower() == ".json":
+        return source.parent if source.name not in ("", "..") else source.resolve().parent
+    return Path("out") / source.stem
 
 
 def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -60,11 +75,14 @@ def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def load_spec(path: Path | None) -> "Spec":
-    """The settings file named, else `pad.toml` here if there is one, else the defaults."""
+    """The settings file named, else `pad.toml` here if there is one, else the defaults.
+
+    Sections are those that the front door has put into its context, or any.
+    """
     from .settings import Spec
 
-    here = Path("pad.toml")
-    return Spec.load(path or (here if here.exists() else None))
+    here, context = Path("pad.toml"), click.get_current_context(silent=True)
+    return Spec.load(path or (here if here.exists() else None), context.find_root().obj if context else None)
 
 
 @contextmanager

@@ -1,5 +1,7 @@
+"""`pad.toml`: reading, validating and writing settings. Which sections there are is for those who own them to say."""
+
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,11 +17,8 @@ MOST_BYTES = 2**18
 MOST_DOTS = 200
 """In a line: keys of very many parts take the reader of TOML time that grows with their square."""
 
-SECTIONS = ("pad", "contact", "search", "rules", "mould", "printer", "rig", "localizer")
-"""Every section a `pad.toml` may have, whichever package owns it."""
 
-
-class Section(BaseModel):
+class Settings(BaseModel):
     """One table of `pad.toml`: immutable, no unknown keys, no NaN; a field's description is its comment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
@@ -28,22 +27,37 @@ class Section(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise _finding(error, type(self), f"[{type(self).__name__.lower()}]") from error
+            raise _finding(error, type(self), f"[{self.section()}]") from error
+
+    @classmethod
+    def section(cls) -> str:
+        """The name of its table: the model's, without `Settings`."""
+        return cls.__name__.removesuffix("Settings").lower()
 
     __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]  else tables within go there too
 
 
-AnySection = TypeVar("AnySection", bound=Section)
+AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 class Spec:
-    """The content of a `pad.toml`: `spec.section(Pad)` is that section, validated, with defaults filled in."""
+    """The content of a `pad.toml`: `spec.section(PadSettings)` is that section, validated, with defaults filled in.
 
-    def __init__(self, tables: Mapping[str, Mapping[str, Any]], source: str = "built-in defaults") -> None:
+    Args:
+        tables: sections by name. source: what errors call them.
+        sections: names that are allowed; any if None.
+    """
+
+    def __init__(
+        self,
+        tables: Mapping[str, Mapping[str, Any]],
+        source: str = "built-in defaults",
+        sections: Collection[str] | None = None,
+    ) -> None:
         mapping("tables", tables)
-        unknown = [name for name in tables if name not in SECTIONS]
+        unknown = [name for name in tables if sections is not None and name not in sections]
         if unknown:
-            raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(SECTIONS)}")
+            raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(sections or ())}")
         for name, table in tables.items():
             if not isinstance(table, Mapping):
                 raise InputError(f"{source}: {name} is {shown(table)}, expected a section [{name}]")
@@ -52,8 +66,8 @@ class Spec:
         self._tables = tables
 
     @classmethod
-    def load(cls, path: Path | None) -> "Spec":
-        """Read a TOML file; None stands for the defaults.
+    def load(cls, path: Path | None, sections: Collection[str] | None = None) -> "Spec":
+        """Read a TOML file with the `sections` allowed, or any; None stands for the defaults.
 
         Raises:
             InputError: the file is missing, is no TOML, or has an unknown section.
@@ -68,27 +82,27 @@ class Spec:
             tables = tomllib.loads(content.decode("utf-8-sig"))
         except (ValueError, RecursionError) as error:  # tables within tables without end
             raise InputError(f"{path}: not a TOML file ({error})") from error
-        return cls(tables, str(path))
+        return cls(tables, str(path), sections)
 
-    def section(self, model: type[AnySection], **overrides: Any) -> AnySection:
+    def section(self, model: type[AnySettings], **overrides: Any) -> AnySettings:
         """The section `model` stands for; `overrides` that are not None win over the file.
 
         Raises:
             InputError: an unknown key or a value out of range, naming the key, the value and what is allowed.
         """
-        if not (isinstance(model, type) and issubclass(model, Section)):
+        if not (isinstance(model, type) and issubclass(model, Settings)):
             raise InputError(f"model is {shown(model)}, expected a section such as Pad")
-        name = model.__name__.lower()
+        name = model.section()
         given = {key: value for key, value in overrides.items() if value is not None}
         return validated(model, {**self._tables.get(name, {}), **given}, f"{self.source}: [{name}]")
 
 
-def section(name: str, value: AnySection | None, model: type[AnySection]) -> AnySection:
+def or_default(name: str, value: AnySettings | None, model: type[AnySettings]) -> AnySettings:
     """The argument `name` of a public function: a section, or its defaults for None."""
     return model() if value is None else instance(name, value, model)
 
 
-def validated(model: type[AnySection], values: Mapping[str, Any], where: str) -> AnySection:
+def validated(model: type[AnySettings], values: Mapping[str, Any], where: str) -> AnySettings:
     """`model(**values)`, with pydantic's findings as one InputError line that begins with `where`."""
     try:
         return model.model_validate(dict(values))
@@ -96,7 +110,7 @@ def validated(model: type[AnySection], values: Mapping[str, Any], where: str) ->
         raise _finding(error, model, where) from error
 
 
-def _finding(error: ValidationError, model: type[Section], where: str) -> InputError:
+def _finding(error: ValidationError, model: type[Settings], where: str) -> InputError:
     """The first of pydantic's findings on a `model` as one line that begins with `where`."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
@@ -106,7 +120,7 @@ def _finding(error: ValidationError, model: type[Section], where: str) -> InputE
     return InputError(f"{where} {key}: got {shown(first['input'])}, {first['msg'].lower()}")
 
 
-def commented_toml(models: Mapping[str, type[Section]]) -> str:
+def commented_toml(models: Mapping[str, type[Settings]]) -> str:
     """A `pad.toml` that states every default, with each field's description as its comment."""
     lines = ["# padforge settings. Every key is optional; what stands here is the default."]
     for name, model in models.items():

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from design.benchmarking.harness import Bench, Trial
+from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.benchmark import KNOTS, PUBLISHED, SAMPLES, plain_signals
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
 from design.settings import Contact
 
-from .information import disorder_area, joint_entropy, quantize, sharpness
+from .information import disorder_area, joint_entropy, published_sharpness, quantize
 from .published_objective import published_objective, published_presses
 
 
-def trials() -> Iterator[Trial]:
+def trials() -> Iterator[BenchTrial]:
     """The objective of random pads; C grows with the samples, so its weight is scaled to what it is at 2000."""
     for knots in KNOTS:
         pad, case = Morphology.random(4, knots, seed=knots), f"N={knots}"
@@ -29,10 +29,10 @@ def trials() -> Iterator[Trial]:
         for samples in SAMPLES:
             gamma = 5e-6 * (PUBLISHED - 1) / (samples - 1)
             weights = (1.0, 1e-7, gamma)
-            yield Trial(case, "plain", samples, partial(plain_objective, pad, samples, gamma), judge)
+            yield BenchTrial(case, "plain", samples, partial(plain_objective, pad, samples, gamma), judge)
             compiled = partial(published_objective, pad, samples=samples, weights=weights)
-            yield Trial(case, "compiled", samples, compiled, judge)
-        yield Trial(case, "exact", 0, partial(exact_objective, pad))  # what the errors are of
+            yield BenchTrial(case, "compiled", samples, compiled, judge)
+        yield BenchTrial(case, "exact", 0, partial(exact_objective, pad))  # what the errors are of
 
 
 def exact_objective(pad: Morphology) -> float:
@@ -40,7 +40,7 @@ def exact_objective(pad: Morphology) -> float:
     levels = quantize(signals(pad, published_presses(pad.grid)))
     entropy = joint_entropy(levels[:, : pad.grid]) + joint_entropy(levels[:, pad.grid :])
     disorder = disorder_area(pad) * (PUBLISHED - 1) / (pad.grid + 1)
-    return 1 / (1 + entropy) + 1e-7 * sharpness(levels) + 5e-6 * disorder
+    return 1 / (1 + entropy) + 1e-7 * published_sharpness(levels) + 5e-6 * disorder
 
 
 def plain_objective(pad: Morphology, samples: int = PUBLISHED, gamma: float = 5e-6) -> float:

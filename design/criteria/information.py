@@ -31,7 +31,7 @@ def joint_entropy(levels: Array) -> float:
     return float(kernels.row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
 
 
-def sharpness(levels: Array) -> float:
+def published_sharpness(levels: Array) -> float:
     """Z of formula (4): sum over columns of |second difference| along the press order."""
     return float(kernels.second_differences(np.asarray(levels, dtype=np.float64)))
 

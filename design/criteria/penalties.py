@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from design.common.errors import InputError
-from design.settings import Pad, Rules
+from design.settings import PadSettings, RulesSettings
 
 from .differentiable import pchip_sample, span_samples
 
@@ -22,7 +22,7 @@ MOST_PAIRS = 10**8  # of samples that are compared at once: some GB
 
 
 @dataclass(frozen=True)
-class Samples:
+class SampledCurves:
     """Fibres sampled densely: places (2M, P, 2) along their travel and cross axes, slopes and arc lengths (2M, P)."""
 
     place: Tensor
@@ -35,12 +35,14 @@ class Samples:
         step = self.arc.detach().diff(dim=1) / 2
         return torch.nn.functional.pad(step, (1, 0)) + torch.nn.functional.pad(step, (0, 1))
 
-    def take(self, fibres: list[int]) -> "Samples":
+    def take(self, fibres: list[int]) -> "SampledCurves":
         """Those of some fibres."""
-        return Samples(self.place[fibres], self.slope[fibres], self.arc[fibres])
+        return SampledCurves(self.place[fibres], self.slope[fibres], self.arc[fibres])
 
 
-def penalties(travel: Tensor, cross: Tensor, pad: Pad, rules: Rules, margin: float = 1.0) -> dict[str, Tensor]:
+def penalties(
+    travel: Tensor, cross: Tensor, pad: PadSettings, rules: RulesSettings, margin: float = 1.0
+) -> dict[str, Tensor]:
     """A penalty by name of each rule that may be broken, scalars with gradient by the knots.
 
     Args:
@@ -53,7 +55,7 @@ def penalties(travel: Tensor, cross: Tensor, pad: Pad, rules: Rules, margin: flo
     pitch = pad.pitch_mm
     place, slope = span_samples(travel, cross, PER_SPAN)
     step = torch.linalg.vector_norm(place.diff(dim=1), dim=-1)
-    fibres = Samples(place, slope, torch.nn.functional.pad(step.cumsum(dim=1), (1, 0)))
+    fibres = SampledCurves(place, slope, torch.nn.functional.pad(step.cumsum(dim=1), (1, 0)))
     radius, gap = margin * rules.min_bend_radius_mm / pitch, margin * rules.min_gap_mm / pitch
     found = {}
     if radius > 0:
@@ -80,7 +82,7 @@ def penalties(travel: Tensor, cross: Tensor, pad: Pad, rules: Rules, margin: flo
     return found
 
 
-def _bend(fibres: Samples, radius: float, window: float) -> Tensor:
+def _bend(fibres: SampledCurves, radius: float, window: float) -> Tensor:
     """How much more than window / radius a fibre turns within `window` of arc, as a share of that angle."""
     turned = torch.atan(fibres.slope).diff(dim=1).abs().cumsum(dim=1)
     turned = torch.nn.functional.pad(turned, (1, 0))
@@ -92,7 +94,7 @@ def _bend(fibres: Samples, radius: float, window: float) -> Tensor:
     return (over * fibres.share).sum(dim=1).mean() / fibres.place[0, -1, 0].detach()
 
 
-def _gap(fibres: Samples, gap: float) -> Tensor:
+def _gap(fibres: SampledCurves, gap: float) -> Tensor:
     """How much nearer than `gap` neighbours in a family come, as a share of it."""
     grid = len(fibres.place) // 2
     _require_room(2 * grid, fibres.arc.shape[1])
@@ -103,7 +105,7 @@ def _gap(fibres: Samples, gap: float) -> Tensor:
     return _closeness(torch.cat(near), gap) / fibres.arc.numel()
 
 
-def _folds(fibres: Samples, gap: float) -> Tensor:
+def _folds(fibres: SampledCurves, gap: float) -> Tensor:
     """How much nearer than `gap` a fibre comes to a part of itself that is pi / 2 gaps or more away along it."""
     _require_room(*fibres.arc.shape)
     arc = fibres.arc.detach().float()
@@ -113,7 +115,7 @@ def _folds(fibres: Samples, gap: float) -> Tensor:
     return _closeness(_near(fibres.place, fibres, distances, gap), gap) / fibres.arc.numel()
 
 
-def _near(place: Tensor, other: Samples, distances: Tensor, gap: float) -> Tensor:
+def _near(place: Tensor, other: SampledCurves, distances: Tensor, gap: float) -> Tensor:
     """Distances (K,) to `other` of those places (B, P, 2) that may be nearer than `gap`, given all (B, P, P).
 
     They are measured to the piece of tangent the nearest sample stands for, which reaches up to half a step beyond it.
@@ -146,7 +148,7 @@ def _too_many(count: Tensor, limit: float) -> Tensor:
     return torch.relu(count - limit) / max(1.0, limit)
 
 
-def _family_crossings(fibres: Samples) -> Tensor:
+def _family_crossings(fibres: SampledCurves) -> Tensor:
     """Soft number of crossings within the families."""
     grid = len(fibres.place) // 2
     _require_room(grid * (grid - 1), fibres.arc.shape[1])
@@ -155,7 +157,7 @@ def _family_crossings(fibres: Samples) -> Tensor:
     return _mollified(first, second, 0.0)[0]
 
 
-def _crossings(fibres: Samples, limit: float) -> tuple[Tensor, Tensor]:
+def _crossings(fibres: SampledCurves, limit: float) -> tuple[Tensor, Tensor]:
     """Soft number of horizontal x vertical crossings, and of those flatter than `limit` radians, by how much."""
     grid = len(fibres.place) // 2
     _require_room(grid**2, fibres.arc.shape[1])
@@ -189,7 +191,7 @@ def _require_room(fibres: int, samples: int) -> None:
         )
 
 
-def _hugging(fibres: Samples, zone: float) -> Tensor:
+def _hugging(fibres: SampledCurves, zone: float) -> Tensor:
     """How steeper than 45 degrees fibres run in the `zone` by the wall they come from."""
     travel = fibres.place[..., 0].detach()
     edge = (travel < zone) | (travel > travel[0, -1] - zone)

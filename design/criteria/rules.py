@@ -10,10 +10,10 @@ import shapely
 from numpy.typing import NDArray
 
 from design.common.errors import instance
-from design.pad.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, trace
+from design.pad.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
 from design.pad.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
 from design.pad.morphology import Morphology
-from design.settings import Rules
+from design.settings import RulesSettings
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class Violation:
         return f"{self.rule}: {names}{place}: {_amount(self.measured)}, limit {_amount(self.limit)}"
 
 
-def check(pad: Morphology, rules: Rules) -> list[Violation]:
+def check_rules(pad: Morphology, rules: RulesSettings) -> list[Violation]:
     """Every rule of `[rules]` that `pad` breaks, worst place per fibre or pair of fibres.
 
     - `min_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left and
@@ -70,7 +70,7 @@ def check(pad: Morphology, rules: Rules) -> list[Violation]:
     Distances are right to twice the 1e-3 mm to which curves are flattened, those of a fibre to itself to 2e-4 g if that
     is more; bend radii below R to 0.5 %.
     """
-    pad, rules = instance("pad", pad, Morphology), instance("rules", rules, Rules)
+    pad, rules = instance("pad", pad, Morphology), instance("rules", rules, RulesSettings)
     lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.pitch_mm)]
     return [
         *tight_bends(pad, rules.min_bend_radius_mm),
@@ -93,7 +93,7 @@ def tight_bends(pad: Morphology, limit: float) -> list[Violation]:
     found = []
     for fibre in np.flatnonzero(turned > angle):
         # An end of the window that falls between two points is off by less than the turn from one to the other.
-        points, headings = trace(spans[fibre], slopes[fibre], step=max(angle / 200, _FINEST_TURN))
+        points, headings = traced_curve(spans[fibre], slopes[fibre], step=max(angle / 200, _FINEST_TURN))
         radius, place = bend_radius(pad.to_mm(points), headings, window)
         if radius < limit:
             found.append(Violation("min_bend_radius_mm", (int(fibre) + 1,), radius, limit, _place(place)))
@@ -130,7 +130,7 @@ def _folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]
     return found
 
 
-def _crossings(pad: Morphology, rules: Rules) -> list[Violation]:
+def _crossings(pad: Morphology, rules: RulesSettings) -> list[Violation]:
     most, least_angle = rules.max_crossings, rules.min_crossing_angle_deg
     met = crossings(pad, _CROSSING_TOLERANCE, across=most is not None or least_angle > 0)
     across = [c for c in met if c.first < pad.grid <= c.second]

@@ -5,10 +5,10 @@ from dataclasses import asdict
 import numpy as np
 
 from design.common.errors import InputError, instance
-from design.common.settings import section
+from design.common.settings import or_default
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
-from design.settings import Contact, Pad, Rules, Search
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .fibre_loss import loss_shares, lost_subsets
 from .information import idle_share, information
@@ -50,7 +50,7 @@ def score(
     contact: Contact | None = None,
     lost: int | tuple[float, ...] = 3,
     noise: float = 0.11,
-    rules: Rules | None = None,
+    rules: RulesSettings | None = None,
 ) -> dict[str, float]:
     """Every term of a pad, by name.
 
@@ -70,9 +70,9 @@ def score(
     from .ambiguity import sharpness
     from .penalties import PER_SPAN, penalties
 
-    contact, rules = section("contact", contact, Contact), section("rules", rules, Rules)
-    size = Pad(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm)
-    asked = Search(lost=lost, noise=noise)
+    contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
+    size = PadSettings(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm)
+    asked = SearchSettings(lost=lost, noise=noise)
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:
         raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")

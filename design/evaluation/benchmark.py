@@ -13,7 +13,7 @@ from design.pad.contact import signals
 from design.pad.morphology import Morphology
 
 from .levenberg_marquardt import LEARN, VALIDATE, Network, Scale, first_weights
-from .localisation_error import Loss, Trial
+from .localisation_error import Loss, PressSets
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ LOST, SETS = 2, 14
 """Fibres lost at once, and how many sets of them: as many networks as are trained as one batch."""
 
 
-def trials() -> Iterator[harness.Trial]:
+def trials() -> Iterator[harness.BenchTrial]:
     """Networks for SETS of lost fibres of two 4 x 4 pads, the square grid and a random one, both ways.
 
     The plain way makes the whole Jacobian and solves for all weights, as textbooks have it, on as many threads as NumPy
@@ -32,19 +32,19 @@ def trials() -> Iterator[harness.Trial]:
     """
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
-            trial = Trial.of(pad, 32, 2000, 0, partial(signals, pad))
+            trial = PressSets.of(pad, 32, 2000, 0, partial(signals, pad))
             losses = lost_subsets(2 * pad.grid, LOST, SETS)
             judge = partial(_judge, trial, losses)
-            yield harness.Trial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)
-            yield harness.Trial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)
+            yield harness.BenchTrial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)
+            yield harness.BenchTrial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)
 
 
-def _judge(trial: Trial, losses: Sequence[Loss], networks: Sequence[Network]) -> Mapping[str, float]:
+def _judge(trial: PressSets, losses: Sequence[Loss], networks: Sequence[Network]) -> Mapping[str, float]:
     errors = [trial.errors(network, loss).mean() for network, loss in zip(networks, losses, strict=True)]
     return {"error": float(np.mean(errors))}
 
 
-def _learn_plain(trial: Trial, losses: Sequence[Loss]) -> list[Network]:
+def _learn_plain(trial: PressSets, losses: Sequence[Loss]) -> list[Network]:
     kept = [np.setdiff1d(np.arange(trial.recorded.shape[1]), loss) for loss in losses]
     rngs = [np.random.default_rng([2, 0, len(loss), *loss]) for loss in losses]
     return [fit_plain(trial.recorded[:, left], trial.learned, rng) for left, rng in zip(kept, rngs, strict=True)]

@@ -124,7 +124,7 @@ def fit_many(
         InputError: fewer than 3 samples, not as many targets as inputs, nothing to learn from or with, or numbers that
             are not finite.
     """
-    from .variable_projection import train
+    from .variable_projection import train_batch
 
     if min(len(rngs), hidden, inputs.shape[-1]) < 1:
         raise InputError(
@@ -153,7 +153,7 @@ def fit_many(
         validate = [(scale.there(own), places) for own, scale in zip(check[0], into, strict=True)]
     at = device or best_device()
     samples_of = partial(_stacked, device=at)
-    trained = train(_tensor(starts, at), samples_of(learn), samples_of(validate), epochs)
+    trained = train_batch(_tensor(starts, at), samples_of(learn), samples_of(validate), epochs)
     return [
         Network(into_neurons.T, onto_outputs.T, scale, onto, int(taken))
         for scale, into_neurons, onto_outputs, taken in zip(

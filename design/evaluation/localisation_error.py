@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from design.common.computing import one_torch_thread
 from design.common.errors import InputError, instance, shown, whole
-from design.common.settings import section
+from design.common.settings import or_default
 from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import MOST_GRID, Morphology
@@ -46,7 +46,7 @@ class LossError:
     max: float
 
 
-def evaluate(
+def localisation_error(
     pad: Morphology,
     contact: Contact | None = None,
     lost: Sequence[int] = (0, 1, 2, 3),
@@ -78,7 +78,7 @@ def evaluate(
     if side**2 != presses:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
     test, hidden = whole("test", test, 1, MOST_PRESSES), whole("hidden", hidden, 1, 1000)
-    seed, contact = whole("seed", seed, 0, 2**64 - 1), section("contact", contact, Contact)
+    seed, contact = whole("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact)
     fibres = 2 * instance("pad", pad, Morphology).grid
     if not isinstance(lost, Sequence) or isinstance(lost, str):
         raise InputError(f"lost is {shown(lost)}, expected numbers of lost fibres")
@@ -89,7 +89,7 @@ def evaluate(
     if sum(sets) > MOST_NETWORKS:
         raise InputError(f"subsets is {subsets}: that takes {sum(sets)} networks, allowed are {MOST_NETWORKS}")
     losses = [lost_subsets(fibres, number, most) for number, most in zip(levels, sets, strict=True)]
-    trial = Trial.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
+    trial = PressSets.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
 
     def means(batch: list[Loss]) -> Array:
         networks = trial.learn(batch, hidden)
@@ -111,7 +111,7 @@ def batches(losses: Sequence[Loss]) -> list[list[Loss]]:
 
 
 @dataclass(frozen=True)
-class Trial:
+class PressSets:
     """Presses to learn from and fresh ones to test on, with what a pad signals for them.
 
     Attributes:
@@ -126,7 +126,7 @@ class Trial:
     seed: int
 
     @classmethod
-    def of(cls, pad: Morphology, side: int, test: int, seed: int, answer: Callable[[Array], Array]) -> "Trial":
+    def of(cls, pad: Morphology, side: int, test: int, seed: int, answer: Callable[[Array], Array]) -> "PressSets":
         """A serpentine of side^2 presses to learn from and `test` fresh ones; `answer` gives signals for places."""
         learned, fresh = training_presses(pad.grid, side, seed), fresh_presses(pad.grid, test, seed)
         return cls(learned, answer(learned), fresh, answer(fresh), seed)

@@ -33,10 +33,10 @@ LEAST_SLOPE = 1e-7
 BLOCK = 64
 """Columns of a symmetric product made at once."""
 
-Samples = tuple[Tensor, Tensor]
+Examples = tuple[Tensor, Tensor]
 
 
-def train(hidden: Tensor, learn: Samples, validate: Samples, epochs: int) -> tuple[Tensor, Tensor, Tensor]:
+def train_batch(hidden: Tensor, learn: Examples, validate: Examples, epochs: int) -> tuple[Tensor, Tensor, Tensor]:
     """Train every network until validation has not gained for FAILURES steps, or no step makes it better.
 
     Args:
@@ -140,7 +140,7 @@ class _Batch(_Rows):
     growth: Tensor
 
     @classmethod
-    def begun(cls, hidden: Tensor, learn: Samples, validate: Samples) -> Self:
+    def begun(cls, hidden: Tensor, learn: Examples, validate: Examples) -> Self:
         """Before the first step."""
         (x, right), (check_x, check_right) = ((with_ones(inputs), targets) for inputs, targets in (learn, validate))
         fit = reassigned(Fit.of(hidden, x, right[:, 0]), x, right)

@@ -5,10 +5,10 @@ from concurrent.futures import Executor, Future
 from functools import partial
 from typing import Any
 
-from design.benchmarking.harness import Bench, Trial
-from design.criteria.rules import check
-from design.evaluation.localisation_error import evaluate
-from design.settings import Contact, Pad, Rules, Search
+from design.benchmarking.harness import Bench, BenchTrial
+from design.criteria.rules import check_rules
+from design.evaluation.localisation_error import localisation_error
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .search import SearchResult, search
 
@@ -30,31 +30,39 @@ class InThisThread(Executor):
         return done
 
 
-def trials() -> Iterator[Trial]:
+def trials() -> Iterator[BenchTrial]:
     """Every way at every budget, for N of KNOTS and each of SEEDS.
 
     The genetic search minimises the published objective; the gradient search runs without design rules, as the genetic
     one does, and with them.
     """
     ways = [
-        ("genetic", generations, Search(method="genetic", generations=generations), Rules(enforce=False))
+        (
+            "genetic",
+            generations,
+            SearchSettings(method="genetic", generations=generations),
+            RulesSettings(enforce=False),
+        )
         for generations in GENERATIONS
     ]
     for steps in STEPS:
-        descent = Search(method="descent", starts=1, steps=steps)
-        ways += [("descent", steps, descent, Rules(enforce=False)), ("with rules", steps, descent, Rules())]
+        descent = SearchSettings(method="descent", starts=1, steps=steps)
+        ways += [
+            ("descent", steps, descent, RulesSettings(enforce=False)),
+            ("with rules", steps, descent, RulesSettings()),
+        ]
     for knots in KNOTS:
         for way, size, settings, rules in ways:
             for seed in SEEDS:
                 chosen = settings.model_copy(update={"knots": knots, "seed": seed})
-                work = partial(search, Pad(), Contact(), chosen, rules, executor=InThisThread())
-                yield Trial(f"N={knots}", way, size, work, judge, repetition=seed)
+                work = partial(search, PadSettings(), Contact(), chosen, rules, executor=InThisThread())
+                yield BenchTrial(f"N={knots}", way, size, work, judge_pad, repetition=seed)
 
 
-def judge(found: SearchResult) -> Mapping[str, float]:
+def judge_pad(found: SearchResult) -> Mapping[str, float]:
     """How well a pad serves: localisation errors with up to three fibres lost, their mean, and the rules it breaks."""
-    errors = [level.mean for level in evaluate(found.morphology, Contact(), subsets=SUBSETS)]
-    broken = len(check(found.morphology, Rules()))
+    errors = [level.mean for level in localisation_error(found.morphology, Contact(), subsets=SUBSETS)]
+    broken = len(check_rules(found.morphology, RulesSettings()))
     lost = {f"lost_{number}": error for number, error in enumerate(errors)}
     return {"error": sum(errors) / len(errors), "violations": broken, **lost}
 

@@ -18,7 +18,7 @@ from design.criteria.ambiguity import ambiguity, full_scale, sharpness
 from design.criteria.differentiable import ExactSignals, pchip_slopes
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
-from design.criteria.rules import check
+from design.criteria.rules import check_rules
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
 
@@ -183,7 +183,7 @@ class Descent:
 
     def _broken(self) -> bool:
         rules = self.problem.rules
-        return rules.enforce and bool(check(self.morphology(), rules))
+        return rules.enforce and bool(check_rules(self.morphology(), rules))
 
 
 def stratified(grid: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from torch import Tensor
 from design.pad.curves import refine
 from design.pad.knots import MARGIN, assemble
 from design.pad.morphology import Morphology
-from design.settings import Pad, Rules
+from design.settings import PadSettings, RulesSettings
 
 Array = NDArray[np.float64]
 
@@ -64,14 +64,14 @@ class Fibres:
         return assemble(inner)
 
 
-def border_of(pad: Pad, rules: Rules) -> float:
+def border_of(pad: PadSettings, rules: RulesSettings) -> float:
     """Least cross distance of a knot to the border, grid units."""
     wanted = rules.border_mm / pad.pitch_mm if rules.enforce else 0.0
     return min(max(MARGIN, wanted), WIDEST_BORDER * (pad.grid + 1))
 
 
 def first_course(
-    pad: Pad, rules: Rules, knots: int, origin: Morphology | None, start: int, rng: np.random.Generator
+    pad: PadSettings, rules: RulesSettings, knots: int, origin: Morphology | None, start: int, rng: np.random.Generator
 ) -> Array:
     """Knots (2M, N+2, 2) a start of the search begins with.
 
@@ -87,7 +87,7 @@ def first_course(
     return assemble(np.clip(inner, MARGIN, pad.grid + 1 - MARGIN))
 
 
-def _zigzag(pad: Pad, rules: Rules, knots: int, rng: np.random.Generator) -> Array:
+def _zigzag(pad: PadSettings, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
     """A random zigzag each family runs side by side: nothing crosses within a family, and every turn is round.
 
     PCHIP has slope 0 at a turn, so that one knot alone bends sharper the higher the flanks; with shoulders

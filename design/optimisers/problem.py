@@ -4,17 +4,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from design.pad.morphology import Morphology
-from design.settings import Contact, Pad, Rules, Search
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 
 @dataclass(frozen=True)
 class Problem:
     """A pad that serves all of `contacts` within `rules`, to be found as `search` says, from an origin or afresh."""
 
-    pad: Pad
+    pad: PadSettings
     contacts: tuple[Contact, ...]
-    search: Search
-    rules: Rules
+    search: SearchSettings
+    rules: RulesSettings
     origin: Morphology | None = None
 
     @property

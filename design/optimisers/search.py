@@ -23,15 +23,15 @@ from design.common import profiling
 from design.common.checkpoints import Checkpoints, State
 from design.common.errors import MOST_VALUES, InputError, instance, real, shown
 from design.common.errors import path as as_path
-from design.common.settings import section
+from design.common.settings import or_default
 from design.criteria.fibre_loss import loss_shares
-from design.criteria.rules import Violation, check
+from design.criteria.rules import Violation, check_rules
 from design.criteria.score import ambiguities, score
 from design.pad.morphology import Morphology
-from design.settings import Contact, Pad, Rules, Search
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .problem import Problem
-from .start import Slice, advance, finish
+from .start import Slice, advance_start, finish
 
 Report = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
@@ -66,10 +66,10 @@ class SearchResult:
 
 
 def search(
-    pad: Pad | None = None,
+    pad: PadSettings | None = None,
     contact: Contact | None = None,
-    settings: Search | None = None,
-    rules: Rules | None = None,
+    settings: SearchSettings | None = None,
+    rules: RulesSettings | None = None,
     *,
     origin: Morphology | None = None,
     report: Report = lambda run, done, total, objective: None,
@@ -95,8 +95,10 @@ def search(
         InputError: an origin that does not fit, a device that is not there, or states of other settings.
     """
     begin = time.perf_counter()
-    sections = (section("pad", pad, Pad), section("contact", contact, Contact))
-    problem = _problem(*sections, section("settings", settings, Search), section("rules", rules, Rules), origin)
+    sections = (or_default("pad", pad, PadSettings), or_default("contact", contact, Contact))
+    problem = _problem(
+        *sections, or_default("settings", settings, SearchSettings), or_default("rules", rules, RulesSettings), origin
+    )
     checkpoints = None if keep_in is None else Checkpoints(as_path("keep_in", keep_in), problem.settings())
     time_budget = None if time_budget is None else real("time_budget", time_budget, 0, MOST_SECONDS)
     if not callable(report):
@@ -120,7 +122,9 @@ def search(
     return SearchResult(best, terms, violations, problem.rules.enforce, history, seconds, stop.reason)
 
 
-def _problem(pad: Pad, contact: Contact, settings: Search, rules: Rules, origin: Morphology | None) -> Problem:
+def _problem(
+    pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None
+) -> Problem:
     if settings.device == "cuda":
         import torch
 
@@ -214,7 +218,7 @@ def _run(
     while running or (waiting and not stop):
         while waiting and not stop and len(running) < _width(pool):
             start = waiting.pop(0)
-            running[pool.submit(advance, problem, start, states.get(start))] = start
+            running[pool.submit(advance_start, problem, start, states.get(start))] = start
         for future in wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done:
             start, reached = running.pop(future), future.result()
             states[start] = reached.state
@@ -222,7 +226,7 @@ def _run(
                 checkpoints.save(start, reached.state)
             report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
             if not reached.done and not stop:
-                running[pool.submit(advance, problem, start, reached.state)] = start
+                running[pool.submit(advance_start, problem, start, reached.state)] = start
 
 
 def _width(pool: Executor) -> int:
@@ -250,7 +254,7 @@ def _choose(found: list[Morphology], problem: Problem) -> tuple[Morphology, list
         spread = [np.mean(ambiguities(pad, contact, search.lost, search.noise)) for contact in problem.contacts]
         return len(broken[id(pad)]), float(np.mean(spread))
 
-    broken = {id(pad): check(pad, problem.rules) if enforce else [] for pad in found}
+    broken = {id(pad): check_rules(pad, problem.rules) if enforce else [] for pad in found}
     best = found[0] if len(found) == 1 else min(found, key=rank)
     return best, broken[id(best)]
 

@@ -27,7 +27,7 @@ class Slice:
     done: bool
 
 
-def advance(problem: Problem, start: int, state: State | None) -> Slice:
+def advance_start(problem: Problem, start: int, state: State | None) -> Slice:
     """The next slice of a start, from its beginning if `state` is None."""
     run, until = _open(problem, start, state), time.perf_counter() + SLICE_S
     for _ in range(SLICE[problem.search.method]):

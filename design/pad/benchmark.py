@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from design.benchmarking.harness import Bench, Trial
+from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.kernels.pchip import pchip_sample
 from design.settings import Contact
 
@@ -74,7 +74,7 @@ def scanned_signals(knots: Any, presses: Any, radius: float, sides: int, samples
     return out
 
 
-def trials() -> Iterator[Trial]:
+def trials() -> Iterator[BenchTrial]:
     """Signals of random pads: error against run time for N of KNOTS, and time per press for GRIDS."""
     contact = Contact()
     rng = np.random.default_rng(0)
@@ -87,10 +87,10 @@ def trials() -> Iterator[Trial]:
             return {"visited": exact(pad, presses[:100], contact)[1] / (100 * len(pad.knots))}
 
         work = partial(signals_sparse, pad, presses, contact)
-        yield Trial(f"grid {grid}, a press", "exact", 0, work, judge, items=len(presses))
+        yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, judge, items=len(presses))
 
 
-def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[Trial]:
+def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTrial]:
     """Every way of computing the signals of one pad, its error against the exact ones."""
     case = f"N={pad.knots.shape[1] - 2}"
     pairs = len(presses) * len(pad.knots)
@@ -113,15 +113,15 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[Trial]:
         def culled(found: tuple[Array, int], samples: int = samples) -> Mapping[str, float]:
             return {"error": error(found[0], true()), "visited": found[1] / (pairs * samples)}
 
-        yield Trial(case, "plain", samples, plain, scanned)
-        yield Trial(case, "scanned", samples, scan, scanned)
-        yield Trial(case, "culled", samples, cull, culled)
+        yield BenchTrial(case, "plain", samples, plain, scanned)
+        yield BenchTrial(case, "scanned", samples, scan, scanned)
+        yield BenchTrial(case, "culled", samples, cull, culled)
 
     def exactly(found: tuple[Array, int]) -> Mapping[str, float]:
         spans = pairs * (pad.knots.shape[1] - 1)
         return {"error": error(found[0], _oracle(pad, presses, contact)), "visited": found[1] / spans}
 
-    yield Trial(case, "exact", 0, partial(exact, pad, presses, contact), exactly)
+    yield BenchTrial(case, "exact", 0, partial(exact, pad, presses, contact), exactly)
 
 
 def _oracle(pad: Morphology, presses: Array, contact: Contact) -> Array:

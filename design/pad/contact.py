@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from design.common import profiling
 from design.common.computing import in_chunks
 from design.common.errors import MOST_VALUES, InputError, instance, reals, whole
-from design.common.settings import section
+from design.common.settings import or_default
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.press import (
@@ -61,7 +61,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     Raises:
         InputError: presses of the wrong shape or not finite.
     """
-    return exact(pad, presses, section("contact", contact, Contact))[0]
+    return exact(pad, presses, or_default("contact", contact, Contact))[0]
 
 
 def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
@@ -95,7 +95,7 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     """
     from scipy.sparse import csr_array
 
-    contact = section("contact", contact, Contact)
+    contact = or_default("contact", contact, Contact)
     travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
     places, strays = as_presses(presses)[0], family_strays(cross)
     starts = count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
@@ -179,7 +179,7 @@ def signals_quantized(
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
-    return quantized(pad, presses, section("contact", contact, Contact), samples)[0]
+    return quantized(pad, presses, or_default("contact", contact, Contact), samples)[0]
 
 
 def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int) -> tuple[Array, int]:

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from design.common.files import sha256
-from design.common.page.elements import Section, beside, figures, folded, heading, paragraph, table
-from design.settings import Rules
+from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
+from design.settings import RulesSettings
 
 _TERMS = {
     "information": "mutual information of places and signals, bits",
@@ -19,7 +19,7 @@ _TERMS = {
 }
 
 
-def design_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """The fibres of a `design.json` in `folder`: plan, rules with their verdicts, terms of the objective.
 
     Raises:
@@ -36,7 +36,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
     plan = (
         f"The plan of the pad, {size}: horizontal and vertical fibres, their crossings, and the contact in the middle."
     )
-    fibres = Section(
+    fibres = PageSection(
         "Fibres",
         [
             beside(
@@ -84,10 +84,12 @@ def origin(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object
     return [stage, made_by.get("command"), made_by.get("seed"), versions or "-", inputs or "-"]
 
 
-def provenance_section(rows: Sequence[Sequence[object]]) -> Section:
+def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     """Where all results came from, as rows of `origin` say."""
     head = ["stage", "command", "seed", "versions", "inputs (sha256)"]
-    return Section("Provenance", [folded("Commands, seeds, versions and inputs of every stage", [table(head, rows)])])
+    return PageSection(
+        "Provenance", [folded("Commands, seeds, versions and inputs of every stage", [table(head, rows)])]
+    )
 
 
 def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
@@ -96,7 +98,7 @@ def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Ite
             continue
         fails = any(violation["rule"] == name for violation in broken)
         verdict = "fail" if fails else "pass" if rules["enforce"] else "not asked for"
-        known = Rules.model_fields.get(name)
+        known = RulesSettings.model_fields.get(name)
         yield [known.description if known else name, limit, verdict, name]
 
 

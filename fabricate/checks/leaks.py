@@ -29,7 +29,7 @@ _FLOORLESS = 0.5
 
 def tight(slices: Sequence[Slab]) -> Finding:
     """Whether no opening in wall or floor lets silicone out of what the walls surround."""
-    leaks = [place for slab in slices[1:] for place in _through_walls(slab.section)]
+    leaks = [place for slab in slices[1:] for place in _through_walls(slab.cross_section)]
     leaks += _through_floor(slices)
     message = f"silicone runs out at {len(leaks)} places" if leaks else "no opening lets silicone out"
     return verdict("tight", not leaks, len(leaks), 0, message, dict.fromkeys(leaks))
@@ -57,11 +57,17 @@ def _through_walls(section: BaseGeometry) -> list[tuple[float, float]]:
 def _through_floor(slices: Sequence[Slab]) -> list[tuple[float, float]]:
     """Where an area that walls surround has nothing beneath it down to the bed."""
     for number, slab in enumerate(slices):
-        hollow = shapely.union_all([shapely.Polygon(r) for p in shapely.get_parts(slab.section) for r in p.interiors])
+        hollow = shapely.union_all(
+            [shapely.Polygon(r) for p in shapely.get_parts(slab.cross_section) for r in p.interiors]
+        )
         bare = hollow
         for below in slices[:number]:
-            bare = without(bare, below.section)
-        if number and hollow.area > _BASIN * slices[0].section.envelope.area and bare.area < _FLOORLESS * hollow.area:
+            bare = without(bare, below.cross_section)
+        if (
+            number
+            and hollow.area > _BASIN * slices[0].cross_section.envelope.area
+            and bare.area < _FLOORLESS * hollow.area
+        ):
             return [_rounded(part) for part in shapely.get_parts(bare) if part.area > _LEAST_MM2]
     return []
 

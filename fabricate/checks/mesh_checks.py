@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from design.common.errors import instance, real, whole
 from fabricate.mesh_files import read_mesh
-from fabricate.settings import DEFAULTS, Printer
+from fabricate.settings import DEFAULTS, PrinterSettings
 
 from . import self_intersections as intersections
 from .findings import Finding, verdict
@@ -34,7 +34,7 @@ _SHELLS = 100
 def inspect_mesh(
     vertices: ArrayLike,
     triangles: ArrayLike,
-    printer: Printer = DEFAULTS.printer,
+    printer: PrinterSettings = DEFAULTS.printer,
     min_silicone_mm: float = 0.4,
     genus: int | None = None,
     unplanned: bool = True,
@@ -53,7 +53,7 @@ def inspect_mesh(
         The findings of `sound`, then bed; and, if that is a solid that can be cut, wall_thickness, floor_thickness,
         overhang, undercut; and what a plan knows, ridge_width, silicone_wall and tight.
     """
-    instance("printer", printer, Printer)
+    instance("printer", printer, PrinterSettings)
     min_silicone_mm = real("min_silicone_mm", min_silicone_mm, 0, 10)
     surface = Surface.joined(vertices, triangles)
     genus = None if genus is None else whole("genus", genus, 0, 10**6)
@@ -79,7 +79,7 @@ def sound(vertices: ArrayLike, triangles: ArrayLike, genus: int | None = None) -
 
 
 def check_mesh(
-    path: Path, printer: Printer = DEFAULTS.printer, min_silicone_mm: float = 0.4, genus: int | None = None
+    path: Path, printer: PrinterSettings = DEFAULTS.printer, min_silicone_mm: float = 0.4, genus: int | None = None
 ) -> list[Finding]:
     """Every check on a mesh file of any origin; arguments as for `read_mesh` and `inspect_mesh`."""
     return inspect_mesh(*read_mesh(path), printer, min_silicone_mm, genus)
@@ -171,7 +171,7 @@ def _genus(surface: Surface, expected: int) -> Finding:
     return verdict("genus", genus == expected, genus, expected, message)
 
 
-def _bed(surface: Surface, printer: Printer) -> Finding:
+def _bed(surface: Surface, printer: PrinterSettings) -> Finding:
     """Whether it fits the printer, turned by 90 degrees if need be."""
     size, bed = np.ptp(surface.bottom_top, axis=0).tolist(), printer.bed_mm
     turned = zip([*sorted(size[:2]), size[2]], [*sorted(bed[:2]), bed[2]], strict=True)

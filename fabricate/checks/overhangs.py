@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from fabricate.settings import Printer
+from fabricate.settings import PrinterSettings
 
 from .findings import Finding, verdict
 from .slices import Slab, enclosed, section
@@ -32,7 +32,7 @@ _HEIGHTS = 32
 """Heights at which that is looked up, at most."""
 
 
-def overhang(surface: Surface, printer: Printer) -> Finding:
+def overhang(surface: Surface, printer: PrinterSettings) -> Finding:
     """Whether no face leans so far that it is printed on air; the first layer lies on the bed."""
     high = surface.corners[:, :, 2].max(axis=1) > surface.bottom_top[0, 2] + printer.layer_mm
     leaning = _leaning(surface, STEEPEST_DEG + _SPARE_DEG) & high

@@ -16,7 +16,7 @@ from design.criteria.rules import tight_bends
 from design.pad.morphology import Morphology
 from fabricate.mould.assembly import plan_mesh
 from fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
-from fabricate.settings import DEFAULTS, Settings
+from fabricate.settings import DEFAULTS, FabricationSettings
 
 from . import mesh_checks as soundness
 from .findings import Finding, Status, as_places, graded, verdict
@@ -33,7 +33,7 @@ _NAMED = 8
 """More fibres than this are counted instead of named."""
 
 
-def check(pad: Morphology, settings: Settings = DEFAULTS) -> list[Finding]:
+def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Finding]:
     """Every check on the mould of a pad.
 
     Raises:
@@ -83,7 +83,7 @@ def _ridge_width(plan: Plan) -> Finding:
     return verdict("ridge_width", wide, width, least, message, places)
 
 
-def _track_size(settings: Settings) -> Finding:
+def _track_size(settings: FabricationSettings) -> Finding:
     """A fibre must lie within its track, neither pinched nor standing out."""
     room = min(settings.mould.ridge_width_mm, settings.mould.shallow_ridge_height_mm)
     fibre = settings.pad.fibre_diameter_mm

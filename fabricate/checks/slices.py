@@ -60,19 +60,19 @@ class Slab:
         return (self.bottom_mm + self.top_mm) / 2
 
     @cached_property
-    def section(self) -> BaseGeometry:
+    def cross_section(self) -> BaseGeometry:
         """The solid's section half way up."""
         return section(self.solid, self.middle_mm)
 
     @cached_property
     def frame(self) -> BaseGeometry:
         """What the section's outer edges surround, as far as there is a floor beneath."""
-        return overlap(enclosed(self.section), self.base)
+        return overlap(enclosed(self.cross_section), self.base)
 
     @cached_property
     def void(self) -> BaseGeometry:
         """Where a casting lies: surrounded by solid, with a floor beneath."""
-        gaps = shapely.get_parts(without(self.frame, self.section))
+        gaps = shapely.get_parts(without(self.frame, self.cross_section))
         return shapely.MultiPolygon(gaps[shapely.area(gaps) > _LINE_MM * shapely.length(gaps)].tolist())
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from fabricate.mould.plan import without
-from fabricate.settings import Printer
+from fabricate.settings import PrinterSettings
 
 from .findings import Finding, Place, Status, verdict
 from .slices import Slab, least_width, section, spare_width, tested_width, too_narrow
@@ -46,15 +46,15 @@ _NEAR_CORNER = 0.98
 """Share of the way from a triangle's middle to its corners where its thickness is measured too."""
 
 
-def least_line_mm(printer: Printer) -> float:
+def least_line_mm(printer: PrinterSettings) -> float:
     """The narrowest that a printer draws: its nozzle, or two pixels of its screen."""
     return printer.nozzle_mm * (2 if printer.resin else 1)
 
 
-def ridge_width(slices: Sequence[Slab], printer: Printer) -> Finding:
+def ridge_width(slices: Sequence[Slab], printer: PrinterSettings) -> Finding:
     """Whether everything that stands in a layer is as wide as what the printer draws."""
     limit, name = least_line_mm(printer), "two pixels" if printer.resin else "the nozzle"
-    sections = [slab.section for slab in slices]
+    sections = [slab.cross_section for slab in slices]
     least, places = _narrowest(sections, [None] * len(sections), limit)
     if not places:
         return Finding("ridge_width", "pass", limit, limit, f"nothing is narrower than {name}, {limit:g} mm")
@@ -88,12 +88,12 @@ def _level_void(slab: Slab, slices: Sequence[Slab], limit: float) -> BaseGeometr
     if not taller:
         return slab.void
     top, rim = taller[0], taller[-1]
-    wall = rim.section.buffer(_STEEPEST_WALL * (rim.middle_mm - slab.middle_mm), join_style="mitre")
-    ridges = without(top.section, wall)
+    wall = rim.cross_section.buffer(_STEEPEST_WALL * (rim.middle_mm - slab.middle_mm), join_style="mitre")
+    ridges = without(top.cross_section, wall)
     if not ridges.area:
         return slab.void
     foot = _RIDGE_SLOPE * (top.middle_mm - slab.middle_mm)
-    return without(slab.frame, without(slab.section, ridges.buffer(foot, join_style="mitre")))
+    return without(slab.frame, without(slab.cross_section, ridges.buffer(foot, join_style="mitre")))
 
 
 def _narrowest(
@@ -110,7 +110,7 @@ def _points_on(patches: NDArray[np.object_]) -> NDArray[np.float64]:
     return shapely.get_coordinates(shapely.point_on_surface(patches))
 
 
-def wall_thickness(slices: Sequence[Slab], printer: Printer, size: float) -> Finding:
+def wall_thickness(slices: Sequence[Slab], printer: PrinterSettings, size: float) -> Finding:
     """Whether the walls around the casting are two lines thick where they are thinnest, just below their rim."""
     line = least_line_mm(printer)
     limit = _WALL_LINES * printer.nozzle_mm
@@ -126,7 +126,7 @@ def wall_thickness(slices: Sequence[Slab], printer: Printer, size: float) -> Fin
     return Finding("wall_thickness", status, least, limit, message, spread(_points_on(patches)))
 
 
-def floor_thickness(surface: Surface, printer: Printer) -> Finding:
+def floor_thickness(surface: Surface, printer: PrinterSettings) -> Finding:
     """Whether level faces have as much solid beneath them as a tight floor needs.
 
     Measured upright between level faces, at their middles and near their corners; towards a sharp edge between a

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
-from fabricate.settings import DEFAULTS, Settings
+from fabricate.settings import DEFAULTS, FabricationSettings
 
 from . import parts
 from .plan import Plan
@@ -36,7 +36,7 @@ LID_MM = 3.0
 """Thickness of the lid."""
 
 
-def build_mould(pad: Morphology, settings: Settings = DEFAULTS) -> "Solid":
+def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> "Solid":
     """The mould as a build123d solid, ready for CAD and STEP.
 
     Args:
@@ -93,7 +93,7 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
         ridges = parts.ridge(outline, floor_mm=floor, height_mm=height, terrace_mm=plan.settings.terrace_mm)
         body = body.with_adds(ridges)
     written = [outline for outline in plan.numbers if outline is not None]
-    body = body.with_adds(parts.numbers(written, floor_mm=floor, height_mm=mould.shallow_ridge_height_mm))
+    body = body.with_adds(parts.numeral_prisms(written, floor_mm=floor, height_mm=mould.shallow_ridge_height_mm))
     if mould.pins:
         top = floor + plan.silicone_mm
         body = body.with_adds(parts.pins(_pin_places(plan), top_mm=top, diameter_mm=_pin_mm(plan)))

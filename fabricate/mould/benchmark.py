@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
-from design.benchmarking.harness import Bench, Trial
+from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.curves import flatten
 from design.pad.morphology import Morphology
-from fabricate.settings import DEFAULTS, Mould
+from fabricate.settings import DEFAULTS, MouldSettings
 
 from .assembly import mould_body
 from .plan import Plan, polygon_rings
@@ -36,7 +36,7 @@ _CLEAR_MM = 1.0
 """Near the walls outlines belong to exits."""
 
 
-def trials() -> Iterator[Trial]:
+def trials() -> Iterator[BenchTrial]:
     """Every way at every tolerance for random pads of N in KNOTS, from the fibres to the solid.
 
     The error is the greatest deviation, mm, and the size the tolerance, micrometres; "faces" are triangles of the mesh
@@ -45,10 +45,10 @@ def trials() -> Iterator[Trial]:
     for knots in KNOTS:
         pad = Morphology.random(4, knots, SEED)
         for tolerance in TOLERANCES_MM:
-            settings = replace(DEFAULTS, mould=Mould(tolerance_mm=tolerance, number_mm=0))
+            settings = replace(DEFAULTS, mould=MouldSettings(tolerance_mm=tolerance, number_mm=0))
             plan = partial(Plan, pad, settings)
             for way, (work, judge) in (DIRECT if knots > FUSED_UP_TO else DIRECT | FUSED).items():
-                yield Trial(f"N={knots}", way, 1000 * tolerance, partial(work, plan), partial(judge, plan))
+                yield BenchTrial(f"N={knots}", way, 1000 * tolerance, partial(work, plan), partial(judge, plan))
 
 
 def _meshed(new_plan: Callable[[], Plan]) -> Any:

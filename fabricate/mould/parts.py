@@ -64,7 +64,7 @@ def ridge(
     return [Prism(outline(down), bottom, top - down) for down in below]
 
 
-def numbers(strokes: Iterable[BaseGeometry], *, floor_mm: float = 2.0, height_mm: float = 0.4) -> list[Prism]:
+def numeral_prisms(strokes: Iterable[BaseGeometry], *, floor_mm: float = 2.0, height_mm: float = 0.4) -> list[Prism]:
     """Raised writing on the floor; `strokes` are mirrored, so that they read on the casting."""
     return [Prism(number, floor_mm - INTO_FLOOR_MM, floor_mm + height_mm) for number in strokes]
 

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 from design.common.errors import InputError, instance
 from design.pad.curves import Crossing, crossings, flatten
 from design.pad.morphology import Morphology
-from fabricate.settings import DEFAULTS, Settings
+from fabricate.settings import DEFAULTS, FabricationSettings
 
 from .depth_levels import fibre_levels
 from .numerals import number_strokes, with_room
@@ -47,11 +47,11 @@ class Plan:
     """
 
     pad: Morphology
-    settings: Settings = DEFAULTS
+    settings: FabricationSettings = DEFAULTS
 
     def __post_init__(self) -> None:
         instance("pad", self.pad, Morphology)
-        instance("settings", self.settings, Settings).require_consistent(self.pad.pitch_mm)
+        instance("settings", self.settings, FabricationSettings).require_consistent(self.pad.pitch_mm)
 
     @cached_property
     def lines(self) -> list[shapely.LineString]:

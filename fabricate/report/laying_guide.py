@@ -107,7 +107,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
     }
 
 
-def page(document: Mapping[str, Any]) -> str:
+def laying_page(document: Mapping[str, Any]) -> str:
     """`laying.md` from a whole fabrication document: a page to print and take to the bench."""
     sections = {
         "Print": _printing(document),

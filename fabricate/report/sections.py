@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from design.common.page.elements import Section, figures, folded, heading, html_pieces, paragraph, table
+from design.common.page.elements import PageSection, figures, folded, heading, html_pieces, paragraph, table
 
 from . import laying_guide as laying
 from .mould_view import packed, script, view
@@ -12,7 +12,7 @@ from .mould_view import packed, script, view
 _SHOWN_PLACES = 3
 
 
-def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """The mould of a `fabrication.json` in `folder` with what the checks found, and how to make the pad with it.
 
     Raises:
@@ -22,7 +22,7 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Sect
     return [_mould(folder, document), _bench(document)]
 
 
-def _mould(folder: Path, document: Mapping[str, Any]) -> Section:
+def _mould(folder: Path, document: Mapping[str, Any]) -> PageSection:
     """The mould to be turned, its pictures, and the checks."""
     solid = folder / "mould.stl"
     mesh = packed(solid) if solid.is_file() else None
@@ -31,7 +31,7 @@ def _mould(folder: Path, document: Mapping[str, Any]) -> Section:
     passed = [finding for finding in findings if finding["status"] == "pass"]
     remarks = sorted((each for each in findings if each["status"] != "pass"), key=lambda each: each["status"])
     large = f"{solid.name} is too large to be turned on this page, also when made coarser; the pictures show it."
-    return Section(
+    return PageSection(
         "Mould",
         [
             *([view(mesh, document)] if mesh else [paragraph(large)] if solid.is_file() else []),
@@ -57,10 +57,10 @@ def _mould(folder: Path, document: Mapping[str, Any]) -> Section:
     )
 
 
-def _bench(document: Mapping[str, Any]) -> Section:
+def _bench(document: Mapping[str, Any]) -> PageSection:
     """How to make the pad, as `laying.md` has it: what to print and to mix, lengths to cut, the order of laying."""
-    guide, _, _ = laying.page(document).partition("\n## Checks\n")  # which the mould's section has in full
-    return Section("Making the pad", list(html_pieces(guide)))
+    guide, _, _ = laying.laying_page(document).partition("\n## Checks\n")  # which the mould's section has in full
+    return PageSection("Making the pad", list(html_pieces(guide)))
 
 
 def _checks(findings: Sequence[Mapping[str, Any]]) -> str:

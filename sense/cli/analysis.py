@@ -31,8 +31,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path, as_js
     if it did not, places are found as before.
     """
     from design.common.files import refuse_unwritable, staged, write_json
-    from sense.localizer.calibration.recalibration import lines
     from sense.localizer.calibration.recalibration import recalibrate as follow
+    from sense.localizer.calibration.recalibration import recalibration_lines
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
 
@@ -44,7 +44,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path, as_js
         localizer.save(folder)
         write_json(folder / "recalibration.json", document)
         _copy_health(model, folder)
-    show_result(document, lines(document), as_json)
+    show_result(document, recalibration_lines(document), as_json)
 
 
 def _copy_health(model: Path, folder: Path) -> None:
@@ -85,12 +85,12 @@ def robustness(
     kept when it is broken off, and the same command goes on from them.
     """
     from design.common.files import refuse_unwritable, staged, write_json
-    from sense.localizer.calibration.fibre_loss_study import lines
-    from sense.localizer.calibration.fibre_loss_study import robustness as study
+    from sense.localizer.calibration.fibre_loss_study import fibre_loss_lines
+    from sense.localizer.calibration.fibre_loss_study import fibre_loss_study as study
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
     from sense.report.robustness_figures import draw_robustness
-    from sense.settings import Localizer as Options
+    from sense.settings import LocalizerSettings as Options
 
     if not (model or retrain):
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
@@ -110,7 +110,7 @@ def robustness(
     with staged(out) as folder:
         write_json(folder / "robustness.json", document)
         draw_robustness(document, folder / "robustness.png")
-    show_result(document, lines(document), as_json)
+    show_result(document, fibre_loss_lines(document), as_json)
 
 
 @click.command("size-curve")
@@ -128,11 +128,11 @@ def size_curve(recording: Path, seed: int | None, spec: Path | None, out: Path, 
     Writes size_curve.json and size_curve.png.
     """
     from design.common.files import refuse_unwritable, staged, write_json
-    from sense.localizer.calibration.learning_curve import lines
-    from sense.localizer.calibration.learning_curve import size_curve as study
+    from sense.localizer.calibration.learning_curve import learning_curve as study
+    from sense.localizer.calibration.learning_curve import learning_curve_lines
     from sense.recordings.import_export import open_recording
     from sense.report.robustness_figures import draw_size_curve
-    from sense.settings import Localizer as Options
+    from sense.settings import LocalizerSettings as Options
 
     refuse_unwritable(out)
     options, opened = load_spec(spec).section(Options, seed=seed), open_recording(recording)
@@ -141,7 +141,7 @@ def size_curve(recording: Path, seed: int | None, spec: Path | None, out: Path, 
     with staged(out) as folder:
         write_json(folder / "size_curve.json", document)
         draw_size_curve(document, folder / "size_curve.png")
-    show_result(document, lines(document), as_json)
+    show_result(document, learning_curve_lines(document), as_json)
 
 
 @contextmanager

@@ -60,7 +60,7 @@ def calibrate(
     folder = out or recording.absolute().parent
     with claimed(folder):
         document = run_calibration(load_spec(spec), read_recording(recording), folder, overrides)
-    show_result(document, summary(document), as_json)
+    show_result(document, calibration_lines(document), as_json)
 
 
 def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,10 +73,10 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
     from sense.health import health_model as watch
     from sense.localizer.calibration.calibration import calibrate as learn
     from sense.report.calibration_figures import draw_error_by_loss, draw_error_map
-    from sense.settings import Localizer
+    from sense.settings import LocalizerSettings
 
     refuse_unwritable(out)
-    options = spec.section(Localizer, **overrides)
+    options = spec.section(LocalizerSettings, **overrides)
     with progress() as bar:
         task = bar.add_task("training", total=None, note="")
 
@@ -133,10 +133,10 @@ def evaluate(model: Path, recording: Path, lost: tuple[int, ...] | None, as_json
     localizer = Localizer.load(model)
     levels = range(min(4, localizer.fibres)) if lost is None else lost
     document = test(localizer, read_recording(recording), levels)
-    show_result(document, summary(document), as_json)
+    show_result(document, calibration_lines(document), as_json)
 
 
-def summary(document: Mapping[str, Any]) -> list[str]:
+def calibration_lines(document: Mapping[str, Any]) -> list[str]:
     """The errors of a calibration document as a table for people."""
     names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
     return [

@@ -78,7 +78,7 @@ def live(
         page = stack.enter_context(LivePage(port))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
         show = _json if as_json else stack.enter_context(_terminal())
-        scaling = localizers[0].scaling
+        scaling = localizers[0].normalization
         pad = {
             "title": f"{replay or f'{rig} rig'}, {models[0]}",
             "middle_mm": scaling.middle_mm.tolist(),
@@ -104,11 +104,11 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
 
         return simulated(model)
     from sense.rig.arduino.driver import Arduino
-    from sense.settings import Rig
+    from sense.settings import RigSettings
 
     from .rig import port_of
 
-    options = load_spec(spec).section(Rig)
+    options = load_spec(spec).section(RigSettings)
     return Arduino(port_of(options), options.converter_rate_hz, localizer.fibres)
 
 
@@ -145,10 +145,10 @@ def _terminal() -> "Iterator[Show]":
         yield _plain
         return
     with Live(console=console, refresh_per_second=SHOWN_HZ) as drawn:
-        yield lambda view, events: drawn.update(Text("\n".join(lines(view))))
+        yield lambda view, events: drawn.update(Text("\n".join(view_lines(view))))
 
 
-def lines(view: dict[str, Any]) -> list[str]:
+def view_lines(view: dict[str, Any]) -> list[str]:
     """What there is to show (`Live.view`) as text."""
     latest = view["presses"][-1] if view["presses"] else None
     return [

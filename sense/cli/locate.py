@@ -15,7 +15,7 @@ from .options import FILE, Numbers, model_option, read_recording, recording_argu
 
 if TYPE_CHECKING:
     from sense.health.health_model import HealthModel
-    from sense.health.monitor import Finding
+    from sense.health.monitor import FibreFault
     from sense.recordings.recording import Recording
 
 
@@ -63,7 +63,7 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     """
     from dataclasses import asdict
 
-    from sense.health.monitor import lines
+    from sense.health.monitor import fault_lines
 
     opened = read_recording(recording)
     known, findings = _examined(model, opened)
@@ -73,18 +73,18 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
         "dead": list(known.dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
     }
-    show_result(document, lines(findings, opened.fibres, known.dead), as_json)
+    show_result(document, fault_lines(findings, opened.fibres, known.dead), as_json)
     context.exit(int(bool(findings)))
 
 
-def _findings(model: Path, recording: "Recording") -> "list[Finding]":
+def _findings(model: Path, recording: "Recording") -> "list[FibreFault]":
     """What is wrong with the fibres of a recording, as far as the model's folder tells health."""
     from sense.health.health_model import RECORDED, files_of
 
     return _examined(model, recording)[1] if files_of(model, RECORDED)[0].exists() else []
 
 
-def _examined(model: Path, recording: "Recording") -> "tuple[HealthModel, list[Finding]]":
+def _examined(model: Path, recording: "Recording") -> "tuple[HealthModel, list[FibreFault]]":
     """What health is told by, presses that were found by what was learnt from such, and what is wrong."""
     from sense.health.health_model import FELT, RECORDED, HealthModel
     from sense.health.monitor import examine

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from .options import FILE, read_recording, recording_argument, recording_out_option
-from .rig import describe
+from .rig import recording_line
 
 
 @click.command("import")
@@ -29,7 +29,7 @@ def import_(file: Path, out: Path | None) -> None:
     refuse_existing(folder)
     recording = import_file(file)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))
-    click.echo(describe(recording, folder))
+    click.echo(recording_line(recording, folder))
 
 
 @click.command()

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sense.recordings.recording import Recording
     from sense.rig.devices import Arm, Converter
     from sense.rig.planning.press_plan import PressPlan
-    from sense.settings import Rig
+    from sense.settings import RigSettings
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
@@ -78,21 +78,21 @@ def record(
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from design.common.errors import InputError
-    from design.settings import Pad
+    from design.settings import PadSettings
     from sense.recordings.recorder import START
-    from sense.settings import Rig
+    from sense.settings import RigSettings
 
     settings = load_spec(spec)
-    of_pad = settings.section(Pad)
+    of_pad = settings.section(PadSettings)
     inputs = [path for path in (morphology, plan, spec) if path is not None]
     overrides = {"presses": presses, "seed": seed}
     pad = _pad(morphology, of_pad.grid, of_pad.pitch_mm)
     if rig == "simulated" and not through_drivers:
         if resume or dry_run or plan or model:
             raise InputError("--resume, --dry-run, --plan and --model need --through-drivers or --rig ur5")
-        click.echo(describe(run_recording(settings, pad, out, overrides, inputs), out))
+        click.echo(recording_line(run_recording(settings, pad, out, overrides, inputs), out))
         return
-    options = settings.section(Rig, **overrides)
+    options = settings.section(RigSettings, **overrides)
     command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
     order = Order(pad, options, settings, out, command, inputs)
     for ending in {"SIGTERM", "SIGHUP"} & set(
@@ -103,7 +103,7 @@ def record(
         click.echo(f"{out}: nothing to resume, a new recording begins", err=True)
     with _devices(rig, order) as (arm, converter, chosen):
         recording = _run(order, chosen, arm, converter, plan, model, dry=dry_run, resume=resume)
-    click.echo("dry run: every pose reached, nothing kept" if recording is None else describe(recording, out))
+    click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, out))
 
 
 def _pad(morphology: Path | None, grid: int, pitch_mm: float) -> "Morphology":
@@ -121,10 +121,10 @@ def run_recording(
     from design.settings import Contact
     from sense.recordings.recorder import refuse_existing
     from sense.recordings.simulation import simulate
-    from sense.settings import Rig
+    from sense.settings import RigSettings
 
     refuse_existing(out)
-    options = spec.section(Rig, **overrides)
+    options = spec.section(RigSettings, **overrides)
     with stage("simulate"):
         recording = simulate(pad, options, spec.section(Contact))
     recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
@@ -132,7 +132,7 @@ def run_recording(
 
 
 @contextmanager
-def _devices(rig: str, order: Order) -> Iterator[tuple["Arm", "Converter", "Rig"]]:
+def _devices(rig: str, order: Order) -> Iterator[tuple["Arm", "Converter", "RigSettings"]]:
     """Arm and converter, not yet connected, and the settings for them."""
     if rig == "simulated":
         from design.settings import Contact
@@ -153,7 +153,7 @@ def _devices(rig: str, order: Order) -> Iterator[tuple["Arm", "Converter", "Rig"
         arm.close()
 
 
-def port_of(rig: "Rig") -> str:
+def port_of(rig: "RigSettings") -> str:
     """The board's port, looked for where it is not set."""
     from sense.rig.arduino.serial_link import find_ports
     from sense.rig.devices import RigFault
@@ -167,7 +167,7 @@ def port_of(rig: "Rig") -> str:
 
 def _run(
     order: Order,
-    rig: "Rig",
+    rig: "RigSettings",
     arm: "Arm",
     converter: "Converter",
     plan_file: Path | None,
@@ -199,7 +199,7 @@ def _run(
         return None if dry else Recording.open(folder)
 
 
-def _steering(order: Order, rig: "Rig", model: Path | None) -> Callable[["PressPlan", int], "PressPlan"]:
+def _steering(order: Order, rig: "RigSettings", model: Path | None) -> Callable[["PressPlan", int], "PressPlan"]:
     if rig.plan != "adaptive":
         return lambda plan, press: plan
     import numpy as np
@@ -229,13 +229,13 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
     """
     import time
 
-    from design.settings import Pad
+    from design.settings import PadSettings
     from sense.rig.arduino.serial_link import find_ports
     from sense.rig.diagnostics import Diagnosis, examine_arm, examine_converter
-    from sense.settings import Rig
+    from sense.settings import RigSettings
 
     settings = load_spec(spec)
-    of_pad, options = settings.section(Pad), settings.section(Rig)
+    of_pad, options = settings.section(PadSettings), settings.section(RigSettings)
     order = Order(_pad(None, of_pad.grid, of_pad.pitch_mm), options, settings, Path(), "padforge sense doctor", ())
     ports = [f"{port.device} ({port.kind})" for port in find_ports()]
     found = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
@@ -248,7 +248,7 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
     ctx.exit(0 if passed else 1)
 
 
-def describe(recording: "Recording", out: Path) -> str:
+def recording_line(recording: "Recording", out: Path) -> str:
     """A recording in one line, with what is missing of it."""
     import numpy as np
 

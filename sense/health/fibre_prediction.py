@@ -53,7 +53,7 @@ LOG_SPREAD = (-4.0, 2.0)
 """Range of the logarithm of a predicted spread."""
 
 
-def trace(readings: Array, begun: int, lifted: int, low: int, high: int) -> Array:
+def press_trace(readings: Array, begun: int, lifted: int, low: int, high: int) -> Array:
     """The readings around one press.
 
     Args:
@@ -73,7 +73,7 @@ def trace(readings: Array, begun: int, lifted: int, low: int, high: int) -> Arra
 def traces_of(readings: Array, begun: Indices, lifted: Indices) -> Array:
     """(Q, C, TRACE) traces of all presses of (R, C) readings."""
     lows, highs = np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
-    return np.stack([trace(readings, *press) for press in zip(begun, lifted, lows, highs, strict=True)])
+    return np.stack([press_trace(readings, *press) for press in zip(begun, lifted, lows, highs, strict=True)])
 
 
 @dataclass
@@ -176,7 +176,9 @@ def _silu(x: Floats) -> Floats:
     return x * expit(x)
 
 
-def train(inputs: Floats, targets: Array, rows: list[Indices], rng: np.random.Generator) -> dict[str, Floats]:
+def train_predictors(
+    inputs: Floats, targets: Array, rows: list[Indices], rng: np.random.Generator
+) -> dict[str, Floats]:
     """Fit one member to each set of presses.
 
     Args:

@@ -18,11 +18,11 @@ from safetensors.numpy import load, save
 from design.common.errors import InputError, instance, real
 from design.common.files import atomic, read_bytes, read_json, writing
 from design.common.settings import validated
-from sense.processing.limits import LEAST_SPREAD_V, numbers, stream_of
+from sense.processing.limits import LEAST_SPREAD_V, as_numbers, stream_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import HYPOTHESES, Evidence
-from .fibre_prediction import MEMBERS, REST, Shapes, Weights, expected, member, shapes_of, traces_of, train
+from .fibre_prediction import MEMBERS, REST, Shapes, Weights, expected, member, shapes_of, traces_of, train_predictors
 from .schema import FORMAT, LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, WEAK_PRESSES, HealthDocument, refuse_unsound
 
 RECORDED, FELT = "health", "health_live"
@@ -122,7 +122,9 @@ class HealthModel:
         shapes, inputs, targets = shapes_of(traces)
         presses = np.arange(len(traces))
         fold, settled = presses // min(BLOCK, len(traces) // (4 * MEMBERS)) % MEMBERS, presses >= SETTLED
-        weights = train(inputs, targets, [np.flatnonzero(settled & (fold != k)) for k in range(MEMBERS)], rng)
+        weights = train_predictors(
+            inputs, targets, [np.flatnonzero(settled & (fold != k)) for k in range(MEMBERS)], rng
+        )
 
         def judged(lost: Indices) -> tuple[Array, Array]:
             """Means and spreads without the fibres `lost`, by the member that never saw the press: of its own presses
@@ -254,7 +256,7 @@ def checked_presses(
         InputError: they are something else.
     """
     times_s, readings = stream_of(times_s, readings)
-    begun, lifted = (numbers(edges, np.int64, "presses", copy=False) for edges in (begun, lifted))
+    begun, lifted = (as_numbers(edges, np.int64, "presses", copy=False) for edges in (begun, lifted))
     if len(readings) < 2:
         raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2")
     if begun.ndim != 1 or begun.shape != lifted.shape or len(begun) == 0:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, whole
-from sense.processing.limits import MAX_VOLTS, numbers, refuse_beyond
+from sense.processing.limits import MAX_VOLTS, as_numbers, refuse_beyond
 
 from .alarm_thresholds import climb
 from .fault_likelihoods import HYPOTHESES, MOST, noise_of
-from .fibre_prediction import RELEASED, REST, Floats, History, expected, trace
+from .fibre_prediction import RELEASED, REST, Floats, History, expected, press_trace
 from .health_model import SETTLED, HealthModel, checked_presses
 
 MISSING = 20
@@ -48,7 +48,7 @@ TEXTS = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class FibreFault:
     """A fibre at fault.
 
     Attributes:
@@ -108,7 +108,7 @@ class Monitor:
         """Fibres that are not to be relied on, by index: dead from the first, or named since."""
         return tuple(sorted((*self.model.dead, *self.model.living[self._lost].tolist())))
 
-    def update(self, readings: Array, begun: int, lifted: int) -> list[Finding]:
+    def update(self, readings: Array, begun: int, lifted: int) -> list[FibreFault]:
         """Take in the next press.
 
         Args:
@@ -122,13 +122,13 @@ class Monitor:
         Raises:
             InputError: other fibres than health was learnt from, or indices out of range.
         """
-        readings = numbers(readings, np.float64, "readings", copy=False)
+        readings = as_numbers(readings, np.float64, "readings", copy=False)
         if readings.ndim != 2 or readings.shape[1] != self.model.fibres:
             raise InputError(f"readings have shape {readings.shape}, expected (R, {self.model.fibres})")
         refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
         begun = whole("begun", begun, 1, len(readings) - 1)
         lifted = whole("lifted", lifted, begun + 1, len(readings))
-        traces = trace(readings[:, self.model.living], begun, lifted, 0, len(readings))
+        traces = press_trace(readings[:, self.model.living], begun, lifted, 0, len(readings))
         level, settled = self._history.level, self._history.seen >= SETTLED
         inputs, targets = self.model.shapes.scaled(*self.model.shapes.advance(traces, self._history))
         self._recent.append(_Press(traces, inputs, targets, level, settled))
@@ -140,12 +140,12 @@ class Monitor:
         self.presses += 1
         return findings
 
-    def _absent(self, traces: Array) -> list[Finding]:
+    def _absent(self, traces: Array) -> list[FibreFault]:
         self._missing = np.where(np.isfinite(traces).all(axis=1), 0, self._missing + 1)
         gone = ~self._lost & (self._missing == MISSING)
         self._lost |= gone
         since = self.presses - MISSING + 1
-        return [Finding(self.presses, since, (int(c),), "missing", MOST_SCORE) for c in self.model.living[gone]]
+        return [FibreFault(self.presses, since, (int(c),), "missing", MOST_SCORE) for c in self.model.living[gone]]
 
     def _rarity(self, height: Array, lost: Mask) -> Array:
         """(L, H); of lost fibres minus infinity."""
@@ -179,7 +179,7 @@ class Monitor:
         """Kept presses from index `first` on."""
         return list(self._recent)[first - self.presses - 1 :]
 
-    def _name(self) -> Finding:
+    def _name(self) -> FibreFault:
         """The fibre at fault, now that one is: it is lost from here on, and the climbs are as if it always had been.
 
         A bad fibre spoils what is expected of the others. So every suspect is judged anew by the fibres that are
@@ -210,7 +210,7 @@ class Monitor:
         score = min(float(worst[fibre] / np.log(10)), MOST_SCORE)
         self._lost[list(fibres)] = True
         self._replay(first, self._lost)
-        return Finding(self.presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
+        return FibreFault(self.presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
 
     def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> tuple[int, int] | None:
         """The one of `pairs` whose readings since `first` fit far better if exchanged, if there is one."""
@@ -260,7 +260,7 @@ class Monitor:
         return self.presses + 1 - len(self._recent)
 
 
-def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> list[Finding]:
+def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> list[FibreFault]:
     """Follow a whole recording.
 
     Args:
@@ -277,14 +277,14 @@ def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices,
     instance("model", model, HealthModel).refuse_other(readings, times_s)
     monitor = Monitor(model)
     lows, highs = np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
-    findings: list[Finding] = []
+    findings: list[FibreFault] = []
     for down, up, low, high in zip(begun, lifted, lows, highs, strict=True):
         first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
         findings += monitor.update(readings[first:last], int(down - first), int(up - first))
     return findings
 
 
-def lines(findings: Sequence[Finding], fibres: int, dead: Sequence[int] = ()) -> list[str]:
+def fault_lines(findings: Sequence[FibreFault], fibres: int, dead: Sequence[int] = ()) -> list[str]:
     """What to tell of a pad of so many fibres, of which `dead` never lived: a line each finding, and what is left."""
     bad = {fibre for finding in findings for fibre in finding.fibres} | set(dead)
     sound = [str(fibre) for fibre in range(fibres) if fibre not in bad]

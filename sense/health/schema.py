@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
-from design.common.settings import Section
+from design.common.settings import Settings
 from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
 
 from .fault_likelihoods import HYPOTHESES, LIBRARY, STEPS
@@ -32,7 +32,7 @@ MAX_VALUE = 1e6
 """Greatest number of a sound model, by amount."""
 
 
-class HealthDocument(Section):
+class HealthDocument(Settings):
     """The whole of `health.json`, see `HealthModel`."""
 
     format: Literal["padforge-health/1"] = FORMAT

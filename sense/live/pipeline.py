@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, real, shown, whole
 from sense.health.health_model import HealthModel
-from sense.health.monitor import Finding, Monitor
+from sense.health.monitor import FibreFault, Monitor
 from sense.localizer.features import REST, bridged, press_inputs
 from sense.localizer.localizer import RATE_TOLERANCE, Localizer
 from sense.localizer.normalization import Scaled
@@ -63,7 +63,7 @@ class Estimate:
         )
 
 
-Event = Estimate | Finding
+Event = Estimate | FibreFault
 
 
 class Live:
@@ -100,7 +100,7 @@ class Live:
         self._press: Press | None = None
         self._count = self._free = 0
         self.presses: deque[Estimate] = deque(maxlen=TRAIL)
-        self.findings: list[Finding] = []
+        self.findings: list[FibreFault] = []
 
     @property
     def pressed(self) -> bool:
@@ -219,7 +219,7 @@ class Live:
         # The press before stands in by its end alone: the rest of this one reaches back no further.
         begins, ends = ([free - 1, begun], [free, lifted]) if free > 0 else ([begun], [lifted])
         raw = press_inputs(readings, np.array(begins), np.array(ends), localizer.features)[-1:]
-        presses = localizer.scaling.inputs(raw)
+        presses = localizer.normalization.inputs(raw)
         alive = presses.alive.copy()
         alive[:, list(self.lost)] = False
         found = localizer.locate(Scaled(presses.inputs, alive))
@@ -242,7 +242,7 @@ class Live:
         self.presses.append(estimate)
         return estimate
 
-    def _judge(self, press: Press, end: int) -> list[Finding]:
+    def _judge(self, press: Press, end: int) -> list[FibreFault]:
         """What a press that is over says of the fibres."""
         if self._monitor is None:
             return []
@@ -255,7 +255,7 @@ class Live:
 
 def _usual(localizer: Localizer) -> Array:
     """(C,) V, what a fibre's answer to a press goes up to."""
-    usual = (np.abs(localizer.scaling.centre) + 2 * localizer.scaling.spread).max(axis=1)
+    usual = (np.abs(localizer.normalization.centre) + 2 * localizer.normalization.spread).max(axis=1)
     return np.where(usual > 0, usual, 1.0)
 
 

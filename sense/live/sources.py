@@ -17,7 +17,7 @@ from sense.recordings.recording import Recording
 from sense.rig.devices import Converter
 from sense.rig.emulators.live_pad import DemoConverter
 from sense.rig.session.averaging import Averager
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 Array = NDArray[np.float64]
 Block = tuple[Array, Array]
@@ -97,4 +97,6 @@ def simulated(model: Path) -> DemoConverter:
         contact, rig = dict(source["contact"]), dict(source["rig"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
-    return DemoConverter(pad, validated(Rig, rig, f"{path}: rig"), validated(Contact, contact, f"{path}: contact"))
+    return DemoConverter(
+        pad, validated(RigSettings, rig, f"{path}: rig"), validated(Contact, contact, f"{path}: contact")
+    )

@@ -108,7 +108,7 @@ def errors_by_loss(
         level = whole("lost", level, 0, fibres - 1)
         subsets = lost_subsets(fibres, level)
         found = [locate(subset) for subset in subsets]
-        rows.append(summary(level, found, places_mm))
+        rows.append(error_row(level, found, places_mm))
         by_subset += [
             {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
             for subset, each in zip(subsets, found, strict=True)
@@ -168,7 +168,7 @@ def idle_share(recording: Recording) -> Array:
     return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
 
 
-def summary(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
+def error_row(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
     """A row of "errors" from what was found with each set of so many lost fibres."""
     errors = np.stack([distances(each.places_mm, places_mm) for each in found])
     means = errors.mean(axis=1)

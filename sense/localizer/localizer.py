@@ -18,7 +18,7 @@ from sense.recordings.recording import Recording
 
 from .features import SIZES, Inputs, press_inputs
 from .network import Floats, Weights, forward, masked, pooled, refuse_unsound
-from .normalization import Scaled, Scaling
+from .normalization import Normalization, Scaled
 from .schema import FORMAT, read_document
 
 DOCUMENT, WEIGHTS = "localizer.json", "localizer.safetensors"
@@ -68,7 +68,7 @@ class Localizer:
     """
 
     weights: Weights
-    scaling: Scaling
+    normalization: Normalization
     table: Floats
     method: str
     features: str
@@ -84,11 +84,11 @@ class Localizer:
     @property
     def fibres(self) -> int:
         """C, the number of fibres it was trained on, lost ones included."""
-        return len(self.scaling.centre)
+        return len(self.normalization.centre)
 
     def inputs(self, recording: Recording) -> Scaled:
         """The scaled inputs of every press of `recording`; raises what `raw_inputs` raises."""
-        return self.scaling.inputs(self.raw_inputs(recording))
+        return self.normalization.inputs(self.raw_inputs(recording))
 
     def raw_inputs(self, recording: Recording) -> Inputs:
         """The inputs of every press of `recording` in volts.
@@ -122,14 +122,14 @@ class Localizer:
             (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (np.empty((0, 2)),) * 2
         )
         level = np.minimum((~alive).sum(axis=1), len(self.factors) - 1)
-        to_sd, to_r50, to_r90 = self.factors[level].T * self.scaling.span_mm
+        to_sd, to_r50, to_r90 = self.factors[level].T * self.normalization.span_mm
         radius = np.hypot(*spread.T)
         sd, r50, r90 = to_sd[:, None] * spread, to_r50 * radius, to_r90 * radius
         blind = np.logical_not(alive.all(axis=1) if self.method == "published" else alive.any(axis=1))
-        anywhere = np.array(UNKNOWN) * self.scaling.span_mm
+        anywhere = np.array(UNKNOWN) * self.normalization.span_mm
         places, sd = np.where(blind[:, None], 0.0, places), np.where(blind[:, None], anywhere[0], sd)
         r50, r90 = np.where(blind, anywhere[1], r50), np.where(blind, anywhere[2], r90)
-        return Found(self.scaling.places_mm(places), sd, r50, r90)
+        return Found(self.normalization.places_mm(places), sd, r50, r90)
 
     def _pooled(self, inputs: Floats, alive: NDArray[np.bool_]) -> tuple[Floats, Floats]:
         entries = inputs.reshape(len(inputs), -1) if self.method == "published" else masked(inputs, alive)
@@ -168,12 +168,12 @@ class Localizer:
             "fibres": self.fibres,
             "rate_hz": self.rate_hz,
             "scaling": {
-                "centre_v": self.scaling.centre.tolist(),
-                "spread_v": self.scaling.spread.tolist(),
-                "memory": self.scaling.memory.tolist(),
-                "usual_v": self.scaling.usual.tolist(),
-                "middle_mm": self.scaling.middle_mm.tolist(),
-                "span_mm": self.scaling.span_mm,
+                "centre_v": self.normalization.centre.tolist(),
+                "spread_v": self.normalization.spread.tolist(),
+                "memory": self.normalization.memory.tolist(),
+                "usual_v": self.normalization.usual.tolist(),
+                "middle_mm": self.normalization.middle_mm.tolist(),
+                "span_mm": self.normalization.span_mm,
             },
             "factors": self.factors.tolist(),
             "weights_sha256": hashlib.sha256(content).hexdigest(),
@@ -207,7 +207,7 @@ class Localizer:
         content = read_bytes(path)
         if hashlib.sha256(content).hexdigest() != document.weights_sha256:
             raise InputError(f"{path}: not the weights that {DOCUMENT} was written with; calibrate again")
-        scaling = Scaling(
+        normalization = Normalization(
             np.array(document.scaling.centre_v),
             np.array(document.scaling.spread_v),
             np.array(document.scaling.memory).reshape(document.fibres, -1, SIZES[document.features]),
@@ -218,13 +218,13 @@ class Localizer:
         try:
             weights = load(content)
             table = weights.pop(TABLE)
-            scaling.refuse_unsound(table)
-            refuse_unsound(weights, scaling.entries(document.method), document.method)
+            normalization.refuse_unsound(table)
+            refuse_unsound(weights, normalization.entries(document.method), document.method)
         except (KeyError, TypeError, ValueError, SafetensorError) as error:
             raise InputError(f"{path}: no weights of the localizer that {DOCUMENT} describes ({error})") from error
         return cls(
             weights=weights,
-            scaling=scaling,
+            normalization=normalization,
             table=table,
             method=document.method,
             features=document.features,

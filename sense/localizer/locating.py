@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, instance, shown
 from design.common.files import write_text, writing
-from sense.health.monitor import Finding
+from sense.health.monitor import FibreFault
 from sense.recordings.recording import Recording
 
 from .localizer import Found, Localizer
@@ -30,7 +30,9 @@ def write_places(found: Found, path: str | Path) -> None:
         write_text(Path(path), "\n".join([",".join(COLUMNS), *lines]) + "\n")
 
 
-def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = (), findings: Sequence[Finding] = ()) -> Found:
+def locate(
+    localizer: Localizer, recording: Recording, lost: ArrayLike = (), findings: Sequence[FibreFault] = ()
+) -> Found:
     """Find the place of every press of `recording`, without the fibres `lost`, by index.
 
     Args:
@@ -44,7 +46,7 @@ def locate(localizer: Localizer, recording: Recording, lost: ArrayLike = (), fin
     if not isinstance(findings, Sequence):
         raise InputError(f"findings are {shown(findings)}, expected a sequence of them")
     for finding in findings:
-        fibres = list(instance("findings", finding, Finding).fibres)
+        fibres = list(instance("findings", finding, FibreFault).fibres)
         if max(fibres, default=0) >= localizer.fibres:
             raise InputError(f"findings name fibre {max(fibres)}, allowed are 0 to {localizer.fibres - 1}")
         alive[finding.since :, fibres] = False

@@ -10,7 +10,7 @@ from sense.processing.limits import LEAST_SPREAD_V
 
 from .features import Inputs
 from .network import Floats
-from .response_model import STEPS, Response, settled
+from .response_model import STEPS, ResponseModel, settled
 
 MAX_INPUT = 1e4
 """Greatest scaled input, in spreads: what lies further off is no press, and is held there."""
@@ -37,7 +37,7 @@ class Scaled:
 
 
 @dataclass(frozen=True)
-class Scaling:
+class Normalization:
     """Fitted on the presses of training.
 
     Attributes:
@@ -54,7 +54,7 @@ class Scaling:
     span_mm: float
 
     @classmethod
-    def fit(cls, inputs: Inputs, places_mm: Array) -> tuple["Scaling", Floats]:
+    def fit(cls, inputs: Inputs, places_mm: Array) -> tuple["Normalization", Floats]:
         """From the inputs and the places (Q, 2) of the presses of training.
 
         A window is scaled by the geometric mean of its own spread and its fibre's: the fine windows of a touch keep
@@ -65,7 +65,7 @@ class Scaling:
         """
         low, high = places_mm.min(axis=0), places_mm.max(axis=0)
         middle, span = (low + high) / 2, float((high - low).max() / 2) or 1.0
-        response = Response.fit((places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive)
+        response = ResponseModel.fit((places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive)
         windows = settled(inputs.windows, inputs.history, response.memory, response.usual)
         there = np.broadcast_to(inputs.alive[:, :, None], windows.shape)
         centre = _mean(windows, there)

@@ -27,7 +27,7 @@ _PART = 16_384
 
 
 @dataclass(frozen=True)
-class Response:
+class ResponseModel:
     """A fitted pad.
 
     Attributes:
@@ -41,7 +41,7 @@ class Response:
     usual: Array
 
     @classmethod
-    def fit(cls, places: Array, windows: Array, history: Array, alive: NDArray[np.bool_]) -> "Response":
+    def fit(cls, places: Array, windows: Array, history: Array, alive: NDArray[np.bool_]) -> "ResponseModel":
         """From places (Q, 2) within [-1, 1], windows (Q, C, F) V, history (Q, C, J) V of presses of training.
 
         A fibre learns from the presses in which it is alive, (Q, C).

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, JsonValue, ValidationError
 
 from design.common.errors import InputError
-from design.common.settings import Section
+from design.common.settings import Settings
 from sense.processing.limits import LEAST_SPREAD_V, MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
 from sense.settings import Features, Method, Split
 
@@ -32,7 +32,7 @@ Distance = Annotated[float, Field(ge=0)]
 Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
 
 
-class ScalingTable(Section):
+class ScalingTable(Settings):
     """`scaling` of `localizer.json`, see `localizer.Scaling`."""
 
     centre_v: list[list[Volts]]
@@ -43,7 +43,7 @@ class ScalingTable(Section):
     span_mm: float = Field(gt=0, le=MAX_MM)
 
 
-class ErrorRow(Section):
+class ErrorRow(Settings):
     """A row of `errors`, see `calibration.evaluate`."""
 
     lost: int = Field(ge=0)
@@ -57,7 +57,7 @@ class ErrorRow(Section):
     within_r90: Share
 
 
-class LocalizerDocument(Section):
+class LocalizerDocument(Settings):
     """The whole of `localizer.json`, see `localizer.Localizer`."""
 
     format: Literal["padforge-localizer/2"] = FORMAT

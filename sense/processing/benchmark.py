@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import linprog
 
-from design.benchmarking.harness import Bench, Trial
+from design.benchmarking.harness import Bench, BenchTrial
 
 from .filters import running_median, total_variation
 
@@ -28,7 +28,7 @@ _CYCLE = 40  # readings from press to press, half of them pressed
 _STEP_V = 3.3 / 1023  # of the converter
 
 
-def trials() -> Iterator[Trial]:
+def trials() -> Iterator[BenchTrial]:
     """Filters of a made-up fibre of READINGS, the published one by other means too, and of LONG.
 
     The error is the rms deviation from the clean signal as a share of that of the readings; "excess" is the share by
@@ -52,14 +52,14 @@ def trials() -> Iterator[Trial]:
     case = f"{READINGS} readings"
     for lam in LAMS:
         judge = minimised if lam == PUBLISHED else filtered
-        yield Trial(case, "robust", lam, partial(total_variation, noisy, lam), judge)
+        yield BenchTrial(case, "robust", lam, partial(total_variation, noisy, lam), judge)
     for lam in LAMS_V:
-        yield Trial(case, "squares", lam, partial(total_variation, noisy, lam, "squares"), filtered)
+        yield BenchTrial(case, "squares", lam, partial(total_variation, noisy, lam, "squares"), filtered)
     for width in WIDTHS:
-        yield Trial(case, "median", width, partial(running_median, noisy, width), filtered)
-    yield Trial(case, "LP (HiGHS)", PUBLISHED, partial(linear_program, noisy, PUBLISHED), minimised)
+        yield BenchTrial(case, "median", width, partial(running_median, noisy, width), filtered)
+    yield BenchTrial(case, "LP (HiGHS)", PUBLISHED, partial(linear_program, noisy, PUBLISHED), minimised)
     for steps in STEPS:
-        yield Trial(case, "iterative", steps, partial(iterated, noisy, PUBLISHED, steps), minimised)
+        yield BenchTrial(case, "iterative", steps, partial(iterated, noisy, PUBLISHED, steps), minimised)
     for count in LONG:
         long = fibre(count, np.random.default_rng(0))[1]
         ways: dict[tuple[str, float], Callable[[], Array]] = {
@@ -69,7 +69,7 @@ def trials() -> Iterator[Trial]:
             ("median", WIDTHS[3]): partial(running_median, long, WIDTHS[3]),
         }
         for (way, size), work in ways.items():
-            yield Trial(f"{count} readings", way, size, work, lambda found: {"excess": None})
+            yield BenchTrial(f"{count} readings", way, size, work, lambda found: {"excess": None})
 
 
 def fibre(count: int, rng: np.random.Generator) -> tuple[Array, Array]:

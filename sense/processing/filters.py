@@ -21,7 +21,7 @@ from sense.processing.kernels import running_median as median
 from sense.processing.kernels import total_variation_l1 as robust_variation
 from sense.processing.kernels import total_variation_l2 as square_variation
 
-from .limits import MAX_S, numbers, refuse_beyond
+from .limits import MAX_S, as_numbers, refuse_beyond
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -50,7 +50,7 @@ def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
     Raises:
         InputError: times that are not finite, beyond 1e10 s or do not ascend, or an interval that is not above 0.
     """
-    times = numbers(times_s, np.float64, "times_s")
+    times = as_numbers(times_s, np.float64, "times_s")
     if times.ndim != 1:
         raise InputError(f"times_s have shape {times.shape}, expected (R,)")
     refuse_beyond("times_s", times[:, None], MAX_S, "s")
@@ -154,7 +154,7 @@ def checked_readings(readings: ArrayLike) -> Array:
     Raises:
         InputError: they are no real numbers, or beyond GREATEST.
     """
-    array = numbers(readings, np.float64, "readings")
+    array = as_numbers(readings, np.float64, "readings")
     beyond = np.abs(array) > GREATEST
     if beyond.any():
         first = np.argwhere(beyond)[0].tolist()
@@ -166,7 +166,7 @@ def checked_readings(readings: ArrayLike) -> Array:
 
 
 def _checked_starts(starts: ArrayLike, readings: int) -> list[int]:
-    array = numbers(starts, np.int64, "starts")
+    array = as_numbers(starts, np.int64, "starts")
     if array.ndim != 1 or (np.diff(array) <= 0).any() or (len(array) and not 0 <= array[0] <= array[-1] < readings):
         raise InputError(f"starts are {shown(starts)}, allowed are ascending indices of {readings} readings")
     return array.tolist()

@@ -19,7 +19,7 @@ MAX_INDEX = 2**53
 """Greatest index that float64 holds exactly."""
 
 
-def numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
+def as_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
     """`values`, or a copy of them, as an array of float64, or of int64 where all are whole numbers.
 
     Raises:
@@ -60,8 +60,8 @@ def stream_of(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None
     Raises:
         InputError: shapes that do not fit together, what is beyond the limits above, or times that do not ascend.
     """
-    times = numbers(times_s, np.float64, "times", copy=False)
-    rows = numbers(readings, np.float64, "readings", copy=False)
+    times = as_numbers(times_s, np.float64, "times", copy=False)
+    rows = as_numbers(readings, np.float64, "readings", copy=False)
     if times.ndim != 1 or rows.ndim != 2 or len(rows) != len(times) or rows.shape[1] != (fibres or rows.shape[1]):
         raise InputError(
             f"times have shape {times.shape} and readings {rows.shape}, expected (n,) and (n, {fibres or 'C'})"

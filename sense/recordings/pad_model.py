@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from design import Contact, Morphology, signals
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 Array = NDArray[np.float64]
 
@@ -142,7 +142,7 @@ def digitised(volts: Array) -> Array:
     return np.clip(np.rint(volts / SUPPLY_V * ADC_STEPS), 0, ADC_STEPS) * (SUPPLY_V / ADC_STEPS)
 
 
-def read_pad(signals: Array, cycle: Cycle, rig: Rig, rng: np.random.Generator) -> Array:
+def read_pad(signals: Array, cycle: Cycle, rig: RigSettings, rng: np.random.Generator) -> Array:
     """(Q, C) signals of a plan of presses to (Q readings, C) volts as the ADC gives them."""
     model = Divider(signals.shape[1], cycle.rate_hz, rig, rng)
     indented = indentation(cycle, rng.uniform(*DELAY_S, (len(signals), 2)))
@@ -152,7 +152,7 @@ def read_pad(signals: Array, cycle: Cycle, rig: Rig, rng: np.random.Generator) -
 class Divider:
     """The fibres of a simulated pad in their dividers, read by an ADC; may be asked bit by bit."""
 
-    def __init__(self, fibres: int, rate_hz: float, rig: Rig, rng: np.random.Generator) -> None:
+    def __init__(self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator) -> None:
         self._rest_v = rng.uniform(*REST_V, fibres)
         self._answer = Answer(rate_hz, rig.creep, rig.hysteresis)
         self._wander = Wander(fibres, rate_hz, rng)
@@ -176,7 +176,9 @@ class LivePad:
         rate_hz: at which it is asked. rng: of rests, drift and noise.
     """
 
-    def __init__(self, pad: Morphology, contact: Contact, rig: Rig, rate_hz: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, rng: np.random.Generator
+    ) -> None:
         self._pad, self._contact = pad, contact
         self._divider = Divider(2 * pad.grid, rate_hz, rig, rng)
         self._known: dict[tuple[float, float], Array] = {}

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from design.common.errors import InputError, shown, whole
 from design.common.files import lock, read_json, refuse_unwritable, write_json, writing
-from sense.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, numbers
+from sense.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, as_numbers
 
 from .block_file import BlockWriter, write_at
 from .press_journal import cut_torn_line, read_journal
@@ -119,7 +119,7 @@ class Recorder:
             InputError: shapes that do not fit, or times that are not finite.
             OSError: the disk is full or gone; then nothing was added.
         """
-        times, volts = numbers(times_s, np.float64, "times"), numbers(readings, np.float64, "readings")
+        times, volts = as_numbers(times_s, np.float64, "times"), as_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self._fibres) or not np.isfinite(times).all():
             raise InputError(
                 f"times have shape {times.shape} and readings {volts.shape}, expected (n,) finite numbers and "
@@ -153,7 +153,7 @@ class Recorder:
         Raises:
             InputError: a place, index or number that no press has, or what JSON cannot hold.
         """
-        place = numbers(place_mm, np.float64, "place")
+        place = as_numbers(place_mm, np.float64, "place")
         if place.shape != (2,) or not (np.isnan(place).all() or (np.abs(place) <= MAX_MM).all()):
             raise InputError(f"place is {shown(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
         number = self._press if press is None else whole("press", press, 0, MAX_INDEX)

@@ -21,7 +21,7 @@ from sense.processing.limits import (
     MAX_S,
     MAX_VOLTS,
     MIN_RATE_HZ,
-    numbers,
+    as_numbers,
     refuse_beyond,
     refuse_descent,
 )
@@ -69,7 +69,7 @@ class Recording:
             ("begun", np.int64),
             ("lifted", np.int64),
         ):
-            array = numbers(getattr(self, name), kind, name)
+            array = as_numbers(getattr(self, name), kind, name)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         _validate(self)

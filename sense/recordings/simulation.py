@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from design import Contact, Morphology, signals
 from design.common.errors import MOST_VALUES, InputError, instance, whole
-from design.common.settings import section
+from design.common.settings import or_default
 from sense.processing.limits import MAX_FIBRES
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 from .pad_model import Cycle, read_pad
 from .recording import Recording
@@ -18,7 +18,7 @@ JITTER = 0.1
 Array = NDArray[np.float64]
 
 
-def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = None) -> Recording:
+def simulate(pad: Morphology, rig: RigSettings | None = None, contact: Contact | None = None) -> Recording:
     """Record presses at random places on a simulated pad.
 
     A press takes a cycle of readings: the probe goes down in its middle and up at its end.
@@ -33,7 +33,7 @@ def simulate(pad: Morphology, rig: Rig | None = None, contact: Contact | None = 
         InputError: more fibres or readings than a recording may hold.
     """
     instance("pad", pad, Morphology)
-    rig, contact = section("rig", rig, Rig), section("contact", contact, Contact)
+    rig, contact = or_default("rig", rig, RigSettings), or_default("contact", contact, Contact)
     whole("fibres of the pad", 2 * pad.grid, 2, MAX_FIBRES)
     values = rig.presses * rig.readings_per_press * 2 * pad.grid
     if values > MOST_VALUES:

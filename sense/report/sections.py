@@ -7,7 +7,7 @@ from typing import Any
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
-from design.common.page.elements import Section, beside, figures, folded, heading, paragraph, table
+from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
 from sense.processing.limits import MAX_FIBRES
 
 from .loss_chart import Errors, loss_chart
@@ -21,7 +21,7 @@ _HARDEST = 10
 _COUNTED = ("one fibre", "two fibres", "three fibres")
 
 
-def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """Where the readings of a recording in `folder` came from, by its `start.json`.
 
     Raises:
@@ -32,10 +32,10 @@ def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[Sectio
     origin = {"simulated": "the simulated rig", "rig": "a rig"}.get(kind) or source.get("file", kind)
     rig = source.get("rig", {})
     how = f", {rig['rate_hz']:g} a second; presses {rig['depth_mm']:g} mm deep" if rig else ""
-    return [Section("Recording", [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")])]
+    return [PageSection("Recording", [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")])]
 
 
-def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """Errors of a `calibration.json` in `folder`, by lost fibres and by place, and how often each fibre is idle.
 
     Where no `robustness.json` says more, what the loss of which fibres does follows.
@@ -48,7 +48,7 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Sect
     first, last = rows[0], rows[-1]
     idle = [f"{share:.0%}" for share in document["idle_share"]]
     held = {"random": "drawn at random", "chronological": "the last ones"}.get(document["split"], document["split"])
-    section = Section(
+    section = PageSection(
         "Calibration",
         [
             paragraph(
@@ -85,7 +85,7 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Sect
     return [section, *([] if (folder / "robustness.json").exists() else robustness_sections(folder, document))]
 
 
-def robustness_sections(folder: Path, document: Mapping[str, Any]) -> list[Section]:
+def robustness_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """What the loss of which fibres does, from a `robustness.json` or `calibration.json`; none if none was lost.
 
     Raises:
@@ -112,7 +112,7 @@ def robustness_sections(folder: Path, document: Mapping[str, Any]) -> list[Secti
             picture,
             *body,
         ]
-    return [Section("Robustness", body)]
+    return [PageSection("Robustness", body)]
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:

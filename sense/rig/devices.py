@@ -83,7 +83,7 @@ class Arm(Protocol):
 
 
 @dataclass(frozen=True)
-class Samples:
+class ConverterSamples:
     """Readings as they come from a converter.
 
     Attributes:
@@ -103,7 +103,7 @@ class Converter(Protocol):
         """Open the link and start sampling; returns name, firmware version, channels, bits, rate_hz as JSON."""
         ...
 
-    def read(self) -> Samples:
+    def read(self) -> ConverterSamples:
         """All samples since the last call, without waiting; RigFault("stale") after 1 s without any, "lost" if gone."""
         ...
 

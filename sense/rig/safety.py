@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import NoReturn
 
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 from .devices import Arm, ArmState, RigFault
 
@@ -46,7 +46,7 @@ class Limits:
     deadline_s: float = 30.0
 
     @classmethod
-    def of(cls, rig: Rig) -> "Limits":
+    def of(cls, rig: RigSettings) -> "Limits":
         """The limits that `[rig]` says; RigFault("refused") where the workspace is unknown."""
         if rig.box_mm is None:
             raise RigFault(

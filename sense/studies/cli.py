@@ -54,7 +54,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
         ) -> None:
             from design.common.files import refuse_unwritable
 
-            from .study import lines, run
+            from .study import run, study_lines
 
             refuse_unwritable(out)
             with progress() as bar:
@@ -71,7 +71,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
                     print("padforge: interrupted; --resume goes on from what was finished", file=sys.stderr, flush=True)
                     # At once: threads in the middle of their arithmetic cannot be told to stop, nor be waited for.
                     os._exit(INTERRUPTED)
-            show_result(document, [*lines(document), "", f"{name} -> {out / name}.png"], as_json)
+            show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (
             click.argument("names", metavar=f"[{of}]...", nargs=-1),

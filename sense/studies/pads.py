@@ -70,9 +70,9 @@ def _load(name: str, seed: int) -> tuple[str, Morphology]:
 def _optimised(grid: int, seed: int) -> Morphology:
     """What the default search finds from a single start, under the default rules."""
     from design.optimisers.search import search
-    from design.settings import Contact, Pad, Rules, Search
+    from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-    return search(Pad(grid=grid), Contact(), Search(starts=1, seed=seed), Rules()).morphology
+    return search(PadSettings(grid=grid), Contact(), SearchSettings(starts=1, seed=seed), RulesSettings()).morphology
 
 
 def described(pads: Mapping[str, Morphology]) -> dict[str, Any]:

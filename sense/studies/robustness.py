@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from design.common.checkpoints import State
 from design.common.errors import InputError
 from design.criteria.fibre_loss import lost_subsets
-from design.evaluation.localisation_error import Loss, Trial, batches
+from design.evaluation.localisation_error import Loss, PressSets, batches
 from design.pad.contact import signals, signals_quantized
 from design.pad.morphology import Morphology
 from design.settings import Contact
@@ -96,7 +96,7 @@ def _found(
     def answer(places: Array) -> Array:
         return RULES[rule](pad, places, contact)
 
-    trial = Trial.of(pad, side, test, seed, answer)
+    trial = PressSets.of(pad, side, test, seed, answer)
     places = _lattice(pad.grid)
     over = answer(places)
     repeats = -(-NETWORKS // math.comb(2 * pad.grid, len(losses[0])))

@@ -9,7 +9,7 @@ import numpy as np
 
 from design.common.checkpoints import State
 from design.evaluation.levenberg_marquardt import fit_many
-from design.evaluation.localisation_error import Trial
+from design.evaluation.localisation_error import PressSets
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
 from design.settings import Contact
@@ -66,7 +66,7 @@ def _name(contact: Contact) -> str:
 
 def _found(pad: Morphology, own: Contact, objects: list[Contact], seed: int) -> State:
     """Mean errors (MEMBERS, objects) of networks trained with the object `own`, grid units."""
-    trial = Trial.of(pad, SIDE, TEST, seed, lambda places: signals(pad, places, own))
+    trial = PressSets.of(pad, SIDE, TEST, seed, lambda places: signals(pad, places, own))
     rngs = np.random.default_rng([5, seed]).spawn(MEMBERS)
     networks = fit_many(trial.recorded, trial.learned, rngs, HIDDEN)
     met = [signals(pad, trial.fresh, contact) for contact in objects]

@@ -188,14 +188,14 @@ def _results(tasks: Mapping[int, Task], jobs: int) -> Iterator[tuple[int, State]
                 begun.get_nowait()
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+def table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Rows as text, the first one their keys; numbers with four digits."""
     return [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
 
 
-def lines(document: Mapping[str, Any]) -> list[str]:
+def study_lines(document: Mapping[str, Any]) -> list[str]:
     """A study as a table for people, and what it shows."""
-    cells = table(document["rows"])
+    cells = table_cells(document["rows"])
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     told = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in cells]
     return [*told, "", *document["text"]]
@@ -217,7 +217,7 @@ def _markdown(document: Mapping[str, Any], figure: str) -> str:
     def line(row: list[str]) -> str:
         return f"| {' | '.join(cell.replace('|', chr(92) + '|').replace('<', '&lt;') for cell in row)} |"
 
-    head, *body = map(line, table(document["rows"]))
+    head, *body = map(line, table_cells(document["rows"]))
     rule = f"|{' --- |' * len(document['rows'][0])}"
     parts = [f"# {document['title']}", *document["text"], f"![{document['title']}]({figure})"]
     return "\n\n".join([*parts, "\n".join([head, rule, *body])]) + "\n"

@@ -6,8 +6,10 @@ import pytest
 
 from design import Contact, InputError, Spec
 from design.common.settings import commented_toml
-from design.settings import MODELS, Pad, Rules, Search
+from design.settings import PadSettings, RulesSettings, SearchSettings
 from tests.limits import require_ends
+
+MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 
 
 def test_the_written_defaults_read_back_as_the_defaults():
@@ -24,20 +26,20 @@ def test_the_written_defaults_read_back_as_the_defaults():
 @pytest.mark.parametrize(
     ("tables", "model", "message"),
     [
-        ({"pads": {}}, Pad, r"unknown section \[pads\], allowed are pad, contact"),
-        ({"pad": {"gird": 4}}, Pad, r"\[pad\] gird: no such key, allowed are grid"),
-        ({"pad": {"grid": 0}}, Pad, r"\[pad\] grid: got 0, .*greater than or equal to 1"),
-        ({"pad": {"pitch_mm": float("nan")}}, Pad, r"\[pad\] pitch_mm: got nan, .*finite"),
-        ({"pad": {"grid": "4"}}, Pad, r"\[pad\] grid: got '4', .*integer"),
+        ({"pads": {}}, PadSettings, r"unknown section \[pads\], allowed are pad, contact"),
+        ({"pad": {"gird": 4}}, PadSettings, r"\[pad\] gird: no such key, allowed are grid"),
+        ({"pad": {"grid": 0}}, PadSettings, r"\[pad\] grid: got 0, .*greater than or equal to 1"),
+        ({"pad": {"pitch_mm": float("nan")}}, PadSettings, r"\[pad\] pitch_mm: got nan, .*finite"),
+        ({"pad": {"grid": "4"}}, PadSettings, r"\[pad\] grid: got '4', .*integer"),
         ({"contact": {"sides": 2}}, Contact, r"\[contact\] sides: got 2"),
         ({"contact": {"weight": "cubic"}}, Contact, r"\[contact\] weight: got 'cubic', .*inverse_square"),
-        ({"search": {"method": "luck"}}, Search, r"\[search\] method: got 'luck', .*descent"),
-        ({"rules": 3}, Rules, r"rules is 3, expected a section \[rules\]"),
+        ({"search": {"method": "luck"}}, SearchSettings, r"\[search\] method: got 'luck', .*descent"),
+        ({"rules": 3}, RulesSettings, r"rules is 3, expected a section \[rules\]"),
     ],
 )
 def test_refusals_name_the_key_the_value_and_what_is_allowed(tables, model, message):
     with pytest.raises(InputError, match=message) as refusal:
-        Spec(tables).section(model)
+        Spec(tables, sections=MODELS).section(model)
     assert "\n" not in str(refusal.value)
 
 
@@ -48,7 +50,7 @@ def test_a_circle_is_written_and_read_as_a_word():
 
 def test_overrides_win_over_the_file():
     spec = Spec({"search": {"knots": 7, "seed": 3}})
-    found = spec.section(Search, knots=2, seed=None)
+    found = spec.section(SearchSettings, knots=2, seed=None)
     assert (found.knots, found.seed) == (2, 3)
 
 
@@ -66,14 +68,14 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
-    assert Pad().model_dump() == {
+    assert PadSettings().model_dump() == {
         "grid": 4,
         "pitch_mm": 11.25,
         "fibre_diameter_mm": 0.3,
         "deep_family": "horizontal",
     }
     assert Contact().model_dump() == {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan"}
-    assert Rules().model_dump() == {
+    assert RulesSettings().model_dump() == {
         "enforce": True,
         "min_bend_radius_mm": 1.0,
         "min_gap_mm": 0.8,
@@ -83,7 +85,7 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
         "border_mm": 2.0,
         "max_length_mm": 500.0,
     }
-    search = Search().model_dump()
+    search = SearchSettings().model_dump()
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
     assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.11, 0.0)
@@ -92,16 +94,16 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
 @pytest.mark.parametrize(
     ("model", "key", "kept", "refused"),
     [
-        (Pad, "grid", (1, 64), (0,)),
+        (PadSettings, "grid", (1, 64), (0,)),
         (Contact, "sides", (3,), (2,)),
-        (Search, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
-        (Search, "noise", (1e-9, 10.0), (0.0, 10.1)),
-        (Search, "seed", (0, 2**32 - 1), (-1, 2**32)),
-        (Rules, "min_crossing_angle_deg", (0.0, 90.0), (-0.1, 90.1)),
-        (Rules, "min_gap_mm", (0.0, 1000.0), (-0.1, 1000.1)),
-        (Rules, "max_length_mm", (1e-6, 1e6), (0.0, 1.1e6)),
-        (Rules, "same_family_crossings", (0, 10**6), (-1,)),
-        (Rules, "max_crossings", (0, "any"), (-1, "all")),
+        (SearchSettings, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
+        (SearchSettings, "noise", (1e-9, 10.0), (0.0, 10.1)),
+        (SearchSettings, "seed", (0, 2**32 - 1), (-1, 2**32)),
+        (RulesSettings, "min_crossing_angle_deg", (0.0, 90.0), (-0.1, 90.1)),
+        (RulesSettings, "min_gap_mm", (0.0, 1000.0), (-0.1, 1000.1)),
+        (RulesSettings, "max_length_mm", (1e-6, 1e6), (0.0, 1.1e6)),
+        (RulesSettings, "same_family_crossings", (0, 10**6), (-1,)),
+        (RulesSettings, "max_crossings", (0, "any"), (-1, "all")),
     ],
 )
 def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):

@@ -6,8 +6,8 @@ import numpy as np
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
-from design.settings import Pad, Rules
-from fabricate.settings import DEFAULTS, Mould, Printer, Settings
+from design.settings import PadSettings, RulesSettings
+from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
 
 
 def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:
@@ -25,12 +25,12 @@ def with_settings(
     printer: dict[str, object] | None = None,
     pad: dict[str, object] | None = None,
     rules: dict[str, object] | None = None,
-) -> Settings:
+) -> FabricationSettings:
     """The defaults with some keys changed."""
     return replace(
         DEFAULTS,
-        mould=Mould.model_validate(mould or {}),
-        printer=Printer.model_validate(printer or {}),
-        pad=Pad.model_validate(pad or {}),
-        rules=Rules.model_validate(rules or {}),
+        mould=MouldSettings.model_validate(mould or {}),
+        printer=PrinterSettings.model_validate(printer or {}),
+        pad=PadSettings.model_validate(pad or {}),
+        rules=RulesSettings.model_validate(rules or {}),
     )

@@ -4,13 +4,13 @@ import pytest
 
 from design.common.errors import InputError
 from design.common.settings import Spec, commented_toml
-from fabricate.settings import DEFAULTS, MODELS, Mould, Printer, Settings
+from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
 
 
 def test_defaults_come_back_from_their_own_file(tmp_path):
     path = tmp_path / "pad.toml"
-    path.write_text(commented_toml(MODELS), encoding="utf-8")
-    assert Settings.from_spec(Spec.load(path)) == DEFAULTS
+    path.write_text(commented_toml({"mould": MouldSettings, "printer": PrinterSettings}), encoding="utf-8")
+    assert FabricationSettings.from_spec(Spec.load(path)) == DEFAULTS
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_defaults_come_back_from_their_own_file(tmp_path):
 def test_a_bad_key_is_one_clear_line(tables, parts):
     spec = Spec(tables, "pad.toml")
     with pytest.raises(InputError) as error:
-        Settings.from_spec(spec)
+        FabricationSettings.from_spec(spec)
     assert all(part in str(error.value) for part in parts), error.value
     assert "\n" not in str(error.value)
 
@@ -51,7 +51,7 @@ def test_a_bad_key_is_one_clear_line(tables, parts):
 )
 def test_hostile_values_are_one_clear_line(key, value):
     with pytest.raises(InputError, match=rf"\[mould\] {key}: (got )?") as refusal:
-        Settings.from_spec(Spec({"mould": {key: value}})).require_consistent(11.25)
+        FabricationSettings.from_spec(Spec({"mould": {key: value}})).require_consistent(11.25)
     assert "\n" not in str(refusal.value)
 
 
@@ -63,20 +63,24 @@ def test_a_pitch_too_small_for_the_ridges_or_the_exits(pitch_mm):
 
 def test_terraces_are_whole_layers_with_steps_no_printer_places():
     for draft, layers in ((0.5, 34), (3.0, 5), (20.0, 1)):
-        settings = Settings(mould=Mould(ridge_draft_deg=draft))
+        settings = FabricationSettings(mould=MouldSettings(ridge_draft_deg=draft))
         assert settings.terrace_mm == pytest.approx(layers * 0.1)
-    assert Settings().terrace_mm == math.inf
+    assert FabricationSettings().terrace_mm == math.inf
 
 
 def test_default_ridges_are_whole_layers_of_common_printers():
     for layer_mm in (0.1, 0.2):
-        for height in (Mould().deep_ridge_height_mm, Mould().shallow_ridge_height_mm, Mould().floor_mm):
+        for height in (
+            MouldSettings().deep_ridge_height_mm,
+            MouldSettings().shallow_ridge_height_mm,
+            MouldSettings().floor_mm,
+        ):
             assert height / layer_mm == pytest.approx(round(height / layer_mm))
-    assert Printer().layer_mm == 0.1
+    assert PrinterSettings().layer_mm == 0.1
 
 
 def test_the_defaults_are_those_the_pads_were_made_with():
-    assert Mould().model_dump() == {
+    assert MouldSettings().model_dump() == {
         "floor_mm": 2.0,
         "wall_mm": 2.0,
         "wall_draft_deg": 2.0,
@@ -98,7 +102,7 @@ def test_the_defaults_are_those_the_pads_were_made_with():
         "lead_mm": 30.0,
         "tolerance_mm": 0.01,
     }
-    assert Printer().model_dump() == {
+    assert PrinterSettings().model_dump() == {
         "nozzle_mm": 0.4,
         "layer_mm": 0.1,
         "bed_mm": [220.0, 220.0, 250.0],

@@ -7,13 +7,13 @@ from sense import Localizer, Recording, calibrate
 from sense import settings as sense_settings
 from sense.recordings.simulation import simulate
 
-QUICK = sense_settings.Localizer(members=2, hidden=48, layers=2, epochs=100, batch=64)
+QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=100, batch=64)
 
 
 @pytest.fixture(scope="session")
 def recording() -> Recording:
     """300 presses on a pad whose fibres wind."""
-    return simulate(Morphology.random(2, knots=3, seed=5), sense_settings.Rig(presses=300, seed=1))
+    return simulate(Morphology.random(2, knots=3, seed=5), sense_settings.RigSettings(presses=300, seed=1))
 
 
 @pytest.fixture(scope="session")

@@ -2,12 +2,12 @@
 
 import pytest
 
-from sense.settings import Localizer, Rig
+from sense.settings import LocalizerSettings, RigSettings
 from tests.limits import require_ends
 
 
 def test_the_defaults_are_those_of_the_published_bench() -> None:
-    rig = Rig().model_dump()
+    rig = RigSettings().model_dump()
     expected = {
         "presses": 1500,
         "plan": "uniform",
@@ -32,7 +32,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "max_force_n": 60.0,
     }
     assert {key: rig[key] for key in expected} == expected
-    assert Localizer().model_dump() == {
+    assert LocalizerSettings().model_dump() == {
         "method": "masked",
         "features": "full",
         "split": "random",
@@ -51,15 +51,15 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
 @pytest.mark.parametrize(
     ("model", "key", "kept", "refused"),
     [
-        (Rig, "max_force_n", (0.1, 250.0), (0.0, 250.1)),
-        (Rig, "max_depth_mm", (0.1, 50.0), (0.0, 50.1)),
-        (Rig, "press_mm_s", (0.1, 250.0), (0.0, 250.1)),
-        (Rig, "travel_mm_s", (0.1, 500.0), (0.0, 500.1)),
-        (Rig, "clearance_mm", (1.0, 500.0), (0.9, 500.1)),
-        (Rig, "channels", (1, 8), (0, 9)),
-        (Localizer, "test_share", (0.01, 0.99), (0.0, 1.0)),
-        (Localizer, "lost", (0, 8), (-1, 9)),
-        (Localizer, "rate", (1e-6, 1.0), (0.0, 1.1)),
+        (RigSettings, "max_force_n", (0.1, 250.0), (0.0, 250.1)),
+        (RigSettings, "max_depth_mm", (0.1, 50.0), (0.0, 50.1)),
+        (RigSettings, "press_mm_s", (0.1, 250.0), (0.0, 250.1)),
+        (RigSettings, "travel_mm_s", (0.1, 500.0), (0.0, 500.1)),
+        (RigSettings, "clearance_mm", (1.0, 500.0), (0.9, 500.1)),
+        (RigSettings, "channels", (1, 8), (0, 9)),
+        (LocalizerSettings, "test_share", (0.01, 0.99), (0.0, 1.0)),
+        (LocalizerSettings, "lost", (0, 8), (-1, 9)),
+        (LocalizerSettings, "rate", (1e-6, 1.0), (0.0, 1.1)),
     ],
 )
 def test_values_at_the_ends_of_what_is_allowed(model: type, key: str, kept: tuple, refused: tuple) -> None:

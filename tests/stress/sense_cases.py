@@ -14,7 +14,7 @@ from sense import HealthModel, Localizer, Recording, calibrate
 from sense import settings as sense_settings
 from tests.stress.clock import LIMIT_S, ends_in_time
 
-TINY = sense_settings.Localizer(members=1, hidden=8, layers=1, epochs=2, batch=64, lost=2)
+TINY = sense_settings.LocalizerSettings(members=1, hidden=8, layers=1, epochs=2, batch=64, lost=2)
 """Learns next to nothing, in a moment."""
 RATE_HZ = 13.3
 

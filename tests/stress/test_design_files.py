@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 
 from design.common.checkpoints import Checkpoints
 from design.common.errors import InputError
-from design.criteria.rules import check as check_rules
+from design.criteria.rules import check_rules
 from design.optimisers.search import search
 from design.pad.morphology import Morphology
-from design.settings import Contact, Pad, Rules, Search
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 from fabricate.checks.mesh_checks import inspect_mesh
 from fabricate.export import build
 from fabricate.mesh_files import read_mesh
@@ -29,8 +29,8 @@ from padforge import write_report
 from tests.stress.clock import ends_in_time, few
 from tests.stress.door import require_one_line
 
-SEARCH = Search(knots=1, starts=1, steps=30, lost=1, population=4, generations=4)
-PAD, RULES = Pad(grid=1), Rules(enforce=False)
+SEARCH = SearchSettings(knots=1, starts=1, steps=30, lost=1, population=4, generations=4)
+PAD, RULES = PadSettings(grid=1), RulesSettings(enforce=False)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def load(path: Path) -> None:
             return
         assert np.isfinite(pad.knots).all()
         if pad.knots.size < 1000:
-            check_rules(pad, Rules())
+            check_rules(pad, RulesSettings())
 
 
 def check_mesh(path: Path) -> None:

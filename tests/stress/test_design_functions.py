@@ -24,18 +24,18 @@ from design import (
     signals_quantized,
     signals_sparse,
 )
-from design.criteria.rules import check
+from design.criteria.rules import check_rules
 from design.criteria.score import score
-from design.evaluation.localisation_error import evaluate
+from design.evaluation.localisation_error import localisation_error
 from design.optimisers.search import search
 from design.report.plan_drawing import draw_plan
-from design.settings import Pad, Rules, Search
+from design.settings import PadSettings, RulesSettings, SearchSettings
 from tests.stress.clock import ends_in_time, few
 from tests.stress.values import LAX, call_spoiled, contacts, pads, presses
 
 Arguments = dict[str, Any]
 PAD = Morphology.random(2, 3, seed=1)
-SMALL = Search(knots=3, starts=1, steps=2, lost=1)
+SMALL = SearchSettings(knots=3, starts=1, steps=2, lost=1)
 WEIGHTS = ["uniform", "inverse_square", "inverse"]
 
 
@@ -83,7 +83,7 @@ def ignored(found: Any, given: Arguments) -> None: ...
 
 
 def quick_search(**given: Any) -> Any:
-    return search(Pad(grid=1), settings=SMALL, **given)
+    return search(PadSettings(grid=1), settings=SMALL, **given)
 
 
 CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Arguments], None]]] = {
@@ -131,22 +131,30 @@ CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Argument
     "to_mm": (PAD.to_mm, {"places": [1, 2]}, lambda found, given: finite(found)),
     "to_grid": (PAD.to_grid, {"places_mm": [1, 2]}, lambda found, given: finite(found)),
     "Contact": (Contact, {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan"}, a_section),
-    "Pad": (Pad, {"grid": 2, "pitch_mm": 5.0, "fibre_diameter_mm": 0.3, "deep_family": "vertical"}, a_section),
-    "Search": (Search, {"knots": 3, "lost": 2, "noise": 0.1, "contacts": [{"radius": 0.9}], "seed": 1}, a_section),
-    "Rules": (Rules, {"max_crossings": "any", "min_gap_mm": 1.0, "same_family_crossings": 1}, a_section),
+    "Pad": (PadSettings, {"grid": 2, "pitch_mm": 5.0, "fibre_diameter_mm": 0.3, "deep_family": "vertical"}, a_section),
+    "Search": (
+        SearchSettings,
+        {"knots": 3, "lost": 2, "noise": 0.1, "contacts": [{"radius": 0.9}], "seed": 1},
+        a_section,
+    ),
+    "Rules": (RulesSettings, {"max_crossings": "any", "min_gap_mm": 1.0, "same_family_crossings": 1}, a_section),
     "Spec": (lambda tables: Spec(tables).section(Contact), {"tables": {"contact": {"radius": 0.5}}}, a_section),
     "Spec.load": (Spec.load, {"path": None}, lambda found, given: a_section(found.section(Contact), given)),
     "Spec.section": (Spec({}).section, {"model": Contact, "radius": 0.5}, a_section),
-    "check": (check, {"pad": PAD, "rules": Rules()}, lambda found, given: finite([v.measured for v in found])),
+    "check": (
+        check_rules,
+        {"pad": PAD, "rules": RulesSettings()},
+        lambda found, given: finite([v.measured for v in found]),
+    ),
     "draw_plan": (draw_plan, {"pad": PAD, "contact": Contact(), "violations": []}, ignored),
 }
 SLOW_CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Arguments], None]]] = {
-    "score": (score, {"pad": PAD, "contact": Contact(), "lost": 1, "noise": 0.1, "rules": Rules()}, numbers),
+    "score": (score, {"pad": PAD, "contact": Contact(), "lost": 1, "noise": 0.1, "rules": RulesSettings()}, numbers),
     "search": (
         quick_search,
         {
             "contact": Contact(),
-            "rules": Rules(),
+            "rules": RulesSettings(),
             "origin": None,
             "resume": False,
             "time_budget": 5.0,
@@ -155,7 +163,7 @@ SLOW_CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Arg
         lambda found, given: a_pad(found.morphology, given),
     ),
     "evaluate": (
-        evaluate,
+        localisation_error,
         {"pad": PAD, "contact": None, "lost": (0,), "seed": 0, "hidden": 2, "presses": 16, "test": 3, "subsets": 1},
         lambda found, given: finite([level.mean for level in found]),
     ),
@@ -190,7 +198,7 @@ def test_a_pad_however_wild_is_written_and_read_back_as_it_was(data):
 def test_a_pad_however_wild_is_drawn_checked_and_tiled(data):
     pad = data.draw(pads((1, 3), (0, 8)))
     contact = data.draw(contacts())
-    rules = Rules(
+    rules = RulesSettings(
         min_bend_radius_mm=data.draw(st.sampled_from([0.0, 1e-9, 1.0, 1000.0])),
         min_gap_mm=data.draw(st.sampled_from([0.0, 1e-9, 0.8, 1000.0])),
         max_crossings=data.draw(st.sampled_from([None, 0, 3])),
@@ -199,7 +207,7 @@ def test_a_pad_however_wild_is_drawn_checked_and_tiled(data):
         max_length_mm=data.draw(st.sampled_from([1e-300, 10.0, 1e6])),
     )
     with ends_in_time():
-        found = check(pad, rules)
+        found = check_rules(pad, rules)
         finite([[violation.measured, violation.limit] for violation in found])
         draw_plan(pad, contact, found).draw_without_rendering()
         assert pad.tiled(2).grid == 2 * pad.grid
@@ -209,7 +217,7 @@ def test_a_pad_however_wild_is_drawn_checked_and_tiled(data):
 @given(st.data())
 def test_a_pad_however_wild_has_a_finite_score(data):
     pad, contact = data.draw(pads((1, 3), (0, 8))), data.draw(contacts())
-    rules = Rules(
+    rules = RulesSettings(
         same_family_crossings=data.draw(st.sampled_from([0, 2])),
         max_crossings=data.draw(st.sampled_from([None, 4])),
         min_crossing_angle_deg=data.draw(st.sampled_from([0.0, 30.0])),
@@ -233,7 +241,7 @@ def test_a_short_search_of_any_settings_gives_a_pad(data):
     grid = data.draw(st.integers(1, 2))
     knots = data.draw(st.sampled_from([1, 2, 5, 64]))
     origin = data.draw(st.none() | pads((grid, grid), (0, knots)))
-    asked = Search(
+    asked = SearchSettings(
         method=data.draw(st.sampled_from(["descent", "descent", "genetic"])),
         knots=knots,
         starts=data.draw(st.integers(1, 2)),
@@ -245,7 +253,7 @@ def test_a_short_search_of_any_settings_gives_a_pad(data):
         noise=data.draw(st.sampled_from([1e-9, 0.1, 10.0])),
         sharpness=data.draw(st.sampled_from([0.0, 1e-3, 1e6])),
     )
-    rules = Rules(
+    rules = RulesSettings(
         enforce=data.draw(st.booleans()),
         min_bend_radius_mm=data.draw(st.sampled_from([0.0, 1.0, 1000.0])),
         min_gap_mm=data.draw(st.sampled_from([0.0, 0.8, 1000.0])),
@@ -254,7 +262,7 @@ def test_a_short_search_of_any_settings_gives_a_pad(data):
     )
     with ends_in_time(20):
         found = search(
-            Pad(grid=grid, pitch_mm=data.draw(st.sampled_from([0.1, 11.25, 1000.0]))),
+            PadSettings(grid=grid, pitch_mm=data.draw(st.sampled_from([0.1, 11.25, 1000.0]))),
             data.draw(contacts()),
             asked,
             rules,

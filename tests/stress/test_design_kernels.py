@@ -27,15 +27,15 @@ from design.criteria.information import (
     idle_share,
     information,
     joint_entropy,
+    published_sharpness,
     quantize,
-    sharpness,
 )
 from design.criteria.penalties import penalties
 from design.criteria.published_objective import published_terms
-from design.criteria.rules import check
+from design.criteria.rules import check_rules
 from design.evaluation.levenberg_marquardt import fit_many
 from design.optimisers.parametrization import Fibres
-from design.pad.bending import bend_radius, fold_gap, trace
+from design.pad.bending import bend_radius, fold_gap, traced_curve
 from design.pad.contact import fibre_axes, press_shape
 from design.pad.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
 from design.pad.kernels.exact_gradient import signals_gradient
@@ -43,7 +43,7 @@ from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.press import family_strays
 from design.pad.kernels.roots import SCRATCH, roots_in_unit
 from design.pad.knots import assemble
-from design.settings import Pad, Rules
+from design.settings import PadSettings, RulesSettings
 from tests.stress.clock import ends_in_time, few
 from tests.stress.values import LAX, Array, contacts, pads, presses, seeds, wild_knots
 
@@ -328,7 +328,7 @@ def test_bends_and_folds_of_any_curve(data):
     limit, gap = data.draw(st.sampled_from([1e-9, 0.05, 1.0, 100.0])), data.draw(st.sampled_from([1e-6, 0.1, 3.0]))
     with ends_in_time():
         for fibre in range(2 * pad.grid):
-            points, headings = trace(beziers(pad)[fibre], slope_beziers(pad)[fibre], 0.01)
+            points, headings = traced_curve(beziers(pad)[fibre], slope_beziers(pad)[fibre], 0.01)
             assert np.isfinite(points).all()
             assert (np.abs(headings) <= math.pi / 2).all()
             radius, place = bend_radius(points, headings, limit)
@@ -336,9 +336,9 @@ def test_bends_and_folds_of_any_curve(data):
             assert np.isfinite(place).all()
             fold = fold_gap(flatten(pad, 1e-3)[fibre], gap)
             assert fold is None or 0 <= fold[0] < gap
-    found = check(pad, Rules())
+    found = check_rules(pad, RulesSettings())
     order = [2 * f - (pad.grid if f > pad.grid else -pad.grid) - f for v in found for f in v.fibres]
-    other = check(transposed(pad), Rules())
+    other = check_rules(transposed(pad), RulesSettings())
     assert len(order) == sum(len(v.fibres) for v in other)
     assert sorted(v.rule for v in found) == sorted(v.rule for v in other)
 
@@ -359,7 +359,7 @@ def test_quantities_of_information_keep_to_their_bounds(seed, count, columns, sc
         assert (levels == np.round(levels)).all()
         entropy = joint_entropy(levels)
         assert -1e-12 <= entropy <= math.log2(max(count, 1)) + 1e-9
-        assert 0 <= sharpness(levels) <= 4 * 16 * count * columns
+        assert 0 <= published_sharpness(levels) <= 4 * 16 * count * columns
         assert 0 <= idle_share(layout) <= 1
     numbers = np.unique(levels, axis=0, return_counts=True)[1] if columns and count else np.array([1])
     expected = -(numbers / numbers.sum() * np.log2(numbers / numbers.sum())).sum()
@@ -387,7 +387,7 @@ def test_penalties_and_their_gradients_are_finite(data):
     import torch
 
     pad = data.draw(pads((1, 3), (1, 6)))
-    rules = Rules(
+    rules = RulesSettings(
         min_gap_mm=data.draw(st.sampled_from([0.0, 0.8, 5.0])),
         same_family_crossings=data.draw(st.sampled_from([0, 2])),
         max_crossings=data.draw(st.sampled_from([None, 9])),
@@ -396,7 +396,7 @@ def test_penalties_and_their_gradients_are_finite(data):
     course = Fibres.through(pad.knots, 0.01)
     assert np.isfinite(course.knots()).all()
     with ends_in_time():
-        found = penalties(*course.axes(), Pad(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
+        found = penalties(*course.axes(), PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
         torch.stack(list(found.values())).sum().backward()
     assert all(value.isfinite() and value >= 0 for value in found.values())
     assert course.spans.grad is not None

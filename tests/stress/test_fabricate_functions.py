@@ -11,8 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from design import InputError, Morphology
-from design.settings import Pad
-from fabricate import Finding, Mould, Plan, Printer, Settings, build, build_mould, check, check_mesh
+from design.settings import PadSettings
+from fabricate import (
+    FabricationSettings,
+    Finding,
+    MouldSettings,
+    Plan,
+    PrinterSettings,
+    build,
+    build_mould,
+    check,
+    check_mesh,
+)
 from fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
 from fabricate.checks.plan_checks import meshed
 from fabricate.mesh_files import read_mesh, write_3mf, write_stl
@@ -62,18 +72,22 @@ def mesh_file(**given: Any) -> list[Finding]:
 
 
 CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Verify]] = {
-    "Mould": (Mould, {"floor_mm": 2.0, "pins": True, "levels": "two", "tolerance_mm": 0.01}, a_section),
-    "Printer": (Printer, {"nozzle_mm": 0.4, "bed_mm": [1.0, 1.0, 1.0], "resin": False}, a_section),
-    "Settings": (Settings, {"mould": Mould(), "printer": Printer(), "pad": Pad()}, lambda found, given: None),
-    "Plan": (Plan, {"pad": PAD, "settings": Settings()}, lambda found, given: None),
-    "check": (check, {"pad": PAD, "settings": Settings()}, findings),
-    "build": (
-        written,
-        {"pad": PAD, "formats": ["svg"], "settings": Settings(), "inputs": []},
+    "Mould": (MouldSettings, {"floor_mm": 2.0, "pins": True, "levels": "two", "tolerance_mm": 0.01}, a_section),
+    "Printer": (PrinterSettings, {"nozzle_mm": 0.4, "bed_mm": [1.0, 1.0, 1.0], "resin": False}, a_section),
+    "Settings": (
+        FabricationSettings,
+        {"mould": MouldSettings(), "printer": PrinterSettings(), "pad": PadSettings()},
         lambda found, given: None,
     ),
-    "build_mould": (build_mould, {"pad": PAD, "settings": Settings()}, lambda found, given: None),
-    "check_mesh": (mesh_file, {"printer": Printer(), "min_silicone_mm": 0.4, "genus": 0}, findings),
+    "Plan": (Plan, {"pad": PAD, "settings": FabricationSettings()}, lambda found, given: None),
+    "check": (check, {"pad": PAD, "settings": FabricationSettings()}, findings),
+    "build": (
+        written,
+        {"pad": PAD, "formats": ["svg"], "settings": FabricationSettings(), "inputs": []},
+        lambda found, given: None,
+    ),
+    "build_mould": (build_mould, {"pad": PAD, "settings": FabricationSettings()}, lambda found, given: None),
+    "check_mesh": (mesh_file, {"printer": PrinterSettings(), "min_silicone_mm": 0.4, "genus": 0}, findings),
     "check_mesh.path": (check_mesh, {"path": "nowhere.stl"}, findings),
     "inspect_mesh": (
         inspect_mesh,
@@ -91,7 +105,7 @@ def test_any_argument_gives_a_right_result_or_one_line(data):
 
 
 @st.composite
-def tables(draw: st.DrawFn) -> Settings:
+def tables(draw: st.DrawFn) -> FabricationSettings:
     """Settings at the limits of what each key allows, some of them at a time."""
     ends: dict[str, list[Any]] = {
         "floor_mm": [0.4, 50.0],
@@ -115,19 +129,19 @@ def tables(draw: st.DrawFn) -> Settings:
         "tolerance_mm": [1e-3, 0.1],
     }
     keys = draw(st.sets(st.sampled_from(sorted(ends)), max_size=4))
-    mould = Mould(**{key: draw(st.sampled_from(ends[key])) for key in sorted(keys)})
+    mould = MouldSettings(**{key: draw(st.sampled_from(ends[key])) for key in sorted(keys)})
     if draw(st.booleans()):
         mould = mould.model_copy(update={"lid": True, "spout": True})
-    printer = Printer(
+    printer = PrinterSettings(
         nozzle_mm=draw(st.sampled_from([0.4, 0.01, 5.0])),
         layer_mm=draw(st.sampled_from([0.1, 0.01, 2.0])),
         resin=draw(st.booleans()),
     )
-    pad = Pad(
+    pad = PadSettings(
         fibre_diameter_mm=draw(st.sampled_from([0.3, 1e-300, 10.0])),
         deep_family=draw(st.sampled_from(["horizontal", "vertical"])),
     )
-    return Settings(mould, printer, pad)
+    return FabricationSettings(mould, printer, pad)
 
 
 def of_a_sound_mould(found: list[Finding]) -> None:

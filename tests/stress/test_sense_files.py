@@ -385,7 +385,7 @@ def test_hdf5_that_claims_more_than_it_holds_is_refused(tmp_path: Path) -> None:
 def results(tmp: Path) -> dict[str, bytes]:
     """The documents of a calibration and of a robustness study, and a start of a recording."""
     _, document = sense.calibrate(made(4, presses=40), TINY)
-    studied = sense.robustness(SMALL, learnt(), lost=2)
+    studied = sense.fibre_loss_study(SMALL, learnt(), lost=2)
     study = {"format": "padforge-study-x/1", "title": "A", "text": ["b"], "rows": [{"a": 1, "b": 2.5}]}
     study |= {"provenance": document["provenance"]}
     named = {"calibration.json": document, "robustness.json": studied, "x.json": study}
@@ -420,7 +420,7 @@ def test_a_study_resumes_from_sound_networks_only(tmp_path_factory: pytest.TempP
         spoiled[f"start_{rng.choice(['9999', 'x', '-1', '0000_1', ''])}.npz"] = files[name]
     folder = put(tmp / "unfinished", spoiled)
     retrained = {"retrain": True, "options": TINY, "lost": 0}
-    found = right_or_refused(lambda: sense.robustness(made(5, presses=60), keep_in=folder, **retrained))
+    found = right_or_refused(lambda: sense.fibre_loss_study(made(5, presses=60), keep_in=folder, **retrained))
     if found is not None:
         assert all(np.isfinite(row["mean_mm"]) for row in found["ways"]["retrained"]["errors"])
 
@@ -435,5 +435,5 @@ def unfinished(tmp: Path) -> dict[str, bytes]:
 
     folder, options = tmp / "kept", {"retrain": True, "options": TINY, "lost": 0}
     with pytest.raises(KeyboardInterrupt):
-        sense.robustness(made(5, presses=60), keep_in=folder, progress=stop, **options)
+        sense.fibre_loss_study(made(5, presses=60), keep_in=folder, progress=stop, **options)
     return files_of(folder)

@@ -140,12 +140,12 @@ def _recalibrate(rng: np.random.Generator) -> None:
 
 def _robustness(rng: np.random.Generator) -> None:
     given = {"recording": SMALL, "localizer": learnt(), "retrain": False, "options": TINY, "lost": 1, "keep_in": None}
-    found = sense.robustness(**_some(rng, given))
+    found = sense.fibre_loss_study(**_some(rng, given))
     assert all(_finite(list(row.values())) for way in found["ways"].values() for row in way["errors"])
 
 
 def _size_curve(rng: np.random.Generator) -> None:
-    found = sense.size_curve(**_some(rng, {"recording": SMALL, "options": TINY}))
+    found = sense.learning_curve(**_some(rng, {"recording": SMALL, "options": TINY}))
     assert _finite(list(found["fit"].values()))
 
 
@@ -189,7 +189,7 @@ def _localizer(rng: np.random.Generator) -> None:
 
 
 def _simulate(rng: np.random.Generator) -> None:
-    rig = sense_settings.Rig(presses=3, readings_per_press=8)
+    rig = sense_settings.RigSettings(presses=3, readings_per_press=8)
     found = sense.simulate(**_some(rng, {"pad": Morphology.straight(2), "rig": rig, "contact": None}))
     assert _finite(found.readings)
 

@@ -11,8 +11,8 @@ from hypothesis import given
 import sense
 from design.common.errors import InputError
 from sense.localizer.features import FEATURES, press_inputs
-from sense.localizer.normalization import Scaling
-from sense.localizer.response_model import Response
+from sense.localizer.normalization import Normalization
+from sense.localizer.response_model import ResponseModel
 from tests.stress.clock import ends_in_time, few
 from tests.stress.sense_cases import EXTREMES, RATE_HZ, TINY, learnt, made, recorded, right_or_refused, seeds, watched
 
@@ -333,7 +333,7 @@ def test_inputs_of_presses_scale_with_volts_and_keep_fibres_apart(features: str,
         doubled = press_inputs(one.readings * 2, *edges, features)
         np.testing.assert_allclose(doubled.windows, 2 * raw.windows, atol=1e-300)
     places_mm = np.nan_to_num(one.presses_mm)
-    scaling, table = Scaling.fit(raw, places_mm)
+    scaling, table = Normalization.fit(raw, places_mm)
     assert np.isfinite(table).all()
     assert np.isfinite(scaling.inputs(raw).inputs).all()
     assert 0 < scaling.span_mm < np.inf
@@ -351,7 +351,7 @@ def test_very_many_presses_take_memory_in_proportion() -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with ends_in_time(30 + presses // 5000):
         raw = press_inputs(one.readings, one.begun, one.lifted, "early")
-        Response.fit(one.presses_mm, raw.windows, raw.history, raw.alive)
+        ResponseModel.fit(one.presses_mm, raw.windows, raw.history, raw.alive)
         sense.find_presses(one.readings, one.times_s)
     grown_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown_kb < 250_000 + 2 * presses  # the bumps of all of them alone would take 3.5 kB a press

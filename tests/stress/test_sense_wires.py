@@ -17,7 +17,7 @@ from sense.rig.ur5.rtde_reader import VARIABLES, RtdeReader
 from tests.stress.clock import ends_in_time, few
 from tests.stress.sense_cases import seeds
 
-SETTINGS = framing.Settings(1_000_000, 0b1111, 4)
+SETTINGS = framing.BoardSettings(1_000_000, 0b1111, 4)
 FRAMES = (
     framing.Request(framing.Kind.START),
     SETTINGS,

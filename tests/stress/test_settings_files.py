@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
-from design.common.settings import Section, Spec, commented_toml
-from design.criteria.rules import check as check_rules
+from design.common.settings import Settings, Spec, commented_toml
+from design.criteria.rules import check_rules
 from design.pad.morphology import Morphology
-from design.settings import Contact, Pad, Rules
+from design.settings import Contact, PadSettings, RulesSettings
 from fabricate import settings as fabricate
 from fabricate.checks import plan_checks as printability
 from padforge import _check_ahead, _sections
@@ -92,18 +92,18 @@ VALUES = (
 """Values as TOML has them, or has them not."""
 
 
-def read(path: Path) -> dict[str, Section] | InputError:
+def read(path: Path) -> dict[str, Settings] | InputError:
     """All sections of a settings file, or why there are none: one line."""
     with ends_in_time():
         try:
-            spec = Spec.load(path)
+            spec = Spec.load(path, MODELS)
             return {name: spec.section(model) for name, model in MODELS.items()}
         except InputError as error:
             require_one_line(error)
             return error
 
 
-def require_sound(sections: dict[str, Section]) -> None:
+def require_sound(sections: dict[str, Settings]) -> None:
     """Sections that were read hold finite numbers within their limits, and read back as they are written."""
     for name, section in sections.items():
         json.dumps(section.model_dump(mode="json"), allow_nan=False)
@@ -246,10 +246,10 @@ def test_a_whole_run_with_extreme_settings_is_checked_in_time(folder: Path, tabl
 @given(extremes(("pad", "rules", "contact")), st.integers(1, 4), st.integers(0, 8), st.integers(0, 2**32 - 1))
 def test_rules_at_their_extremes(tables: dict[str, dict[str, Any]], grid: int, knots: int, seed: int):
     spec = Spec(tables)
-    pad = Morphology.random(grid, knots, seed, spec.section(Pad).pitch_mm)
+    pad = Morphology.random(grid, knots, seed, spec.section(PadSettings).pitch_mm)
     spec.section(Contact)
     with ends_in_time():
-        found = check_rules(pad, spec.section(Rules))
+        found = check_rules(pad, spec.section(RulesSettings))
     assert all(math.isfinite(violation.measured) for violation in found)
     assert all(1 <= fibre <= 2 * grid for violation in found for fibre in violation.fibres)
 
@@ -258,10 +258,10 @@ def test_rules_at_their_extremes(tables: dict[str, dict[str, Any]], grid: int, k
 @given(extremes(("pad", "rules", "mould", "printer")), st.integers(1, 3), st.integers(0, 3), st.integers(0, 2**32 - 1))
 def test_a_mould_at_the_extremes(tables: dict[str, dict[str, Any]], grid: int, knots: int, seed: int):
     spec = Spec(tables)
-    pad = Morphology.random(grid, knots, seed, spec.section(Pad).pitch_mm)
+    pad = Morphology.random(grid, knots, seed, spec.section(PadSettings).pitch_mm)
     with ends_in_time():
         try:
-            findings = printability.check(pad, fabricate.Settings.from_spec(spec))
+            findings = printability.check(pad, fabricate.FabricationSettings.from_spec(spec))
         except InputError as error:
             require_one_line(error)
             return

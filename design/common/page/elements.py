@@ -32,7 +32,7 @@ _CLASSES = ("pass", "warn", "fail", "number", "short", "long")
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A part of a page, which its contents line links to.
 
     Attributes:
@@ -53,7 +53,7 @@ class Section:
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
-def page(title: str, lead: str, sections: Sequence[Section]) -> str:
+def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
     """A whole HTML document: title, contents, key figures, sections.
 
     Nothing is let in from elsewhere, and no script runs but those of the sections and of the page itself.
@@ -140,7 +140,7 @@ def figures(pictures: Sequence[tuple[Path, str]]) -> str:
     return f'<div class="figures">{"".join(found)}</div>' if found else ""
 
 
-def _section(section: Section) -> str:
+def _section(section: PageSection) -> str:
     head = f'<h2 id="{section.anchor}">{escape(section.title)}</h2>'
     return f'<section aria-labelledby="{section.anchor}">{head}\n' + "\n".join(section.body) + "</section>"
 

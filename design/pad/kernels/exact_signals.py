@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from .press import EPS, INVERSE, touched_range
-from .quadrature import HALVINGS, across, measure
+from .quadrature import HALVINGS, across, length_element
 from .roots import SCRATCH, roots_in_unit
 
 _PROBES = (0.5, 0.22, 0.78)
@@ -158,13 +158,13 @@ def _stretch_signal(span: Any, a: float, b: float, radius: float, weight: int, l
     """Signal of a stretch inside the press; the 1/d weight has a kink where it is cut off, which is split at."""
     roots, work, p, stack, _ = scratch
     if weight != INVERSE:
-        return measure(span, a, b, radius, weight, length, stack)
+        return length_element(span, a, b, radius, weight, length, stack)
     count = circle_roots(span, a, b, radius / 100, roots, 0, work, p)
     total, begin = 0.0, a
     for i in range(count):
-        total += measure(span, begin, roots[i], radius, weight, length, stack)
+        total += length_element(span, begin, roots[i], radius, weight, length, stack)
         begin = roots[i]
-    return total + measure(span, begin, b, radius, weight, length, stack)
+    return total + length_element(span, begin, b, radius, weight, length, stack)
 
 
 @njit(cache=True, error_model="numpy")

@@ -91,7 +91,7 @@ def precise(error: float, pieces: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def measure(span: Any, a: float, b: float, radius: float, weight: int, length: int, stack: Any) -> float:
+def length_element(span: Any, a: float, b: float, radius: float, weight: int, length: int, stack: Any) -> float:
     """Integral of the density over a stretch [a, b] that lies wholly inside the press."""
     if weight == UNIFORM and length == MANHATTAN:
         mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)

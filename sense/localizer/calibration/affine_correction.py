@@ -31,12 +31,12 @@ def fit_correction(localizer: Localizer, raw: Inputs, places_mm: Array) -> Local
     """
     from scipy.optimize import least_squares  # slow to import, and needed here only
 
-    expected_mm = localizer.locate(localizer.scaling.inputs(raw)).sd_mm
+    expected_mm = localizer.locate(localizer.normalization.inputs(raw)).sd_mm
 
     def off(numbers: Array) -> Array:
         # Numbers are counted from 1, since the solver takes its steps relative to them.
         found = _corrected(localizer, numbers - 1)
-        misses = (found.locate(found.scaling.inputs(raw)).places_mm - places_mm) / expected_mm
+        misses = (found.locate(found.normalization.inputs(raw)).places_mm - places_mm) / expected_mm
         return np.concatenate([misses.ravel(), numbers - 1])
 
     solved = least_squares(off, np.ones(localizer.fibres + 4), loss="soft_l1", diff_step=STEP, xtol=1e-2, ftol=1e-3)
@@ -53,7 +53,7 @@ def _parts(localizer: Localizer, numbers: Array) -> tuple[Array, Array, Array]:
 
 def _corrected(localizer: Localizer, numbers: Array) -> Localizer:
     gains, turn, shift = _parts(localizer, numbers)
-    scaling, weights = localizer.scaling, dict(localizer.weights)
+    scaling, weights = localizer.normalization, dict(localizer.weights)
     gains = gains[:, None]
     last, bias = weights["last.w"].copy(), weights["last.b"].copy()
     last[..., :2] = last[..., :2] @ turn.T

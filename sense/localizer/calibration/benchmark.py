@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design import Morphology
-from design.benchmarking.harness import Bench, Trial
+from design.benchmarking.harness import Bench, BenchTrial
 from design.common.computing import one_torch_thread
 from sense import settings
 from sense.localizer.features import press_inputs
 from sense.localizer.network import Floats, Weights, forward, masked, pooled
-from sense.localizer.normalization import Scaling
+from sense.localizer.normalization import Normalization
 from sense.recordings.recording import Recording
 from sense.recordings.simulation import simulate
 
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
 
 
-def trials() -> Iterator[Trial]:
+def trials() -> Iterator[BenchTrial]:
     """Trainings on PRESSES simulated presses less TEST, in every way, and the time to find one press."""
     with one_torch_thread():
         for features in FEATURES:
@@ -51,13 +51,13 @@ def trials() -> Iterator[Trial]:
 
 @cache
 def _recording() -> Recording:
-    return simulate(Morphology.random(3, knots=5, seed=0), settings.Rig(presses=PRESSES, seed=0))
+    return simulate(Morphology.random(3, knots=5, seed=0), settings.RigSettings(presses=PRESSES, seed=0))
 
 
-def _trainings(features: str) -> Iterator[Trial]:
+def _trainings(features: str) -> Iterator[BenchTrial]:
     recording = _recording()
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-    scaling, table = Scaling.fit(raw[:-TEST], recording.presses_mm[:-TEST])
+    scaling, table = Normalization.fit(raw[:-TEST], recording.presses_mm[:-TEST])
     scaled, targets = scaling.inputs(raw), scaling.targets(recording.presses_mm)
     flat = scaled.inputs.reshape(len(scaled), -1).astype(np.float64)
     x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
@@ -74,7 +74,7 @@ def _trainings(features: str) -> Iterator[Trial]:
     }
     for way, (sizes, train) in ways.items():
         for size in sizes:
-            yield Trial(features, way, size, partial(train, size), judge)
+            yield BenchTrial(features, way, size, partial(train, size), judge)
 
 
 def _held(presses: int) -> NDArray[np.bool_]:
@@ -139,33 +139,33 @@ def _adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    from .training import Samples, train
+    from .training import TrainingPresses, train_members
 
     alive = np.ones(inputs.shape[:2], dtype=bool)
     held = _held(len(inputs))
-    shown, check = (Samples(inputs[part], alive[part], targets[part]) for part in (~held, held))
-    batches = max(1, int((~held).sum()) // settings.Localizer().batch)
-    options = settings.Localizer(members=1, epochs=-(-steps // batches))
-    weights = train(shown, check, table, options, np.random.default_rng(0), lambda done, total: None)
+    shown, check = (TrainingPresses(inputs[part], alive[part], targets[part]) for part in (~held, held))
+    batches = max(1, int((~held).sum()) // settings.LocalizerSettings().batch)
+    options = settings.LocalizerSettings(members=1, epochs=-(-steps // batches))
+    weights = train_members(shown, check, table, options, np.random.default_rng(0), lambda done, total: None)
 
     return lambda x: _places(weights, x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)).astype(np.float64)
 
 
-def _predictions() -> Iterator[Trial]:
+def _predictions() -> Iterator[BenchTrial]:
     """Finding one press with networks of the usual size; what they were taught does not matter for it."""
     rng = np.random.default_rng(0)
     one = _scaled("published")[:1].reshape(1, -1).astype(np.float64)
     published = _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
-    yield Trial("one press", "published", 0, partial(published, one))
+    yield BenchTrial("one press", "published", 0, partial(published, one))
     inputs = _scaled("full")[:1]
     weights = _untrained(inputs.size + inputs.shape[1])
-    yield Trial("one press", "masked", 0, partial(_places, weights, inputs))
+    yield BenchTrial("one press", "masked", 0, partial(_places, weights, inputs))
 
 
 def _scaled(features: str) -> Floats:
     recording = _recording()
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-    return Scaling.fit(raw, recording.presses_mm)[0].inputs(raw).inputs
+    return Normalization.fit(raw, recording.presses_mm)[0].inputs(raw).inputs
 
 
 def _places(weights: Weights, inputs: Floats) -> Floats:
@@ -178,7 +178,7 @@ def _untrained(entries: int) -> Weights:
 
     from .training import initial
 
-    options, generator = settings.Localizer(), torch.Generator().manual_seed(0)
+    options, generator = settings.LocalizerSettings(), torch.Generator().manual_seed(0)
     members = [initial(entries, options, generator) for _ in range(options.members)]
     axis = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
     return {name: torch.cat([each[name] for each in members], dim=axis[name]).detach().numpy() for name in axis}

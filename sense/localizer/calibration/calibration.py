@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from design.common.errors import InputError, instance
 from design.common.files import provenance
 from design.common.profiling import stage
-from design.common.settings import section, validated
+from design.common.settings import or_default, validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import settings
 from sense.localizer.evaluation import conformal, evaluate
 from sense.localizer.features import press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.network import refuse_unsound
-from sense.localizer.normalization import Scaled, Scaling
+from sense.localizer.normalization import Normalization, Scaled
 from sense.recordings.recording import Recording
 
 LEAST_TRAINING = 3
@@ -36,7 +36,7 @@ Indices = NDArray[np.int64]
 
 def calibrate(
     recording: Recording,
-    options: settings.Localizer | None = None,
+    options: settings.LocalizerSettings | None = None,
     *,
     split: str | None = None,
     seed: int | None = None,
@@ -59,9 +59,9 @@ def calibrate(
         InputError: an option out of range, too few presses to hold a share back, or a training that diverged.
     """
     instance("recording", recording, Recording)
-    options = section("options", options, settings.Localizer)
+    options = or_default("options", options, settings.LocalizerSettings)
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
-    options = validated(settings.Localizer, {**options.model_dump(), **given}, "[localizer]")
+    options = validated(settings.LocalizerSettings, {**options.model_dump(), **given}, "[localizer]")
     if options.method == "published":
         options = options.model_copy(update={"features": "published"})
     rng = np.random.default_rng(options.seed)
@@ -84,7 +84,7 @@ def calibrate(
 def learn(
     recording: Recording,
     training: Indices,
-    options: settings.Localizer,
+    options: settings.LocalizerSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Localizer:
@@ -108,16 +108,16 @@ def learn(
         again = felt(recording.readings, recording.times_s, *edges)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         shown_mm = np.concatenate([shown_mm, shown_mm])
-    scaling, table = Scaling.fit(shown_raw, shown_mm)
+    scaling, table = Normalization.fit(shown_raw, shown_mm)
     held_presses = scaling.inputs(raw[checked])
-    from .training import Samples, train  # torch, seconds to import, is needed here only
+    from .training import TrainingPresses, train_members  # torch, seconds to import, is needed here only
 
     shown, held = (
-        Samples(presses.inputs, presses.alive, scaling.targets(places))
+        TrainingPresses(presses.inputs, presses.alive, scaling.targets(places))
         for presses, places in ((scaling.inputs(shown_raw), shown_mm), (held_presses, held_mm))
     )
     if options.method == "masked":
-        weights = train(shown, held, table, options, rng, progress)
+        weights = train_members(shown, held, table, options, rng, progress)
     else:
         from .published_training import train_published
 
@@ -128,7 +128,7 @@ def learn(
         raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
     localizer = Localizer(
         weights=weights,
-        scaling=scaling,
+        normalization=scaling,
         table=table,
         method=options.method,
         features=options.features,

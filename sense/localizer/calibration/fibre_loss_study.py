@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from design.common.checkpoints import Checkpoints, State
 from design.common.errors import InputError, instance, path, shown, whole
 from design.common.files import provenance
-from design.common.settings import section
+from design.common.settings import or_default
 from design.criteria.fibre_loss import lost_subsets
 from sense import settings
 from sense.localizer.evaluation import by_place, errors_by_loss, held_back
@@ -37,12 +37,12 @@ Indices = NDArray[np.int64]
 Lost = tuple[int, ...]
 
 
-def robustness(
+def fibre_loss_study(
     recording: Recording,
     localizer: Localizer | None = None,
     *,
     retrain: bool = False,
-    options: settings.Localizer | None = None,
+    options: settings.LocalizerSettings | None = None,
     lost: int = 3,
     keep_in: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -74,7 +74,7 @@ def robustness(
     if localizer is not None:
         instance("localizer", localizer, Localizer)
     keep_in = None if keep_in is None else path("keep_in", keep_in)
-    options, lost = section("options", options, settings.Localizer), whole("lost", lost, 0, MAX_FIBRES)
+    options, lost = or_default("options", options, settings.LocalizerSettings), whole("lost", lost, 0, MAX_FIBRES)
     training, test = _presses(recording, localizer, options)
     levels = range(min(lost, recording.fibres - 1) + 1)
     places_mm = recording.presses_mm[test]
@@ -111,7 +111,9 @@ def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm:
     return {"errors": rows, "by_subset": by_subset, "maps": maps}
 
 
-def _presses(recording: Recording, localizer: Localizer | None, options: settings.Localizer) -> tuple[Indices, Indices]:
+def _presses(
+    recording: Recording, localizer: Localizer | None, options: settings.LocalizerSettings
+) -> tuple[Indices, Indices]:
     """Presses of known place to train on and to test on."""
     known, digest = np.flatnonzero(recording.known), recording.digest
     if localizer is not None and digest in localizer.recalibrated_by:
@@ -128,7 +130,7 @@ def _retrained(
     recording: Recording,
     training: Indices,
     test: Indices,
-    options: settings.Localizer,
+    options: settings.LocalizerSettings,
     levels: range,
     kept: Checkpoints | None,
     progress: Callable[[int, int], None],
@@ -158,7 +160,7 @@ def _retrained(
 
 
 def _train_without(
-    lost: Lost, recording: Recording, training: Indices, test: Indices, options: settings.Localizer
+    lost: Lost, recording: Recording, training: Indices, test: Indices, options: settings.LocalizerSettings
 ) -> Found:
     """Train on the other fibres alone, and find the test presses; the same whatever else is trained, and when."""
     rest = np.setdiff1d(np.arange(recording.fibres), lost)
@@ -192,7 +194,7 @@ def _found_of(state: State, presses: int) -> Found:
     return Found(**state)
 
 
-def lines(document: dict[str, Any]) -> list[str]:
+def fibre_loss_lines(document: dict[str, Any]) -> list[str]:
     """The errors of both ways as a table for people."""
     head = f"error in mm on {document['test_presses']} presses (split: {document['split']})"
     out = [head, f"{'':14s}lost  sets   mean    std    max"]

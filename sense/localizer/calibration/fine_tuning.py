@@ -15,7 +15,7 @@ from torch import Tensor
 from design.common.computing import one_torch_thread
 from sense.localizer.network import Floats, Weights
 
-from .training import INPUT_NOISE, MOVED, Samples, draw_alive, forward, looked_up, masked, one_cycle
+from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, looked_up, masked, one_cycle
 
 STEPS, BATCH, RATE = 200, 128, 1e-4
 """Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""
@@ -29,7 +29,7 @@ SPREAD_KEPT = 0.02
 
 def adapt(
     weights: Weights,
-    samples: Samples,
+    samples: TrainingPresses,
     table: Floats,
     lost: int,
     rng: np.random.Generator,
@@ -75,7 +75,7 @@ def adapt(
 class _Presses:
     """Draws presses that resemble the known ones."""
 
-    def __init__(self, samples: Samples, table: Floats, lost: int, generator: torch.Generator) -> None:
+    def __init__(self, samples: TrainingPresses, table: Floats, lost: int, generator: torch.Generator) -> None:
         self._x, self._alive, self._y = (torch.from_numpy(a) for a in (samples.inputs, samples.alive, samples.places))
         self._table = torch.from_numpy(table).flatten(2)
         self._at_home = looked_up(self._table, self._y)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance
 from design.common.files import provenance
-from design.common.settings import section
+from design.common.settings import or_default
 from sense import settings
 from sense.localizer.evaluation import distances
 from sense.recordings.recording import Recording
@@ -37,9 +37,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-def size_curve(
+def learning_curve(
     recording: Recording,
-    options: settings.Localizer | None = None,
+    options: settings.LocalizerSettings | None = None,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def size_curve(
         InputError: too few presses for a curve.
     """
     instance("recording", recording, Recording)
-    options = section("options", options, settings.Localizer)
+    options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.known)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
@@ -98,7 +98,7 @@ def _found(
     recording: Recording,
     trainings: Sequence[Indices],
     test: Indices,
-    options: settings.Localizer,
+    options: settings.LocalizerSettings,
     progress: Callable[[int, int], None],
 ) -> list[Array]:
     """Places (Q, 2) that localizers trained on each of `trainings` find for the test presses."""
@@ -185,7 +185,7 @@ def _advice(presses: int, error_mm: float, forecast: dict[str, Any]) -> str:
     )
 
 
-def lines(document: dict[str, Any]) -> list[str]:
+def learning_curve_lines(document: dict[str, Any]) -> list[str]:
     """A size curve for people."""
     fit = document["fit"]
     return [

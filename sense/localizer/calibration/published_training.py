@@ -9,13 +9,13 @@ import numpy as np
 from design.evaluation.levenberg_marquardt import fit
 from sense.localizer.network import Weights
 
-from .training import Samples
+from .training import TrainingPresses
 
 HIDDEN = 50
 """Neurons of the experiment's network."""
 
 
-def train_published(learn: Samples, check: Samples, rng: np.random.Generator) -> Weights:
+def train_published(learn: TrainingPresses, check: TrainingPresses, rng: np.random.Generator) -> Weights:
     """Fit the published network.
 
     Args:

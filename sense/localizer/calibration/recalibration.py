@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from design.common.errors import InputError, instance, whole
 from design.common.files import provenance
 from design.criteria.fibre_loss import lost_subsets
-from sense.localizer.evaluation import conformal, distances, summary
+from sense.localizer.evaluation import conformal, distances, error_row
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Found, Localizer
 from sense.recordings.recording import Recording
@@ -132,10 +132,10 @@ def recalibrate(
 
 def _adapted(localizer: Localizer, raw: Inputs, places_mm: Array, rng: np.random.Generator) -> Localizer:
     from .fine_tuning import adapt  # torch, seconds to import, is needed here only
-    from .training import Samples
+    from .training import TrainingPresses
 
-    scaled, targets = localizer.scaling.inputs(raw), localizer.scaling.targets(places_mm)
-    samples = Samples(scaled.inputs, scaled.alive, targets)
+    scaled, targets = localizer.normalization.inputs(raw), localizer.normalization.targets(places_mm)
+    samples = TrainingPresses(scaled.inputs, scaled.alive, targets)
     return replace(
         localizer, weights=adapt(localizer.weights, samples, localizer.table, len(localizer.factors) - 1, rng)
     )
@@ -164,7 +164,9 @@ class _Trial:
 
     def found(self, localizers: Sequence[Localizer]) -> Found_by_loss:
         """Each press found by the localizer of the fold that holds it, with each set of lost fibres."""
-        scaled = [each.scaling.inputs(self._raw[fold]) for each, fold in zip(localizers, self._folds, strict=True)]
+        scaled = [
+            each.normalization.inputs(self._raw[fold]) for each, fold in zip(localizers, self._folds, strict=True)
+        ]
         out = {}
         for lost in self._subsets:
             parts = [each.locate(part, lost) for each, part in zip(localizers, scaled, strict=True)]
@@ -183,7 +185,7 @@ class _Trial:
 
     def summary(self, found: Found_by_loss) -> list[dict[str, Any]]:
         """Rows as "errors" of `evaluate`."""
-        return [summary(len(level[0]), [found[lost] for lost in level], self._places_mm) for level in self._levels()]
+        return [error_row(len(level[0]), [found[lost] for lost in level], self._places_mm) for level in self._levels()]
 
     def widened(self, found: Found_by_loss) -> Array:
         """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do."""
@@ -197,7 +199,7 @@ class _Trial:
         return distances(found.places_mm, self._places_mm)
 
 
-def lines(document: Mapping[str, Any]) -> list[str]:
+def recalibration_lines(document: Mapping[str, Any]) -> list[str]:
     """A recalibration for people."""
     gain, error = document["gain_mm"], document["standard_error_mm"]
     names = ("lost  sets", "before mm", "after mm", "in r90 before", "in r90 after")

@@ -46,7 +46,7 @@ PATIENCE = 12
 
 
 @dataclass(frozen=True)
-class Samples:
+class TrainingPresses:
     """Presses to learn from or to check on.
 
     Attributes:
@@ -62,11 +62,11 @@ class StoppedError(Exception):
     """Another member failed, or the user broke off."""
 
 
-def train(
-    learn: Samples,
-    check: Samples,
+def train_members(
+    learn: TrainingPresses,
+    check: TrainingPresses,
     table: Floats,
-    options: settings.Localizer,
+    options: settings.LocalizerSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
 ) -> Weights:
@@ -110,7 +110,7 @@ def train(
     return {name: np.concatenate([weights[name] for weights in found], axis=axis[name]) for name in found[0]}
 
 
-def training_steps(presses: int, options: settings.Localizer) -> int:
+def training_steps(presses: int, options: settings.LocalizerSettings) -> int:
     """Steps that a member takes: `epochs` times through the presses, but no more than `MOST_STEPS`."""
     return min(MOST_STEPS, options.epochs * max(1, presses // options.batch))
 
@@ -118,7 +118,14 @@ def training_steps(presses: int, options: settings.Localizer) -> int:
 class _Member:
     """One network in training, on the GPU where there is one."""
 
-    def __init__(self, learn: Samples, check: Samples, table: Floats, options: settings.Localizer, seed: int) -> None:
+    def __init__(
+        self,
+        learn: TrainingPresses,
+        check: TrainingPresses,
+        table: Floats,
+        options: settings.LocalizerSettings,
+        seed: int,
+    ) -> None:
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._generator = torch.Generator(self._device).manual_seed(seed)
         self._options = options
@@ -131,7 +138,7 @@ class _Member:
         self._at_home = looked_up(self._table, self._y)
         self._weights = initial(self._fibres * size + self._fibres, options, self._generator)
 
-    def _on_device(self, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
+    def _on_device(self, samples: TrainingPresses) -> tuple[Tensor, Tensor, Tensor]:
         arrays = (samples.inputs, samples.alive, samples.places)
         x, alive, y = (torch.from_numpy(array).to(self._device) for array in arrays)
         return x, alive, y
@@ -214,7 +221,7 @@ def one_cycle(share: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
 
 
-def initial(entries: int, options: settings.Localizer, generator: torch.Generator) -> dict[str, Tensor]:
+def initial(entries: int, options: settings.LocalizerSettings, generator: torch.Generator) -> dict[str, Tensor]:
     """Random first weights of one member, named and shaped as in `network.Weights`, for `entries` numbers entering."""
     hidden, layers = options.hidden, options.layers
 

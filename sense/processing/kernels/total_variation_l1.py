@@ -60,7 +60,7 @@ def _minimum(level: float, lower: Any, lowers: int, upper: Any, uppers: int) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def forward(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
+def forward_sweep(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
     """Carry a message on over readings (R,).
 
     Args:

@@ -66,7 +66,7 @@ def _minimum(lam: float, knots: Any, first: int, last: int) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def forward(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
+def forward_sweep(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
     """Carry a message on over readings (R,): as `robust_variation.forward`; `ends` costs O(knots) a reading."""
     origin, kept = message[0][0], message[1]
     room = len(readings)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from design.common.errors import InputError
-from sense.rig.devices import RigFault, Samples
+from sense.rig.devices import ConverterSamples, RigFault
 
-from .framing import FULL_SCALE, MAX_AVERAGING, MAX_CHANNELS, Ack, Block, Identity, Kind, Request, Settings, Status
+from .framing import FULL_SCALE, MAX_AVERAGING, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Request, Status
 from .sample_clock import SampleClock
-from .serial_link import POLL_S, Link
+from .serial_link import POLL_S, SerialLink
 
 FIRMWARE_MAJOR = 1
 """Boards with another first number of the firmware version speak another wire format."""
@@ -54,16 +54,16 @@ class Arduino:
         _within("channels", channels, 1, MAX_CHANNELS)
         _within("averaging", averaging, 1, MAX_AVERAGING)
         self._port = port
-        self._wanted = Settings(round(1e9 / rate_hz), (1 << channels) - 1, averaging)
+        self._wanted = BoardSettings(round(1e9 / rate_hz), (1 << channels) - 1, averaging)
         self._supply_v = supply_v
-        self._link: Link | None = None
+        self._link: SerialLink | None = None
         self._reader: _Reader | None = None
         self._assembler: Assembler | None = None
 
     def connect(self) -> dict[str, Any]:
         """Open the port, check the firmware, set the board and start it; see `Converter`."""
         self.close()
-        self._link = link = Link(self._port)
+        self._link = link = SerialLink(self._port)
         try:
             identity = self._identify(link)
             settings = self._set(link)
@@ -84,7 +84,7 @@ class Arduino:
             "port": self._port,
         }
 
-    def read(self) -> Samples:
+    def read(self) -> ConverterSamples:
         """All samples since the last call, C columns of volts; see `Converter`.
 
         Raises:
@@ -119,7 +119,7 @@ class Arduino:
             self._link.close()
         self._reader = None
 
-    def _identify(self, link: Link) -> Identity:
+    def _identify(self, link: SerialLink) -> Identity:
         try:
             identity = link.ask(Request(Kind.IDENTIFY), Identity, lambda _: True, _ANSWER_S)
         except RigFault as fault:
@@ -133,7 +133,7 @@ class Arduino:
             raise RigFault("refused", message, f"flash it anew, see {_FIRMWARE}/README.md")
         return identity
 
-    def _set(self, link: Link) -> Settings:
+    def _set(self, link: SerialLink) -> BoardSettings:
         link.ask(Request(Kind.STOP), Ack, lambda ack: ack.command == Kind.STOP, _ANSWER_S)
         ack = link.ask(self._wanted, Ack, lambda ack: ack.command == Kind.SETTINGS, _ANSWER_S)
         if ack.status != Status.OK:
@@ -145,7 +145,7 @@ class Arduino:
             raise RigFault("refused", message, "lower the rate, the channels or the averaging")
         return ack.settings
 
-    def _start(self, link: Link, settings: Settings) -> None:
+    def _start(self, link: SerialLink, settings: BoardSettings) -> None:
         link.decoder.damaged = 0
         self._reader = reader = _Reader(link, round(_UNREAD_S * 1e9 / settings.period_ns))
         reader.start()
@@ -166,7 +166,7 @@ class Assembler:
         blocks, missing, overruns: blocks so far, samples that are missing, those of them dropped by the board.
     """
 
-    def __init__(self, settings: Settings, supply_v: float) -> None:
+    def __init__(self, settings: BoardSettings, supply_v: float) -> None:
         self.clock = SampleClock(settings.period_ns * 1e-9)
         self.blocks = self.missing = self.overruns = 0
         self._settings = settings
@@ -174,7 +174,7 @@ class Assembler:
         self._next = 0
         self._time_us: int | None = None
 
-    def samples(self, arrivals: Iterable[Arrival]) -> Samples:
+    def samples(self, arrivals: Iterable[Arrival]) -> ConverterSamples:
         """The samples of the blocks that have arrived since the last call.
 
         Raises:
@@ -188,7 +188,7 @@ class Assembler:
         times = [self.clock.times(first, len(counts)) for first, _, counts in placed]
         missing = [np.r_[lost, np.zeros(len(counts) - 1, np.int64)] for _, lost, counts in placed]
         channels = self._settings.mask.bit_count()
-        return Samples(
+        return ConverterSamples(
             np.concatenate([np.empty(0), *times]),
             np.concatenate([np.empty((0, channels)), *(counts for *_, counts in placed)]) * self._volts,
             np.concatenate([np.empty(0, np.int64), *missing]),
@@ -218,7 +218,7 @@ class Assembler:
 class _Reader(threading.Thread):
     """Drains the port into a buffer of at most `capacity` samples, until stopped or something fails."""
 
-    def __init__(self, link: Link, capacity: int) -> None:
+    def __init__(self, link: SerialLink, capacity: int) -> None:
         super().__init__(name=f"reader of {link.port}", daemon=True)
         self._link = link
         self._capacity = capacity

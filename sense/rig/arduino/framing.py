@@ -72,7 +72,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Settings:
+class BoardSettings:
     """How to sample: `period_ns` from sample to sample, inputs by bit of `mask`, `averaging` conversions a sample."""
 
     period_ns: int
@@ -110,7 +110,7 @@ class Ack:
 
     command: int
     status: int
-    settings: Settings
+    settings: BoardSettings
 
     def pack(self) -> bytes:
         """The payload."""
@@ -141,7 +141,7 @@ class Block:
         return _BLOCK.pack(Kind.BLOCK, len(self.counts), *fields) + self.counts.astype("<u2").tobytes()
 
 
-Frame = Request | Settings | Identity | Ack | Block
+Frame = Request | BoardSettings | Identity | Ack | Block
 
 _SETTINGS = struct.Struct("<IHB")
 _IDENTITY = struct.Struct("<3BBB16s16s")
@@ -192,13 +192,13 @@ def unpack(payload: bytes) -> Frame:
         if kind in (Kind.IDENTIFY, Kind.START, Kind.STOP) and len(payload) == 1:
             return Request(Kind(payload[0]))
         if kind == Kind.SETTINGS:
-            return Settings(*_SETTINGS.unpack(payload[1:]))
+            return BoardSettings(*_SETTINGS.unpack(payload[1:]))
         if kind == Kind.IDENTITY:
             major, minor, patch, bits, channels, name, serial = _IDENTITY.unpack(payload[1:])
             return Identity((major, minor, patch), bits, channels, name.rstrip(b"\0").decode("ascii"), serial)
         if kind == Kind.ACK:
             command, status, *settings = _ACK.unpack(payload[1:])
-            return Ack(command, status, Settings(*settings))
+            return Ack(command, status, BoardSettings(*settings))
     except struct.error as error:
         raise ValueError(f"kind {kind} of {len(payload)} bytes ({error})") from error
     if kind == Kind.BLOCK:

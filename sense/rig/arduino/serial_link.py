@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from sense.rig.devices import RigFault
 
-from .framing import Decoder, Frame, Request, Settings, encode
+from .framing import BoardSettings, Decoder, Frame, Request, encode
 
 BAUD = 115_200
 """Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
@@ -45,7 +45,7 @@ def find_ports() -> list[BoardPort]:
     return sorted(found, key=lambda port: (port.kind, port.device))
 
 
-class Link:
+class SerialLink:
     """An open port. Any method but `close` raises RigFault("lost") once the board is gone."""
 
     def __init__(self, port: str) -> None:
@@ -68,14 +68,14 @@ class Link:
             raise self._lost(error) from error
         return time.monotonic(), self.decoder.feed(data)
 
-    def send(self, command: Request | Settings) -> None:
+    def send(self, command: Request | BoardSettings) -> None:
         """Send one command."""
         try:
             self._serial.write(encode(command))
         except OSError as error:
             raise self._lost(error) from error
 
-    def ask(self, command: Request | Settings, kind: type[F], fits: Callable[[F], bool], wait_s: float) -> F:
+    def ask(self, command: Request | BoardSettings, kind: type[F], fits: Callable[[F], bool], wait_s: float) -> F:
         """Send `command` until a frame of `kind` that `fits` comes; all other frames are thrown away.
 
         Raises:

@@ -24,12 +24,12 @@ from sense.rig.arduino.framing import (
     MAX_SAMPLES,
     Ack,
     Block,
+    BoardSettings,
     Decoder,
     Frame,
     Identity,
     Kind,
     Request,
-    Settings,
     Status,
     encode,
 )
@@ -80,7 +80,7 @@ class EmulatedBoard:
         self.port = os.ttyname(self._slave)
         self._decoder = Decoder()
         self._out = bytearray()
-        self._settings = Settings(1_000_000, 0xFF, 1)
+        self._settings = BoardSettings(1_000_000, 0xFF, 1)
         self._started_s: float | None = None
         self._first = self._sequence = self._overruns = 0
         self._overrun_asked = 0
@@ -160,8 +160,8 @@ class EmulatedBoard:
 
     def _answer(self, frame: Frame) -> Identity | Ack | None:
         status = Status.OK
-        if isinstance(frame, Settings):
-            status = Status.RUNNING if self._started_s is not None else judge(frame)
+        if isinstance(frame, BoardSettings):
+            status = Status.RUNNING if self._started_s is not None else judge_settings(frame)
             if status == Status.OK:
                 self._settings = frame
             return Ack(Kind.SETTINGS, status, self._settings)
@@ -222,7 +222,7 @@ class EmulatedBoard:
                 del self._out[: os.write(self._master, self._out)]
 
 
-def judge(settings: Settings) -> Status:
+def judge_settings(settings: BoardSettings) -> Status:
     """What the board says to settings."""
     mask, averaging, period_ns = settings.mask, settings.averaging, settings.period_ns
     if not (0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= MAX_AVERAGING and 0 < period_ns <= MAX_PERIOD_NS):

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from design import Contact, Morphology, signals
 from sense.recordings.pad_model import TRAVEL_S, LivePad
 from sense.recordings.simulation import random_places
-from sense.rig.devices import RigFault, Samples
-from sense.settings import Rig
+from sense.rig.devices import ConverterSamples, RigFault
+from sense.settings import RigSettings
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ class DemoConverter:
     """
 
     def __init__(
-        self, pad: Morphology, rig: Rig, contact: Contact, clock: Callable[[], float] = time.monotonic
+        self, pad: Morphology, rig: RigSettings, contact: Contact, clock: Callable[[], float] = time.monotonic
     ) -> None:
         rng = np.random.default_rng(rig.seed)
         random_places(pad, rig.presses, rng)  # those of the recording, drawn before the pad is
@@ -42,7 +42,7 @@ class DemoConverter:
         self._started_s, self._count = self._clock(), 0
         return {"name": "simulated", "channels": 2 * self._pad.grid, "rate_hz": self._rig.rate_hz}
 
-    def read(self) -> Samples:
+    def read(self) -> ConverterSamples:
         """All samples since the last call; see `Converter`. Raises RigFault("refused") before `connect`."""
         if self._started_s is None:
             raise RigFault("refused", "the simulated rig is not connected")
@@ -52,7 +52,7 @@ class DemoConverter:
         touches = [self._touch(at_s) for at_s in elapsed_s.tolist()]
         places_mm = np.array([place for place, _ in touches]).reshape(-1, 2)
         volts = self._model.volts(places_mm, np.array([depth for _, depth in touches]))
-        return Samples(self._started_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
+        return ConverterSamples(self._started_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
 
     def close(self) -> None:
         """Nothing is open; see `Converter`."""

@@ -27,7 +27,7 @@ MOVE, DRIFT, STOP_DRIFT, SET_TCP, STOP, WATCHDOG, IS_SAFE, GET_TCP, IS_STEADY, E
 
 
 @dataclass(frozen=True)
-class Surface:
+class SpringySurface:
     """A springy plane the tool can press on, at a height in m."""
 
     height: float
@@ -46,7 +46,7 @@ class Controller:
         remote: whether the arm is in remote control. asked: every line the dashboard was sent.
     """
 
-    def __init__(self, series: Series, pose: Array, surface: Surface | None = None, now: float = 0.0) -> None:
+    def __init__(self, series: Series, pose: Array, surface: SpringySurface | None = None, now: float = 0.0) -> None:
         self.series: Series = series
         self.motion = Motion(pose)
         self.surface = surface

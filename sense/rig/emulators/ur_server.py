@@ -22,7 +22,7 @@ import numpy as np
 
 from sense.rig.ur5 import rtde_frames as frames
 
-from .ur_controller import RATES_HZ, VERSIONS, Controller, Series, Surface
+from .ur_controller import RATES_HZ, VERSIONS, Controller, Series, SpringySurface
 from .ur_truth import TruthWriter
 
 ADDRESS = "127.0.0.1"
@@ -256,7 +256,7 @@ def _say(what: Any) -> None:
 
 def main(series: Series, pose_mm: list[float], surface_mm: float | None, stiffness_n_mm: float, truth: str) -> None:
     """Open the ports and serve; the first line on stdout is null, or why it cannot be."""
-    surface = None if surface_mm is None else Surface(surface_mm / 1e3, stiffness_n_mm * 1e3)
+    surface = None if surface_mm is None else SpringySurface(surface_mm / 1e3, stiffness_n_mm * 1e3)
     controller = Controller(series, np.array(pose_mm) / TO_MM, surface, time.monotonic())
     server = Server(controller, TruthWriter(Path(truth)))
     try:

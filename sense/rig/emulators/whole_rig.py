@@ -11,7 +11,7 @@ from sense.recordings.pad_model import LivePad
 from sense.rig.arduino.driver import Arduino
 from sense.rig.session.pad_frame import Frame
 from sense.rig.ur5.driver import UR5
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 from .board import EmulatedBoard
 from .ur import UrEmulator
@@ -20,7 +20,9 @@ HOST = "127.0.0.1"
 
 
 @contextmanager
-def emulated(pad: Morphology, contact: Contact, rig: Rig) -> Iterator[tuple[UR5, Arduino, UrEmulator, EmulatedBoard]]:
+def emulated(
+    pad: Morphology, contact: Contact, rig: RigSettings
+) -> Iterator[tuple[UR5, Arduino, UrEmulator, EmulatedBoard]]:
     """Drivers of an arm and a board, not yet connected, and the emulators behind them.
 
     Args:
@@ -45,7 +47,7 @@ def emulated(pad: Morphology, contact: Contact, rig: Rig) -> Iterator[tuple[UR5,
                 arm.close()
 
 
-def emulated_rig(rig: Rig, pad: Morphology) -> Rig:
+def emulated_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
     """`rig` with a workspace around the emulated pad, and a channel for every fibre as far as the board has them."""
     x, y = rig.pad_mm
     reach = pad.size_mm + rig.clearance_mm

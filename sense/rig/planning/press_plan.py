@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
-from sense.processing.limits import MAX_MM, numbers, refuse_beyond
+from sense.processing.limits import MAX_MM, as_numbers, refuse_beyond
 from sense.recordings.csv_table import read_csv
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 Array = NDArray[np.float64]
 
@@ -34,8 +34,8 @@ class PressPlan:
     depths_mm: Array
 
     def __post_init__(self) -> None:
-        places = numbers(self.places_mm, np.float64, "places of the plan")
-        depths = numbers(self.depths_mm, np.float64, "depths of the plan")
+        places = as_numbers(self.places_mm, np.float64, "places of the plan")
+        depths = as_numbers(self.depths_mm, np.float64, "depths of the plan")
         if places.ndim != 2 or places.shape[1] != 2 or len(places) == 0 or depths.shape != (len(places),):
             raise InputError(
                 f"plan: places have shape {places.shape} and depths {depths.shape}, expected (Q, 2) and (Q,), Q > 0"
@@ -58,13 +58,13 @@ class PressPlan:
     @classmethod
     def of(cls, rows: ArrayLike) -> "PressPlan":
         """The plan of rows (Q, 3) as `document` gives them."""
-        table = numbers(rows, np.float64, "plan")
+        table = as_numbers(rows, np.float64, "plan")
         if table.ndim != 2 or table.shape[1] != 3:
             raise InputError(f"plan has shape {table.shape}, expected (Q, 3): {', '.join(COLUMNS)}")
         return cls(table[:, :2], table[:, 2])
 
 
-def planned(pad: Morphology, rig: Rig, rng: np.random.Generator) -> PressPlan:
+def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator) -> PressPlan:
     """The plan that `[rig]` asks for: `presses` places in the square half a pitch beyond the outer fibres.
 
     A grid has as many rows as columns and at least `presses` places, of which the first are taken; boustrophedon runs
@@ -114,6 +114,6 @@ def _named(path: Path, rows: list[list[float]]) -> PressPlan:
         raise InputError(f"{path}: {error}") from error
 
 
-def describe(plan: PressPlan) -> dict[str, Any]:
+def plan_lines(plan: PressPlan) -> dict[str, Any]:
     """The plan as a recording's start document keeps it."""
     return {"columns": list(COLUMNS), "presses": plan.document()}

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from design.common.settings import Spec
     from design.pad.morphology import Morphology
     from sense.recordings.recorder import Recorder
-    from sense.settings import Rig
+    from sense.settings import RigSettings
 
     from .press_plan import PressPlan
 
@@ -22,14 +22,14 @@ class Order:
     """What is to be recorded: the pad, settings and plan, and where they came from."""
 
     pad: "Morphology"
-    rig: "Rig"
+    rig: "RigSettings"
     spec: "Spec"
     out: Path
     command: str
     inputs: Sequence[Path]
 
 
-def plan_of(order: Order, rig: "Rig", plan_file: Path | None, resume: bool) -> "PressPlan":
+def plan_of(order: Order, rig: "RigSettings", plan_file: Path | None, resume: bool) -> "PressPlan":
     """The plan of a resumed recording, of a file, or of the settings."""
     import numpy as np
 
@@ -54,7 +54,7 @@ _LASTING = ("channels", "rate_hz", "converter_rate_hz", "readings_per_press", "p
 """Settings that all of a recording has to share."""
 
 
-def _require_same(order: Order, rig: "Rig", source: Mapping[str, Any]) -> None:
+def _require_same(order: Order, rig: "RigSettings", source: Mapping[str, Any]) -> None:
     """Refuse to go on with a recording under other settings, or of another pad."""
     was, now = source.get("rig"), rig.model_dump(mode="json")
     for key in _LASTING:
@@ -69,11 +69,11 @@ def _morphology(order: Order) -> dict[str, Any]:
     return {"pitch_mm": order.pad.pitch_mm, "knots": order.pad.knots.tolist()}
 
 
-def recorder_of(order: Order, rig: "Rig", plan: "PressPlan", folder: Path, resume: bool) -> "Recorder":
+def recorder_of(order: Order, rig: "RigSettings", plan: "PressPlan", folder: Path, resume: bool) -> "Recorder":
     """The recorder of a new recording, or of the one in `folder` that is gone on with."""
     from sense.recordings.recorder import START, Recorder
 
-    from .press_plan import describe as describe_plan
+    from .press_plan import plan_lines as describe_plan
 
     if resume and (folder / START).exists():
         return Recorder.resume(folder)

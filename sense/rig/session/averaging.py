@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sense.rig.devices import Samples
+from sense.rig.devices import ConverterSamples
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class Averager:
         self._waiting = np.empty((0, 2 + channels))  # stretch, time, volts
         self.lost = 0
 
-    def feed(self, samples: Samples) -> tuple[Array, Array]:
+    def feed(self, samples: ConverterSamples) -> tuple[Array, Array]:
         """Times (n,) and volts (n, C) of the stretches that are complete now; the others wait for more samples."""
         if len(samples.times_s) == 0:
             return np.empty(0), np.empty((0, self._waiting.shape[1] - 2))

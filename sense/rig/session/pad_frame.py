@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sense.rig.devices import Pose, RigFault
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class Frame:
     tool_rad: tuple[float, float, float]
 
     @classmethod
-    def of(cls, rig: Rig) -> "Frame":
+    def of(cls, rig: RigSettings) -> "Frame":
         """The frame that `[rig]` says; raises RigFault where the contact height is unknown."""
         if rig.contact_mm is None:
             raise RigFault(

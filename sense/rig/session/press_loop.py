@@ -16,7 +16,7 @@ from sense.recordings.recorder import Recorder
 from sense.rig.devices import Arm, Converter, Pose, RigFault
 from sense.rig.planning.press_plan import PressPlan
 from sense.rig.safety import POLL_S, Limits, require_safe, wait_until_still, watch
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 from .averaging import Averager
 from .pad_frame import Frame
@@ -47,7 +47,7 @@ class Session:
         arm: Arm,
         converter: Converter,
         recorder: Recorder,
-        rig: Rig,
+        rig: RigSettings,
         *,
         dry: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -205,7 +205,7 @@ class Session:
             wait_until_still(self._arm, self._limits, self._clock, self._sleep)
 
 
-def require_safe_plan(plan: PressPlan, rig: Rig) -> None:
+def require_safe_plan(plan: PressPlan, rig: RigSettings) -> None:
     """Refuse a plan of which any pose or move is beyond the limits of `[rig]`; raises RigFault("refused")."""
     frame, limits = Frame.of(rig), Limits.of(rig)
     for place, depth in zip(plan.places_mm, plan.depths_mm.tolist(), strict=True):

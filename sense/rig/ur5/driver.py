@@ -12,7 +12,7 @@ from sense.recordings.recorder import STATE_COLUMNS
 from sense.rig.devices import ArmState, Array, RigFault
 from sense.rig.safety import require_numbers
 
-from .link import Link
+from .link import ArmLink
 from .rtde_frames import stop_program
 
 CONNECT_S = 4.5
@@ -33,7 +33,7 @@ class UR5:
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self._link: Link | None = None
+        self._link: ArmLink | None = None
         self._moved_s = 0.0
 
     def connect(self) -> Mapping[str, Any]:
@@ -49,7 +49,7 @@ class UR5:
         if importlib.util.find_spec("rtde_control") is None:
             raise RigFault("refused", "the arm needs ur-rtde", "pip install 'padforge[rig]'")
         self._end()
-        self._link = Link(self._host)
+        self._link = ArmLink(self._host)
         try:
             return self._link.ask("connect", timeout_s=CONNECT_S)
         except BaseException:
@@ -144,7 +144,7 @@ class UR5:
                 self._link.ask("close", timeout_s=MOVE_S)
             self._end()
 
-    def _running(self) -> Link:
+    def _running(self) -> ArmLink:
         if self._link is None:
             raise RigFault("lost", f"there is no link to the arm {self._host}", "connect first")
         if fault := self._link.fault:

@@ -25,7 +25,7 @@ STOP_S = 0.2
 """Longest wait for the dashboard to confirm a stop."""
 
 
-class Link:
+class ArmLink:
     """A running child.
 
     Attributes:

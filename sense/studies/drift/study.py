@@ -27,7 +27,7 @@ from sense.localizer.features import bridged, press_inputs
 from sense.processing.filters import running_median, total_variation
 from sense.recordings.recording import Recording
 from sense.recordings.simulation import simulate
-from sense.settings import Rig
+from sense.settings import RigSettings
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
 
@@ -78,7 +78,7 @@ def drift_study(
     pads: Mapping[str, Morphology],
     recordings: Mapping[str, Recording],
     *,
-    rig: Rig | None = None,
+    rig: RigSettings | None = None,
     presses: int = 1000,
     test_share: float = 0.15,
     hidden: int = 50,
@@ -104,7 +104,7 @@ def drift_study(
     if twice:
         raise InputError(f"{twice[0]}: both a morphology and a recording are called so, expected each label once")
     drawn = int(np.random.default_rng([6, seed]).integers(2**32))
-    rig = (rig or Rig()).model_copy(update={"presses": presses, "seed": drawn})
+    rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": drawn})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
     sources |= {label: partial(_same, recording) for label, recording in recordings.items()}
     kinds = dict.fromkeys(pads, SIMULATED)

@@ -86,8 +86,8 @@ def test_the_search_bench_has_every_way_budget_and_seed(monkeypatch):
 def test_a_search_is_the_same_in_this_thread(monkeypatch):
     monkeypatch.setattr(search, "GENERATIONS", (2,))
     trial = next(iter(search.trials()))
-    settings = search.Search(method="genetic", generations=2, knots=3, seed=0)
-    again = search.search(search.Pad(), search.Contact(), settings, search.Rules(enforce=False))
+    settings = search.SearchSettings(method="genetic", generations=2, knots=3, seed=0)
+    again = search.search(search.PadSettings(), search.Contact(), settings, search.RulesSettings(enforce=False))
     np.testing.assert_array_equal(trial.work().morphology.knots, again.morphology.knots)
 
 

@@ -7,8 +7,8 @@ import time
 import pytest
 
 from design.benchmarking import harness, suite
-from design.benchmarking.comparison import compared, lines, read_earlier, worse
-from design.benchmarking.harness import Bench, Measured, Trial, measure
+from design.benchmarking.comparison import compared, comparison_lines, read_earlier, worse
+from design.benchmarking.harness import Bench, BenchTrial, Measured, measure
 from design.benchmarking.suite import run_benches
 from design.benchmarking.table import bench_lines, summary_rows, write_bench
 from design.common.errors import InputError
@@ -17,8 +17,8 @@ from design.common.errors import InputError
 def bench(error=0.1, work=lambda: None, name="x"):
     def trials():
         for case in ("a", "b"):
-            yield Trial(case, "plain", 7, lambda: None, lambda found: {"error": 0.5, "visited": 1.0})
-            yield Trial(case, "ours", 0, work, lambda found: {"error": error, "visited": 0.25})
+            yield BenchTrial(case, "plain", 7, lambda: None, lambda found: {"error": 0.5, "visited": 1.0})
+            yield BenchTrial(case, "ours", 0, work, lambda found: {"error": error, "visited": 0.25})
 
     return Bench(name, trials, "error (mm)", ("plain", 7), ("ours", 0), plain=("plain",))
 
@@ -37,7 +37,7 @@ def _quick(monkeypatch):
 
 def test_a_later_round_times_what_it_is_told_to_and_judges_once():
     judged = []
-    trial = Trial("a", "ours", 3, lambda: 42, lambda found: judged.append(found) or {"error": 1.0})
+    trial = BenchTrial("a", "ours", 3, lambda: 42, lambda found: judged.append(found) or {"error": 1.0})
     one = Bench("x", lambda: iter([trial]), "error", ("ours", 3), ("ours", 3), plain=())
     so_far = Measured()
     assert measure(one, so_far, lambda step: None, lambda key: False) == 1
@@ -68,7 +68,7 @@ def test_time_is_an_items_and_waits_for_a_core_do_not_count(monkeypatch):
     monkeypatch.setattr(harness, "_fixed_work", lambda: [0.5, 1.0])
     now = iter([0.0, 0.01] * 1000)
     monkeypatch.setattr(harness.time, "perf_counter", lambda: next(now))
-    trial = Trial("a", "ours", 0, lambda: None, items=2)
+    trial = BenchTrial("a", "ours", 0, lambda: None, items=2)
     so_far = Measured()
     measure(Bench("x", lambda: iter([trial]), "", ("ours", 0), ("ours", 0), ()), so_far, lambda s: None, lambda k: True)
     assert so_far.times[trial.key] == [pytest.approx(0.002)]
@@ -166,8 +166,8 @@ def test_errors_of_rounding_are_all_alike():
 def test_a_change_is_told_in_one_line():
     (change,) = worse(document(), document(seconds=1.5))
     assert str(change) == "x, a, ours: slower, 1.50x (1 before, 1.5 now)"
-    assert lines([change], 3) == ["3 trials compared; worse than before:", f"  {change}"]
-    assert lines([], 3) == ["3 trials compared: none slower, less accurate or looking at more"]
+    assert comparison_lines([change], 3) == ["3 trials compared; worse than before:", f"  {change}"]
+    assert comparison_lines([], 3) == ["3 trials compared: none slower, less accurate or looking at more"]
     assert compared({"x": document()}, {"x": document(), "y": document()}) == 1
 
 

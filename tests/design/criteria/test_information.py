@@ -14,8 +14,8 @@ from design.criteria.information import (
     idle_share,
     information,
     joint_entropy,
+    published_sharpness,
     quantize,
-    sharpness,
 )
 from design.criteria.published_objective import published_presses, published_terms
 from design.pad.contact import boustrophedon
@@ -48,9 +48,9 @@ def test_levels_span_the_converter_whatever_the_signals(signals):
 
 def test_sharpness_is_zero_on_a_ramp_and_counts_a_spike_four_times():
     ramp = np.arange(6.0)[:, None]
-    assert sharpness(ramp) == 0
+    assert published_sharpness(ramp) == 0
     ramp[3] += 1
-    assert sharpness(ramp) == 4
+    assert published_sharpness(ramp) == 4
 
 
 def test_disorder_of_two_swapped_fibres_is_the_area_between_them_in_samples():
@@ -173,7 +173,7 @@ def test_disorder_counts_both_families_and_only_what_is_in_the_wrong_order():
 
 def test_the_sharpness_of_columns_adds():
     levels = np.array([[0.0, 3.0], [1.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
-    assert sharpness(levels) == (2 + 1) + (3 + 3)
+    assert published_sharpness(levels) == (2 + 1) + (3 + 3)
 
 
 def test_joint_entropy_looks_at_every_column():

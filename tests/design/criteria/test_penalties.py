@@ -8,12 +8,12 @@ from scipy.interpolate import PchipInterpolator
 from design import Morphology
 from design.criteria.differentiable import span_samples
 from design.criteria.penalties import penalties
-from design.criteria.rules import check
+from design.criteria.rules import check_rules
 from design.pad.contact import fibre_axes
 from design.pad.curves import crossings, lengths
-from design.settings import Pad, Rules
+from design.settings import PadSettings, RulesSettings
 
-NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0, border_mm=0, max_length_mm=1e6)
+NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0, border_mm=0, max_length_mm=1e6)
 
 
 def axes(pad):
@@ -22,7 +22,9 @@ def axes(pad):
 
 
 def found(pad, rules, margin=1.0):
-    return {rule: value.item() for rule, value in penalties(*axes(pad), Pad(grid=pad.grid), rules, margin).items()}
+    return {
+        rule: value.item() for rule, value in penalties(*axes(pad), PadSettings(grid=pad.grid), rules, margin).items()
+    }
 
 
 def bent(cross, travel=2.5, fibre=0, others=0.0):
@@ -36,7 +38,7 @@ def bent(cross, travel=2.5, fibre=0, others=0.0):
 
 
 def test_the_straight_grid_has_no_penalty():
-    assert set(found(Morphology.straight(4), Rules()).values()) == {0.0}
+    assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
 
 
 @pytest.mark.parametrize(
@@ -63,7 +65,11 @@ def test_a_broken_rule_has_a_penalty_that_grows(limits, mild, worse):
 
 def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
     """On random gentle pads; those with a penalty are only counted, so that the test is seen to look at both kinds."""
-    rng, rules, passed = np.random.default_rng(0), Rules(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70), 0
+    rng, rules, passed = (
+        np.random.default_rng(0),
+        RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70),
+        0,
+    )
     for _ in range(60):
         knots = Morphology.straight(4).knots
         inner = np.linspace(knots[:, 0], knots[:, -1], 7).transpose(1, 0, 2)[:, 1:-1]
@@ -73,7 +79,7 @@ def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
         pad = Morphology(np.concatenate([knots[:, :1], inner, knots[:, 1:]], axis=1))
         if sum(found(pad, rules, margin=1.05).values()) == 0:
             passed += 1
-            assert check(pad, rules) == []
+            assert check_rules(pad, rules) == []
     assert 5 < passed < 55
 
 
@@ -83,7 +89,7 @@ def test_folds_that_come_near_each_other_are_pushed_apart():
     pad = Morphology(np.stack([knots, straight]))
     rules = NONE.model_copy(update={"min_gap_mm": 4.0})
     assert found(pad, rules)["folds"] > 0
-    assert {v.fibres for v in check(pad, rules)} == {(1,)}
+    assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}
 
 
 def test_the_soft_number_of_crossings_is_the_number_of_crossings():
@@ -97,7 +103,7 @@ def test_the_soft_number_of_crossings_is_the_number_of_crossings():
 @pytest.mark.parametrize(
     "rules",
     [
-        Rules(min_bend_radius_mm=4, min_gap_mm=9),
+        RulesSettings(min_bend_radius_mm=4, min_gap_mm=9),
         NONE.model_copy(update={"max_crossings": 3, "min_crossing_angle_deg": 60}),
     ],
 )
@@ -106,13 +112,13 @@ def test_the_gradient_is_that_of_finite_differences(rules):
     rng = np.random.default_rng(4)
     pad = Morphology.random(2, 3, seed=5)
     travel, cross = axes(pad)
-    total = torch.stack(list(penalties(travel, cross, Pad(grid=2), rules).values())).sum()
+    total = torch.stack(list(penalties(travel, cross, PadSettings(grid=2), rules).values())).sum()
     total.backward()
     step = 1e-6 * torch.tensor(rng.standard_normal(cross.shape))
     step[:, [0, -1]] = 0
     with torch.no_grad():
         ahead, behind = (
-            torch.stack(list(penalties(travel, cross + sign * step, Pad(grid=2), rules).values())).sum()
+            torch.stack(list(penalties(travel, cross + sign * step, PadSettings(grid=2), rules).values())).sum()
             for sign in (1, -1)
         )
     assert cross.grad is not None

@@ -5,11 +5,11 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from design import InputError, Morphology, Spec, crossings
-from design.criteria.rules import check
+from design.criteria.rules import check_rules
 from design.pad.curves import crossing_angles
-from design.settings import Rules
+from design.settings import RulesSettings
 
-NONE = Rules(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
+NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
 
 
 def only(**limits):
@@ -17,7 +17,7 @@ def only(**limits):
 
 
 def test_the_straight_grid_breaks_nothing():
-    assert check(Morphology.straight(4), Rules()) == []
+    assert check_rules(Morphology.straight(4), RulesSettings()) == []
 
 
 def bent(cross, travel=2.5, fibre=0):
@@ -30,7 +30,7 @@ def bent(cross, travel=2.5, fibre=0):
 
 
 def test_fibres_too_close_are_named_with_their_gap():
-    found = check(bent(1.95), only(min_gap_mm=0.8))
+    found = check_rules(bent(1.95), only(min_gap_mm=0.8))
     assert [v.fibres for v in found] == [(1, 2)]
     assert found[0].measured == pytest.approx(0.05 * 11.25, abs=1e-3)
     assert found[0].place_mm == pytest.approx((0, (1.975 - 2.5) * 11.25), abs=0.3)
@@ -48,26 +48,26 @@ def zigzag(apart_mm, legs=3):
 
 
 def test_branches_of_one_fibre_too_close_are_found_with_their_gap():
-    found = check(zigzag(0.5), only(min_gap_mm=0.8))
+    found = check_rules(zigzag(0.5), only(min_gap_mm=0.8))
     assert [(v.rule, v.fibres) for v in found] == [("min_gap_mm", (1,))]
     assert found[0].measured == pytest.approx(0.5, abs=1e-3)
     assert str(found[0]).startswith("min_gap_mm: fibre 1 at (")
-    assert check(zigzag(0.5), only(min_gap_mm=0.48)) == []
+    assert check_rules(zigzag(0.5), only(min_gap_mm=0.48)) == []
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_folds_of_a_large_pad_with_a_large_gap_are_those_of_a_small_one(seed, monkeypatch):
     """The same courses, a hundred times larger: what is found is too, to 2e-4 of the gap, from fewer points."""
     small = Morphology.random(1, 9, seed)
-    found = [check(Morphology(small.knots, 10.0 * s), only(min_gap_mm=4.0 * s)) for s in (1, 100)]
+    found = [check_rules(Morphology(small.knots, 10.0 * s), only(min_gap_mm=4.0 * s)) for s in (1, 100)]
     assert found[0]
     assert [v.fibres for v in found[0]] == [v.fibres for v in found[1]]
     for one, hundred in zip(*found, strict=True):
         assert hundred.measured / 100 == pytest.approx(one.measured, abs=4.0 * 2e-4 + 2e-3)
     measured = []
     monkeypatch.setattr("design.criteria.rules.fold_gap", lambda line, gap: measured.append(len(line)))
-    check(Morphology(small.knots, 1000.0), only(min_gap_mm=0.8))
-    check(Morphology(small.knots, 1000.0), only(min_gap_mm=400.0))
+    check_rules(Morphology(small.knots, 1000.0), only(min_gap_mm=0.8))
+    check_rules(Morphology(small.knots, 1000.0), only(min_gap_mm=400.0))
     assert measured[2] < measured[0] / 5
 
 
@@ -75,7 +75,7 @@ def test_folds_of_a_large_pad_with_a_large_gap_are_those_of_a_small_one(seed, mo
 def test_the_fold_found_is_one_of_the_curve(seed):
     """Against points of SciPy's curve, 0.02 mm apart: none lies nearer, and some almost as near."""
     pad = Morphology.random(1, 6, seed)
-    found = check(pad, only(min_gap_mm=2.0))
+    found = check_rules(pad, only(min_gap_mm=2.0))
     assert found
     for v in found:
         fibre = v.fibres[0] - 1
@@ -93,30 +93,30 @@ def test_the_fold_found_is_one_of_the_curve(seed):
 
 
 def test_too_many_crossings_of_the_families_are_one_finding():
-    found = check(Morphology.straight(4), only(max_crossings=15))
+    found = check_rules(Morphology.straight(4), only(max_crossings=15))
     assert [str(v) for v in found] == ["max_crossings: pad: 16, limit 15"]
-    assert check(Morphology.straight(4), only(max_crossings=16)) == []
-    many = check(Morphology.straight(40), only(max_crossings=1234))
+    assert check_rules(Morphology.straight(4), only(max_crossings=16)) == []
+    many = check_rules(Morphology.straight(40), only(max_crossings=1234))
     assert [str(v) for v in many] == ["max_crossings: pad: 1600, limit 1234"]
 
 
 def test_any_number_of_crossings_is_written_and_read_as_a_word():
-    assert Spec({"rules": {"max_crossings": "any"}}).section(Rules).max_crossings is None
-    assert Rules().model_dump()["max_crossings"] == "any"
+    assert Spec({"rules": {"max_crossings": "any"}}).section(RulesSettings).max_crossings is None
+    assert RulesSettings().model_dump()["max_crossings"] == "any"
     with pytest.raises(InputError, match=r"\[rules\] max_crossings: got 'none'"):
-        Spec({"rules": {"max_crossings": "none"}}).section(Rules)
+        Spec({"rules": {"max_crossings": "none"}}).section(RulesSettings)
 
 
 def test_a_slanting_crossing_is_found_with_its_angle():
     """Half-way up a span that is as high as long, between two turning points, a PCHIP has slope 1.5."""
     swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
     pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
-    found = check(pad, only(min_crossing_angle_deg=40))
+    found = check_rules(pad, only(min_crossing_angle_deg=40))
     assert [(v.rule, v.fibres) for v in found] == [("min_crossing_angle_deg", (1, 2))]
     assert found[0].measured == pytest.approx(np.degrees(np.arctan(1 / 1.5)), abs=1e-6)
     assert found[0].place_mm == pytest.approx((0, 0), abs=1e-3)
-    assert check(pad, only(min_crossing_angle_deg=33)) == []
-    assert check(Morphology.straight(4), only(min_crossing_angle_deg=90)) == []
+    assert check_rules(pad, only(min_crossing_angle_deg=33)) == []
+    assert check_rules(Morphology.straight(4), only(min_crossing_angle_deg=90)) == []
 
 
 def test_a_pair_of_fibres_is_named_once_with_its_least_angle():
@@ -126,26 +126,26 @@ def test_a_pair_of_fibres_is_named_once_with_its_least_angle():
     for c, angle in zip(across, crossing_angles(pad, across), strict=True):
         pair = (c.first + 1, c.second + 1)
         least[pair] = min(angle, least.get(pair, 30))
-    found = check(pad, only(min_crossing_angle_deg=30, same_family_crossings=10**6))
+    found = check_rules(pad, only(min_crossing_angle_deg=30, same_family_crossings=10**6))
     assert {v.fibres: v.measured for v in found} == {pair: angle for pair, angle in least.items() if angle < 30}
     assert len(found) > 1
 
 
 def test_a_crossing_within_a_family_is_counted_at_its_places():
-    found = check(bent(2.5), only(same_family_crossings=0))
+    found = check_rules(bent(2.5), only(same_family_crossings=0))
     assert len(found) == 2
     assert {v.fibres for v in found} == {(1, 2)}
-    assert check(bent(2.5), only(same_family_crossings=2)) == []
+    assert check_rules(bent(2.5), only(same_family_crossings=2)) == []
 
 
 def test_a_fibre_at_the_border_is_found():
-    found = check(bent(0.05, fibre=4), only(border_mm=2.0))
+    found = check_rules(bent(0.05, fibre=4), only(border_mm=2.0))
     assert [v.fibres for v in found] == [(5,)]
     assert found[0].measured == pytest.approx(0.05 * 11.25, abs=1e-3)
 
 
 def test_a_long_fibre_is_found():
-    found = check(bent(3.0), only(max_length_mm=5 * 11.25 + 0.1))
+    found = check_rules(bent(3.0), only(max_length_mm=5 * 11.25 + 0.1))
     assert [(v.rule, v.fibres) for v in found] == [("max_length_mm", (1,))]
 
 
@@ -153,15 +153,15 @@ def test_a_sharp_bend_is_found_and_a_gentle_one_passes():
     knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [2, 1.0]])
     straight = np.array([[1, 0], [1, 0.5], [1, 1.0], [1, 2.0]])
     sharp = Morphology(np.stack([knots, straight]))
-    found = check(sharp, only(min_bend_radius_mm=1.0))
+    found = check_rules(sharp, only(min_bend_radius_mm=1.0))
     assert [v.fibres for v in found] == [(1,)]
-    assert check(bent(1.3), only(min_bend_radius_mm=1.0)) == []
+    assert check_rules(bent(1.3), only(min_bend_radius_mm=1.0)) == []
 
 
 def test_a_bend_is_placed_where_it_is():
     knots = np.array([[0, 1], [1.0, 1.9], [2, 1.0]])
     pad = Morphology(np.stack([knots, [[1, 0], [1, 1.0], [1, 2.0]]]), pitch_mm=2.0)
-    found = check(pad, only(min_bend_radius_mm=2.0))
+    found = check_rules(pad, only(min_bend_radius_mm=2.0))
     assert [v.fibres for v in found] == [(1,)]
     assert found[0].place_mm == pytest.approx((0, 0.9 * 2), abs=0.01)
 
@@ -172,13 +172,13 @@ def test_a_kink_passes_up_to_half_a_radian(rise, breaks):
     at = np.array([0, 0.5, 1 - 1e-7, 1, 1 + 1e-7, 1.5, 2])
     roof = np.column_stack([at, 1 + rise * (1 - np.abs(at - 1))])
     turn = 2 * (2 * np.arctan(4 / 3 * rise) - np.arctan(rise))
-    found = check(Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_bend_radius_mm=3.0))
+    found = check_rules(Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_bend_radius_mm=3.0))
     assert (turn > 0.5) == breaks
     assert [v.measured for v in found] == ([pytest.approx(1.5 / turn, rel=1e-3)] if breaks else [])
 
 
 def test_a_finding_reads_as_one_line():
-    text = str(check(bent(1.95), only(min_gap_mm=0.8))[0])
+    text = str(check_rules(bent(1.95), only(min_gap_mm=0.8))[0])
     assert text.startswith("min_gap_mm: fibre 1 and fibre 2 at (0.0, -5.9) mm: 0.56")
     assert "\n" not in text
 
@@ -186,7 +186,7 @@ def test_a_finding_reads_as_one_line():
 @pytest.mark.parametrize(("fibre", "fibres"), [(0, (1, 2)), (2, (3, 4)), (4, (5, 6)), (6, (7, 8))])
 def test_fibres_too_close_are_counted_through_both_families(fibre, fibres):
     pad = bent(fibre % 4 + 1.95, fibre=fibre)
-    (found,) = check(pad, only(min_gap_mm=0.8))
+    (found,) = check_rules(pad, only(min_gap_mm=0.8))
     assert found.fibres == fibres
     between = ((0, (fibre % 4 + 1.975 - 2.5) * 11.25), ((fibre % 4 + 1.975 - 2.5) * 11.25, 0))[fibre // 4]
     assert found.place_mm == pytest.approx(between, abs=0.3)
@@ -201,13 +201,13 @@ def test_a_limit_that_is_just_kept_is_kept():
         ({"max_length_mm": 50.0 + hair}, {"max_length_mm": 50.0 - hair}, 8),
         ({"max_crossings": 16}, {"max_crossings": 15}, 1),
     ):
-        assert check(grid, only(**kept)) == []
-        assert len(check(grid, only(**broken))) == count
+        assert check_rules(grid, only(**kept)) == []
+        assert len(check_rules(grid, only(**broken))) == count
 
 
 @pytest.mark.parametrize(("fibre", "cross"), [(0, 0.1), (3, 4.9), (4, 0.1), (7, 4.9)])
 def test_every_side_of_the_pad_has_a_border(fibre, cross):
-    (found,) = check(bent(cross, fibre=fibre), only(border_mm=2.0))
+    (found,) = check_rules(bent(cross, fibre=fibre), only(border_mm=2.0))
     assert found.fibres == (fibre + 1,)
     assert found.measured == pytest.approx(0.1 * 11.25, abs=1e-3)
     at = ((0, (cross - 2.5) * 11.25), ((cross - 2.5) * 11.25, 0))[fibre // 4]
@@ -216,7 +216,7 @@ def test_every_side_of_the_pad_has_a_border(fibre, cross):
 
 def test_the_length_found_is_that_of_the_curve():
     pad = bent(3.0, fibre=5)
-    (found,) = check(pad, only(max_length_mm=5 * 11.25 + 0.1))
+    (found,) = check_rules(pad, only(max_length_mm=5 * 11.25 + 0.1))
     at = np.linspace(0, 5, 200_001)
     curve = PchipInterpolator(pad.knots[5, :, 1], pad.knots[5, :, 0])(at)
     assert found.fibres == (6,)
@@ -232,14 +232,16 @@ def test_the_gap_of_two_bent_fibres_is_that_of_their_curves():
     at = np.linspace(0, 3, 6001)
     first, second = (np.column_stack([at, PchipInterpolator(*knots[f].T)(at)]) * 11.25 for f in (0, 1))
     least = min(np.linalg.norm(second - place, axis=1).min() for place in first)
-    (found,) = check(Morphology(knots), only(min_gap_mm=6.0))
+    (found,) = check_rules(Morphology(knots), only(min_gap_mm=6.0))
     assert found.measured == pytest.approx(least, abs=3e-3)
 
 
 def test_findings_come_rule_by_rule():
     """A fibre that swings far over breaks most rules at once."""
-    rules = Rules(min_bend_radius_mm=20, min_gap_mm=3, min_crossing_angle_deg=80, max_length_mm=60, max_crossings=15)
-    order = [v.rule for v in check(bent(4.9), rules)]
+    rules = RulesSettings(
+        min_bend_radius_mm=20, min_gap_mm=3, min_crossing_angle_deg=80, max_length_mm=60, max_crossings=15
+    )
+    order = [v.rule for v in check_rules(bent(4.9), rules)]
     assert sorted(set(order), key=order.index) == [
         "min_bend_radius_mm",
         "min_gap_mm",
@@ -252,7 +254,7 @@ def test_findings_come_rule_by_rule():
 
 
 def test_flat_crossings_are_told_in_the_order_of_the_fibres():
-    found = check(Morphology.random(3, 8, seed=1), only(min_crossing_angle_deg=60))
+    found = check_rules(Morphology.random(3, 8, seed=1), only(min_crossing_angle_deg=60))
     pairs = [v.fibres for v in found]
     assert pairs == sorted(pairs)
     assert [v.measured for v in found] != sorted(v.measured for v in found)

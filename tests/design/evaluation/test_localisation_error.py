@@ -8,16 +8,18 @@ import torch
 
 from design import Contact, Morphology
 from design.common.errors import InputError
-from design.evaluation.localisation_error import evaluate, fresh_presses, training_presses
+from design.evaluation.localisation_error import fresh_presses, localisation_error, training_presses
 
 
 def means(pad, **settings):
-    return [level.mean for level in evaluate(pad, presses=256, test=500, hidden=20, **settings)]
+    return [level.mean for level in localisation_error(pad, presses=256, test=500, hidden=20, **settings)]
 
 
 def test_the_published_pad_beats_the_square_grid(published):
-    square = evaluate(Morphology.load(published / "square_grid_cir.mat"), Contact(sides=50), lost=(0, 1), subsets=1)
-    curved = evaluate(Morphology.load(published / "5para_dis.mat"), lost=(0, 1, 3), subsets=1)
+    square = localisation_error(
+        Morphology.load(published / "square_grid_cir.mat"), Contact(sides=50), lost=(0, 1), subsets=1
+    )
+    curved = localisation_error(Morphology.load(published / "5para_dis.mat"), lost=(0, 1, 3), subsets=1)
     assert [level.subsets for level in curved] == [1, 1, 1]
     for straight, bent in zip(square, curved[:2], strict=True):
         assert bent.mean < 0.7 * straight.mean
@@ -27,7 +29,7 @@ def test_the_published_pad_beats_the_square_grid(published):
 
 
 def test_errors_grow_with_lost_fibres_and_are_summed_up_over_all_sets():
-    found = evaluate(Morphology.random(2, 5, seed=1), presses=144, test=300, hidden=10)
+    found = localisation_error(Morphology.random(2, 5, seed=1), presses=144, test=300, hidden=10)
     assert [(level.lost, level.subsets) for level in found] == [(0, 1), (1, 4), (2, 6), (3, 4)]
     assert found[0].std == 0
     assert found[0].mean < found[2].mean < found[3].mean
@@ -58,13 +60,13 @@ def test_presses_to_test_on_are_others_than_those_learned(grid):
 
 
 def test_a_pad_of_two_fibres_is_evaluated_as_far_as_fibres_are_left():
-    found = evaluate(Morphology.random(1, 5, seed=0), presses=144, test=200, hidden=10)
+    found = localisation_error(Morphology.random(1, 5, seed=0), presses=144, test=200, hidden=10)
     assert [level.lost for level in found] == [0, 1]
     assert 0 < found[0].mean < 0.6
 
 
 def test_fibres_that_no_press_touches_do_no_harm():
-    found = evaluate(Morphology.straight(2), Contact(radius=1e-6), presses=64, test=100, hidden=5, lost=(0,))
+    found = localisation_error(Morphology.straight(2), Contact(radius=1e-6), presses=64, test=100, hidden=5, lost=(0,))
     assert 0.2 < found[0].mean < 0.7
 
 
@@ -73,4 +75,4 @@ def test_fibres_that_no_press_touches_do_no_harm():
 )
 def test_settings_that_cannot_be_used_are_refused(settings):
     with pytest.raises(InputError, match="allowed is"):
-        evaluate(Morphology.straight(4), **settings)
+        localisation_error(Morphology.straight(4), **settings)

@@ -14,7 +14,7 @@ import pytest
 
 from design.common.checkpoints import Checkpoints
 from design.optimisers.search import search
-from design.settings import Search
+from design.settings import SearchSettings
 
 SETTINGS = """
 [search]
@@ -97,7 +97,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
     distributed = pytest.importorskip("distributed")
-    settings = Search(knots=6, starts=3, steps=80, lost=1)
+    settings = SearchSettings(knots=6, starts=3, steps=80, lost=1)
     here = search(settings=settings)
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,

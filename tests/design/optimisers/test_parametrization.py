@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Morphology
-from design.criteria.rules import check
+from design.criteria.rules import check_rules
 from design.optimisers.parametrization import Fibres, border_of, first_course
 from design.pad.curves import refine
-from design.settings import Pad, Rules
+from design.settings import PadSettings, RulesSettings
 
 
 @given(st.integers(1, 5), st.integers(1, 9), st.integers(0, 99))
@@ -36,9 +36,9 @@ def test_more_knots_leave_the_old_ones_and_keep_near_the_curve(more, seed):
 
 @pytest.mark.parametrize("knots", [1, 2, 5, 6, 7, 20, 21, 64])
 @pytest.mark.parametrize("grid", [1, 2, 4, 8])
-@pytest.mark.parametrize("rules", [Rules(), Rules(enforce=False)])
+@pytest.mark.parametrize("rules", [RulesSettings(), RulesSettings(enforce=False)])
 def test_a_random_course_is_a_pad_without_crossings_in_a_family_at_its_turns(knots, grid, rules):
-    pad = Pad(grid=grid)
+    pad = PadSettings(grid=grid)
     course = first_course(pad, rules, knots, None, 0, np.random.default_rng(knots))
     found = Morphology(course, pad.pitch_mm)
     assert found.knots.shape == (2 * grid, knots + 2, 2)
@@ -48,14 +48,16 @@ def test_a_random_course_is_a_pad_without_crossings_in_a_family_at_its_turns(kno
 
 def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
     origin = Morphology.random(4, 5, seed=3)
-    begin = [first_course(Pad(), Rules(), 5, origin, start, np.random.default_rng(start)) for start in (0, 1)]
+    begin = [
+        first_course(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start)) for start in (0, 1)
+    ]
     assert np.array_equal(begin[0], origin.knots)
     assert 0 < np.abs(begin[1] - origin.knots).max() < 1
-    straight = first_course(Pad(), Rules(), 5, Morphology.straight(4), 0, np.random.default_rng(0))
+    straight = first_course(PadSettings(), RulesSettings(), 5, Morphology.straight(4), 0, np.random.default_rng(0))
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 
 def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
-    rules = Rules(border_mm=400)
-    knots = Fibres.through(Morphology.random(4, 5).knots, border_of(Pad(), rules)).knots()
-    assert "border_mm" in {violation.rule for violation in check(Morphology(knots), rules)}
+    rules = RulesSettings(border_mm=400)
+    knots = Fibres.through(Morphology.random(4, 5).knots, border_of(PadSettings(), rules)).knots()
+    assert "border_mm" in {violation.rule for violation in check_rules(Morphology(knots), rules)}

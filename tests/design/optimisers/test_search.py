@@ -12,11 +12,11 @@ from design.common.checkpoints import Checkpoints
 from design.criteria.score import score
 from design.optimisers.problem import Problem
 from design.optimisers.search import search
-from design.optimisers.start import advance
-from design.settings import Pad, Rules, Search
+from design.optimisers.start import advance_start
+from design.settings import PadSettings, RulesSettings, SearchSettings
 
-SMALL = Search(knots=3, starts=2, steps=60, population=20, generations=6, lost=1)
-QUICK = Rules(min_bend_radius_mm=0.5)
+SMALL = SearchSettings(knots=3, starts=2, steps=60, population=20, generations=6, lost=1)
+QUICK = RulesSettings(min_bend_radius_mm=0.5)
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
@@ -30,7 +30,7 @@ def test_the_same_seed_gives_the_same_fibres_and_another_seed_others(method):
 
 
 def test_descent_beats_the_square_grid_within_the_rules():
-    found = search(settings=Search(starts=1, steps=120, lost=1))
+    found = search(settings=SearchSettings(starts=1, steps=120, lost=1))
     pad, grid = (score(m, Contact(), lost=1, noise=0.02) for m in (found.morphology, Morphology.straight(4)))
     assert found.violations == []
     assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
@@ -38,7 +38,7 @@ def test_descent_beats_the_square_grid_within_the_rules():
 
 
 def test_genetic_search_improves_generation_by_generation():
-    found = search(settings=SMALL.model_copy(update={"method": "genetic"}), rules=Rules(enforce=False))
+    found = search(settings=SMALL.model_copy(update={"method": "genetic"}), rules=RulesSettings(enforce=False))
     best = [entry["objective"] for entry in found.history]
     assert best == sorted(best, reverse=True)
     assert found.terms["published_objective"] == pytest.approx(best[-1])
@@ -46,14 +46,14 @@ def test_genetic_search_improves_generation_by_generation():
 
 
 def test_rules_that_cannot_hold_are_named():
-    found = search(settings=SMALL, rules=Rules(max_length_mm=20))
+    found = search(settings=SMALL, rules=RulesSettings(max_length_mm=20))
     assert {v.rule for v in found.violations} == {"max_length_mm"}
     assert len(found.violations) == 8
 
 
 def test_small_and_odd_pads_are_searched_too():
     for grid, pitch in ((1, 20.0), (2, 5.0), (3, 20.0)):
-        found = search(Pad(grid=grid, pitch_mm=pitch), settings=SMALL)
+        found = search(PadSettings(grid=grid, pitch_mm=pitch), settings=SMALL)
         assert found.morphology.grid == grid
         assert found.morphology.pitch_mm == pitch
         assert found.violations == []
@@ -111,16 +111,16 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
 
 
 def test_resuming_with_other_settings_is_refused_and_names_what_differs(tmp_path):
-    problem = Problem(Pad(), (Contact(),), SMALL, QUICK)
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance(problem, 0, None).state)
+    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     other = SMALL.model_copy(update={"seed": 5})
     with pytest.raises(InputError, match="begun with search seed 0, now 5"):
         search(settings=other, rules=QUICK, keep_in=tmp_path / "search", resume=True)
 
 
 def test_a_damaged_state_is_named(tmp_path):
-    problem = Problem(Pad(), (Contact(),), SMALL, QUICK)
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance(problem, 0, None).state)
+    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     path = tmp_path / "search" / "start_0000.npz"
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read"):
@@ -128,9 +128,9 @@ def test_a_damaged_state_is_named(tmp_path):
 
 
 def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
-    problem = Problem(Pad(), (Contact(),), SMALL, QUICK)
+    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
     path = tmp_path / "search" / "start_0000.npz"
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance(problem, 0, None).state)
+    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     with np.load(path) as arrays:
         state = {name: arrays[name] for name in arrays.files}
     np.savez(path, allow_pickle=False, **state | {"done": np.array([1, 2])})
@@ -139,15 +139,15 @@ def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
 
 
 def test_a_state_of_another_start_is_refused(tmp_path):
-    problem = Problem(Pad(), (Contact(),), SMALL, QUICK)
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance(problem, 0, None).state)
+    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     (tmp_path / "search" / "start_0000.npz").rename(tmp_path / "search" / "start_0001.npz")
     with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
         search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
 
 
 def test_a_generation_that_fits_no_memory_is_refused():
-    settings = Search(method="genetic", population=100_000)
+    settings = SearchSettings(method="genetic", population=100_000)
     with pytest.raises(InputError, match="population is 100000: that takes"):
         search(settings=settings)
 
@@ -170,7 +170,7 @@ def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatc
     settings = SMALL.model_copy(update={"method": method, "steps": 30, "generations": 4, "starts": 1})
     whole = search(settings=settings)
     monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    assert advance(Problem(Pad(), (Contact(),), settings, Rules(), None), 0, None).step == 1
+    assert advance_start(Problem(PadSettings(), (Contact(),), settings, RulesSettings(), None), 0, None).step == 1
     assert search(settings=settings).morphology == whole.morphology
 
 
@@ -183,9 +183,9 @@ def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch)
 
 
 def test_a_search_from_a_pad_improves_on_it():
-    origin = search(settings=Search(knots=5, starts=1, steps=60, lost=1, seed=3)).morphology
+    origin = search(settings=SearchSettings(knots=5, starts=1, steps=60, lost=1, seed=3)).morphology
     before = score(origin, Contact(), lost=1)
-    after = search(settings=Search(knots=8, starts=1, steps=150, lost=1), origin=origin)
+    after = search(settings=SearchSettings(knots=8, starts=1, steps=150, lost=1), origin=origin)
     assert after.morphology.knots.shape == (8, 10, 2)
     assert after.terms["ambiguity_lost_0"] + after.terms["ambiguity_lost_1"] < (
         before["ambiguity_lost_0"] + before["ambiguity_lost_1"]
@@ -193,7 +193,7 @@ def test_a_search_from_a_pad_improves_on_it():
 
 
 def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
-    free = Rules(enforce=False)
+    free = RulesSettings(enforce=False)
     origin = search(settings=SMALL, rules=free).morphology
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [Morphology.straight(4)])
     assert search(settings=SMALL, rules=free, origin=origin).morphology == origin
@@ -208,7 +208,7 @@ def test_an_origin_that_does_not_fit_is_refused():
 
 
 def test_several_contacts_serve_both_better_than_one_alone():
-    one = Search(starts=1, steps=200, lost=0, knots=9)
+    one = SearchSettings(starts=1, steps=200, lost=0, knots=9)
     large = Contact(radius=1.2)
     both = one.model_copy(update={"contacts": (large,)})
     for_one, for_both = search(settings=one), search(settings=both)
@@ -235,7 +235,7 @@ def test_a_device_that_is_not_there_is_refused():
     ],
 )
 def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists):
-    found = search(settings=SMALL.model_copy(update={"starts": 1}), rules=Rules(**rules))
+    found = search(settings=SMALL.model_copy(update={"starts": 1}), rules=RulesSettings(**rules))
     assert resists in {violation.rule for violation in found.violations}
     assert all(np.isfinite(violation.measured) for violation in found.violations)
 
@@ -245,10 +245,10 @@ def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists):
     [{"max_crossings": 24}, {"min_crossing_angle_deg": 50.0}, {"min_gap_mm": 4.0}, {"max_length_mm": 65.0}],
 )
 def test_each_further_rule_is_kept(rules):
-    found = search(settings=Search(starts=1, steps=150, lost=1, knots=9), rules=Rules(**rules))
+    found = search(settings=SearchSettings(starts=1, steps=150, lost=1, knots=9), rules=RulesSettings(**rules))
     assert found.violations == []
 
 
 def test_a_loss_of_every_fibre_is_refused():
     with pytest.raises(InputError, match="leaves some of the 2 fibres"):
-        search(Pad(grid=1), settings=Search(lost=(0.0, 0.0, 1.0)))
+        search(PadSettings(grid=1), settings=SearchSettings(lost=(0.0, 0.0, 1.0)))

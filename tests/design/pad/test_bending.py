@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Morphology, flatten
-from design.pad.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, trace
+from design.pad.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
 from design.pad.curves import beziers, slope_beziers
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -19,7 +19,7 @@ def arc_of(points):
 
 
 def traced(pad, fibre, step=2.5e-3):
-    return trace(beziers(pad)[fibre], slope_beziers(pad)[fibre], step)
+    return traced_curve(beziers(pad)[fibre], slope_beziers(pad)[fibre], step)
 
 
 def dense(pad, fibre, per_span=2000):

@@ -8,7 +8,7 @@ from manifold3d import Manifold, OpType
 from design.common.errors import InputError
 from fabricate.checks import mesh_checks as soundness
 from fabricate.checks.mesh_checks import SOUND, check_mesh, inspect_mesh, sound
-from fabricate.settings import Printer
+from fabricate.settings import PrinterSettings
 from tests.fabricate.trays import CROSS, block, faults, inspected, line, near, prism, tray
 
 
@@ -100,7 +100,7 @@ class TestSound:
         ],
     )
     def test_bed(self, bed, status):
-        assert inspected(self.box, printer=Printer(bed_mm=bed))["bed"].status == status
+        assert inspected(self.box, printer=PrinterSettings(bed_mm=bed))["bed"].status == status
 
     def test_what_a_box_measures(self):
         found = inspected(self.box, genus=0)

@@ -6,11 +6,11 @@ from design.pad.morphology import Morphology
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.plan_checks import _thinner, check
-from fabricate.settings import DEFAULTS, Settings
+from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 
-def found(pad: Morphology, name: str, settings: Settings = DEFAULTS) -> Finding:
+def found(pad: Morphology, name: str, settings: FabricationSettings = DEFAULTS) -> Finding:
     return {finding.name: finding for finding in check(pad, settings)}[name]
 
 

@@ -12,7 +12,7 @@ from manifold3d import CrossSection, Manifold, Mesh, OpType
 from fabricate.checks import slices
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.thickness import least_line_mm
-from fabricate.settings import Printer
+from fabricate.settings import PrinterSettings
 from tests.fabricate.trays import (
     CROSS,
     DEPTH,
@@ -107,7 +107,7 @@ class TestWidth:
         ],
     )
     def test_what_a_printer_draws(self, printer, status):
-        assert inspected(tray(*CROSS), printer=Printer.model_validate(printer))["ridge_width"].status == status
+        assert inspected(tray(*CROSS), printer=PrinterSettings.model_validate(printer))["ridge_width"].status == status
 
     @pytest.mark.parametrize(("gap", "status"), [(0.05, "fail"), (0.3, "warn"), (0.35, "warn"), (0.4, "pass")])
     def test_narrow_silicone_between_ridges(self, gap, status):
@@ -170,7 +170,9 @@ class TestWidth:
         hollow = Manifold.extrude(CrossSection.square((side, side), True), DEPTH + over, scale_top=(flare, flare))
         outer = side + DEPTH + 2 * 0.5
         box = Manifold.cube((outer, outer, top), True).translate((0, 0, top / 2))
-        found = inspected(box - hollow.translate((0, 0, FLOOR)), printer=Printer(layer_mm=layer))["wall_thickness"]
+        found = inspected(box - hollow.translate((0, 0, FLOOR)), printer=PrinterSettings(layer_mm=layer))[
+            "wall_thickness"
+        ]
         assert found.measured == pytest.approx(0.5 + layer / 2 * 0.5, abs=0.015)
 
     @pytest.mark.parametrize(("floor", "status"), [(0.2, "fail"), (0.35, "fail"), (0.5, "pass")])
@@ -184,7 +186,7 @@ class TestWidth:
         [(0.37, 0.1, "fail"), (0.39, 0.1, "pass"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
     )
     def test_a_floor_is_two_layers_and_at_least_four_tenths_thick(self, floor, layer, status):
-        found = inspected(tray(floor=floor), printer=Printer(layer_mm=layer))["floor_thickness"]
+        found = inspected(tray(floor=floor), printer=PrinterSettings(layer_mm=layer))["floor_thickness"]
         assert (found.status, found.limit) == (status, pytest.approx(max(0.4, 2 * layer)))
 
     def test_less_than_a_layer(self):
@@ -218,14 +220,14 @@ class TestLean:
     def test_specks_need_no_support(self, side, status):
         bracket = Manifold.cube((1.0, 1.0, 4.0)).translate((-9.5, 0, FLOOR - 0.2))
         speck = Manifold.cube((side, side, 0.5)).translate((-8.5, 0.2, FLOOR + 2))
-        assert inspected(tray(bracket, speck), printer=Printer(layer_mm=0.1))["overhang"].status == status
+        assert inspected(tray(bracket, speck), printer=PrinterSettings(layer_mm=0.1))["overhang"].status == status
 
     def test_the_first_layer_lies_on_the_bed(self):
         """A foot that is set back by a millimetre, for half a layer and for two."""
         for foot, status in ((0.05, "pass"), (0.2, "fail")):
             top, low = block(10, 10, 4, at=(0, 0, 2 + foot)), block(8, 8, foot + 0.5, at=(0, 0, (foot + 0.5) / 2))
             solid = Manifold.batch_boolean([_manifold(top), _manifold(low)], OpType.Add)
-            assert inspected(solid, printer=Printer(layer_mm=0.1))["overhang"].status == status
+            assert inspected(solid, printer=PrinterSettings(layer_mm=0.1))["overhang"].status == status
 
     @pytest.mark.parametrize("lean_deg", [0.5, 3, 10])
     def test_a_wall_that_leans_inwards(self, lean_deg):
@@ -267,7 +269,7 @@ class TestAreas:
 
     @pytest.mark.parametrize(("resin", "least"), [(False, 0.3), (True, 0.6)])
     def test_the_narrowest_line(self, resin, least):
-        assert least_line_mm(Printer(nozzle_mm=0.3, resin=resin)) == least
+        assert least_line_mm(PrinterSettings(nozzle_mm=0.3, resin=resin)) == least
 
     def test_a_bar_is_as_wide_as_it_is(self):
         (patch,) = slices.too_narrow(self.bar, 0.4)

@@ -11,7 +11,7 @@ from fabricate.mould.assembly import mould_body, plan_mesh
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
 from fabricate.report import laying_guide as laying
-from fabricate.settings import DEFAULTS, Settings
+from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 
@@ -119,7 +119,7 @@ def test_silicone_between_fibres_at_every_crossing(published):
         (with_settings({"levels": "two"}), -0.3),
     ],
 )
-def test_fibres_that_touch_are_told(settings: Settings, gap: float):
+def test_fibres_that_touch_are_told(settings: FabricationSettings, gap: float):
     crossings = laying.document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
     assert crossings["gap_mm"] == pytest.approx(gap)
     assert crossings["same_family"] == 2
@@ -146,7 +146,7 @@ def rows(page: str, head: str) -> list[list[str]]:
 def test_the_page_has_what_to_mix_and_to_cut():
     plan = Plan(level_pad(1.8, 1.2))
     document = whole(plan)
-    page = laying.page(document)
+    page = laying.laying_page(document)
     ((_, a, b, _),) = rows(page, "EcoFlex 00-20")
     assert a == b == f"{document['silicone']['part_a_g']:.1f} g"
     table = rows(page, "step")
@@ -161,13 +161,13 @@ def test_the_page_has_what_to_mix_and_to_cut():
 
 def test_the_page_has_places_as_on_the_pad_turned_over():
     plan = Plan(Morphology.straight(2))
-    table = rows(laying.page(whole(plan)), "fibres")
+    table = rows(laying.laying_page(whole(plan)), "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
 
 
 def test_many_crossings_are_counted_by_depth(published):
-    page = laying.page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
+    page = laying.laying_page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
     table = rows(page, "depths")
     assert sum(int(count) for *_, count in table) == 30
     assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
@@ -180,12 +180,12 @@ def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
         {"name": "wall", "status": "fail", "message": "no wall", "places_mm": []},
     )
     lid = with_settings({"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True})
-    page = laying.page(whole(Plan(Morphology.straight(2), lid), findings))
+    page = laying.laying_page(whole(Plan(Morphology.straight(2), lid), findings))
     assert "1 of 3 checks pass" in page
     assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 place,")
     assert "pour through its spout" in page
     assert "of resin" in page
     assert "read the right way" not in page
-    plain = laying.page(whole(Plan(Morphology.straight(2)), findings[:1]))
+    plain = laying.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
     assert "the lid" not in plain

@@ -21,7 +21,7 @@ from sense.health.alarm_thresholds import Tail, climb
 from sense.health.fault_likelihoods import HYPOTHESES, noise_of
 from sense.health.fibre_prediction import INPUTS, MEMBERS, TARGETS, TRACE, expected, traces_of
 from sense.health.health_model import RECORDED, HealthModel, _dead, checked_presses, files_of
-from sense.health.monitor import TEXTS, Finding, Monitor, _Press, examine, lines
+from sense.health.monitor import TEXTS, FibreFault, Monitor, _Press, examine, fault_lines
 from sense.health.schema import LEAST_PRESSES
 from sense.processing.limits import LEAST_SPREAD_V
 from sense.recordings.simulation import simulate
@@ -36,7 +36,9 @@ DOCUMENT, WEIGHTS = (path.name for path in files_of("", RECORDED))
 @pytest.fixture(scope="module")
 def pad() -> Recording:
     """PRESSES on a simulated pad of six fibres."""
-    return simulate(Morphology.random(3, knots=3, seed=5), sense_settings.Rig(presses=PRESSES, seed=1, drift_mv=10))
+    return simulate(
+        Morphology.random(3, knots=3, seed=5), sense_settings.RigSettings(presses=PRESSES, seed=1, drift_mv=10)
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -59,7 +61,7 @@ def learn(readings: Array, pad: Recording, presses: int = LEARNT) -> HealthModel
     )
 
 
-def later(model: HealthModel, readings: Array, pad: Recording, first: int = LEARNT) -> list[Finding]:
+def later(model: HealthModel, readings: Array, pad: Recording, first: int = LEARNT) -> list[FibreFault]:
     """Findings on the presses that health was not learnt from; press 0 is the first of them."""
     start = pad.lifted[first - 1]
     return examine(model, readings[start:], pad.times_s[start:], pad.begun[first:] - start, pad.lifted[first:] - start)
@@ -107,10 +109,10 @@ def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int,
 
 def test_the_trace_of_a_press_keeps_to_it() -> None:
     readings = np.arange(100.0)[:, None] * [1.0, 2.0]
-    whole = residuals.trace(readings, begun=30, lifted=55, low=0, high=100)
+    whole = residuals.press_trace(readings, begun=30, lifted=55, low=0, high=100)
     assert whole.shape == (2, TRACE)
     assert whole[0].tolist() == [*range(20, 50), *range(55, 75)]
-    tight = residuals.trace(readings, begun=30, lifted=34, low=28, high=36)
+    tight = residuals.press_trace(readings, begun=30, lifted=34, low=28, high=36)
     assert tight[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
 
 
@@ -276,7 +278,7 @@ def test_presses_one_by_one_tell_the_same(pad: Recording, model: HealthModel) ->
     readings = pad.readings.copy()
     noisy(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
     monitor = Monitor(model)
-    findings: list[Finding] = []
+    findings: list[FibreFault] = []
     for press in range(LEARNT, PRESSES):
         first = pad.begun[press] - 10
         last = pad.begun[press + 1] if press + 1 < PRESSES else len(readings)
@@ -439,8 +441,8 @@ def test_what_cannot_be_learnt_from_is_refused(pad: Recording) -> None:
 
 
 def test_findings_are_told_in_one_line_each() -> None:
-    findings = [Finding(30, 21, (1, 4), "swapped", 7.2), Finding(50, 41, (0,), "weak", 6.0)]
-    told = lines(findings, 6, dead=(5,))
+    findings = [FibreFault(30, 21, (1, 4), "swapped", 7.2), FibreFault(50, 41, (0,), "weak", 6.0)]
+    told = fault_lines(findings, 6, dead=(5,))
     assert told == [
         "fibre 5 was dead in the recording that health was learnt from",
         "fibres 1 and 4 have changed places (swapped) since press 21, found at press 30; by chance once in 1e7 presses",

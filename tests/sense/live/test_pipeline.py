@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 import sense.live.pipeline
 from design.common.errors import InputError
 from sense import Localizer, Recording, locate
-from sense.health.monitor import Finding
+from sense.health.monitor import FibreFault
 from sense.live.pipeline import Estimate, Live
 from sense.live.press_buffer import HISTORY, SLACK, Press, Ring
 from sense.localizer.features import press_inputs
 from sense.localizer.network import OUTPUTS
-from sense.localizer.normalization import Scaling
+from sense.localizer.normalization import Normalization
 from sense.processing.press_detection import Event
 
 
@@ -57,12 +57,12 @@ class Watching:
         self.told: list[tuple[np.ndarray, int, int]] = []
         self.lost: tuple[int, ...] = ()
 
-    def update(self, readings: np.ndarray, begun: int, lifted: int) -> list[Finding]:
+    def update(self, readings: np.ndarray, begun: int, lifted: int) -> list[FibreFault]:
         self.told.append((readings.copy(), begun, lifted))
         if len(self.told) != 6:
             return []
         self.lost = (1,)
-        return [Finding(5, 2, (1,), "silent", 9.0)]
+        return [FibreFault(5, 2, (1,), "silent", 9.0)]
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +70,9 @@ def untrained(recording: Recording, localizer: Localizer) -> Callable[..., Local
     """Makes localizers whose places mean nothing but depend on everything."""
 
     @cache
-    def scaled(features: str) -> tuple[Scaling, np.ndarray]:
+    def scaled(features: str) -> tuple[Normalization, np.ndarray]:
         raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-        return Scaling.fit(raw, recording.presses_mm)
+        return Normalization.fit(raw, recording.presses_mm)
 
     def make(part: Recording, features: str = "full") -> Localizer:
         scaling, table = scaled(features)
@@ -231,7 +231,7 @@ def watched(
 
 def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(watched, untrained) -> None:
     part, live, events, _ = watched
-    found = next(index for index, event in enumerate(events) if isinstance(event, Finding))
+    found = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
     estimates = [event for event in events if isinstance(event, Estimate)]
     assert [event.press for event in events[:found]] == [0, 1, 2, 3, 4, 5]
     assert [each.lost for each in estimates] == [()] * 6 + [(1,)] * (len(estimates) - 6)

@@ -17,10 +17,10 @@ from sense.live.page_server import LivePage
 from sense.live.sources import connected, replayed, simulated
 from sense.recordings.simulation import simulate
 from sense.rig.arduino.driver import Arduino
-from sense.rig.devices import RigFault, Samples
+from sense.rig.devices import ConverterSamples, RigFault
 from sense.rig.emulators.board import EmulatedBoard
 from sense.rig.emulators.live_pad import DemoConverter
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 
 class Time:
@@ -64,9 +64,9 @@ def test_samples_are_averaged_to_the_rate_of_the_localizer(still: Time) -> None:
         def connect(self) -> dict:
             return {"channels": 2, "rate_hz": 1000.0}
 
-        def read(self) -> Samples:
+        def read(self) -> ConverterSamples:
             times_s = np.arange(still.now_s, still.now_s + 0.01, 0.001)[:10]
-            return Samples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
+            return ConverterSamples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
 
         def close(self) -> None:
             pass
@@ -83,7 +83,7 @@ def test_samples_are_averaged_to_the_rate_of_the_localizer(still: Time) -> None:
 
 def test_the_demo_presses_the_pad_that_was_recorded() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
-    rig = Rig(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
+    rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
     recorded = simulate(pad, rig)
     time = Time()
     demo = DemoConverter(pad, rig, sense.live.sources.Contact(), time)
@@ -187,7 +187,7 @@ def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, mon
     import sense.rig.arduino.serial_link
 
     monkeypatch.setattr(sense.rig.arduino.serial_link, "find_ports", list)
-    other = simulate(Morphology.straight(3), Rig(presses=3))
+    other = simulate(Morphology.straight(3), RigSettings(presses=3))
     other.save(tmp_path / "other", {})
     with LivePage(0) as page:
         port = page.url.rstrip("/").rsplit(":", 1)[1]
@@ -208,7 +208,7 @@ def test_the_end_comes_when_it_is_asked_for(live, monkeypatch: pytest.MonkeyPatc
     closed = []
 
     class Interrupted(DemoConverter):
-        def read(self) -> Samples:
+        def read(self) -> ConverterSamples:
             raise KeyboardInterrupt
 
         def close(self) -> None:
@@ -223,7 +223,7 @@ def test_the_end_comes_when_it_is_asked_for(live, monkeypatch: pytest.MonkeyPatc
 
 def test_a_fault_of_the_rig_ends_it(live, monkeypatch: pytest.MonkeyPatch) -> None:
     class Stale(DemoConverter):
-        def read(self) -> Samples:
+        def read(self) -> ConverterSamples:
             raise RigFault("stale", "the board does not send", "reset it")
 
     monkeypatch.setattr(sense.live.sources, "DemoConverter", Stale)

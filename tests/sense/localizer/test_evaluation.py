@@ -5,7 +5,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense import Recording
-from sense.localizer.evaluation import by_place, conformal, distances, errors_by_loss, idle_share, summary
+from sense.localizer.evaluation import by_place, conformal, distances, error_row, errors_by_loss, idle_share
 from sense.localizer.localizer import Found
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
@@ -22,7 +22,7 @@ def test_distances_are_euclidean() -> None:
 
 
 def test_a_row_of_errors_is_made_of_the_means_of_each_set_and_of_all_presses() -> None:
-    row = summary(2, [off_by(0, 1, 2, 3), off_by(1, 1, 1, 9, r50=1.5, r90=8.0)], PLACES)
+    row = error_row(2, [off_by(0, 1, 2, 3), off_by(1, 1, 1, 9, r50=1.5, r90=8.0)], PLACES)
     assert (row["lost"], row["subsets"]) == (2, 2)
     assert (row["mean_mm"], row["std_mm"], row["max_mm"]) == pytest.approx((2.25, 0.75, 3.0))
     assert row["median_mm"] == 1

@@ -18,13 +18,13 @@ from sense.localizer.calibration import training
 from sense.localizer.calibration.training import draw_alive, looked_up, one_cycle
 from sense.localizer.features import Inputs
 from sense.localizer.network import pooled
-from sense.localizer.normalization import Scaled, Scaling
+from sense.localizer.normalization import Normalization, Scaled
 
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4))
 def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
-    options = sense_settings.Localizer(layers=layers, hidden=24)
+    options = sense_settings.LocalizerSettings(layers=layers, hidden=24)
     generator = torch.Generator().manual_seed(seed)
     weights = training.initial(3 * 5 + 3, options, generator)
     inputs = torch.randn(7, 3, 5, generator=generator)
@@ -82,7 +82,7 @@ def test_the_rate_rises_along_a_line_and_falls_along_a_cosine(share: float, rate
 def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of presses at the corners of the known places, half of a normal distribution remains on either axis."""
     corners = np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32)
-    samples = training.Samples(np.zeros((4, 1, 1), np.float32), np.ones((4, 1), bool), corners)
+    samples = training.TrainingPresses(np.zeros((4, 1, 1), np.float32), np.ones((4, 1), bool), corners)
     seen: list[torch.Tensor] = []
 
     def spy(table: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
@@ -90,7 +90,7 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
         return looked_up(table, places)
 
     monkeypatch.setattr(training, "looked_up", spy)
-    options = sense_settings.Localizer(hidden=8, layers=1, lost=0)
+    options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0)
     member = training._Member(samples, samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
     for _ in range(500):
         member._loss()
@@ -121,9 +121,9 @@ def test_a_press_without_any_fibre_may_be_anywhere(localizer: Localizer, recordi
     readings = np.array(recording.readings)
     readings[recording.begun[7] - 15 : recording.lifted[7] + 25] = np.nan
     found = localizer.locate(localizer.inputs(replace(recording, readings=readings)))
-    assert found.places_mm[7] == pytest.approx(localizer.scaling.middle_mm)
+    assert found.places_mm[7] == pytest.approx(localizer.normalization.middle_mm)
     assert found.r50_mm[7] < found.r90_mm[7]
-    assert found.r50_mm[7] > 0.5 * localizer.scaling.span_mm
+    assert found.r50_mm[7] > 0.5 * localizer.normalization.span_mm
     assert np.isfinite(found.places_mm).all()
 
 
@@ -234,7 +234,7 @@ def raw(windows: np.ndarray, history: np.ndarray | None = None) -> Inputs:
 def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None:
     rng = np.random.default_rng(seed)
     inputs, places = rng.standard_normal((30, 3, 4)), rng.uniform(-9, 9, (30, 2))
-    (plain, table), (scaled, same) = (Scaling.fit(raw(factor * inputs), places) for factor in (1, gain))
+    (plain, table), (scaled, same) = (Normalization.fit(raw(factor * inputs), places) for factor in (1, gain))
     assert np.allclose(plain.inputs(raw(inputs)).inputs, scaled.inputs(raw(gain * inputs)).inputs, atol=1e-4)
     assert np.allclose(table, same, atol=1e-3)
     assert np.abs(plain.targets(places)).max() <= 1 + 1e-6
@@ -244,13 +244,13 @@ def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None
 def test_a_dead_fibre_is_scaled_to_finite_numbers() -> None:
     inputs = np.zeros((10, 2, 3))
     inputs[:, 0] = np.random.default_rng(0).standard_normal((10, 3))
-    assert np.isfinite(Scaling.fit(raw(inputs), np.zeros((10, 2)))[0].inputs(raw(inputs)).inputs).all()
+    assert np.isfinite(Normalization.fit(raw(inputs), np.zeros((10, 2)))[0].inputs(raw(inputs)).inputs).all()
 
 
 def test_a_fibre_that_was_never_there_is_scaled_to_finite_numbers() -> None:
     rng = np.random.default_rng(0)
     inputs = replace(raw(rng.standard_normal((10, 2, 3))), alive=np.tile([True, False], (10, 1)))
-    scaling, table = Scaling.fit(inputs, rng.uniform(-9, 9, (10, 2)))
+    scaling, table = Normalization.fit(inputs, rng.uniform(-9, 9, (10, 2)))
     assert np.isfinite(scaling.inputs(inputs).inputs).all()
     assert np.isfinite(table).all()
 
@@ -363,8 +363,8 @@ def test_a_mask_that_is_no_index_is_refused(localizer: Localizer, recording: Rec
 
 def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localizer, recording: Recording) -> None:
     readings = 1000.0 * np.random.default_rng(0).choice([-1, 1], recording.readings.shape)
-    spread = np.full_like(localizer.scaling.spread, 1e-40)
-    still = replace(localizer.scaling, spread=spread, middle_mm=np.zeros(2), span_mm=1e5)
+    spread = np.full_like(localizer.normalization.spread, 1e-40)
+    still = replace(localizer.normalization, spread=spread, middle_mm=np.zeros(2), span_mm=1e5)
     found = replace(localizer, scaling=still)
     places = found.locate(found.inputs(replace(recording, readings=readings)))
     assert np.isfinite(places.places_mm).all()
@@ -373,5 +373,5 @@ def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localiz
 
 def test_a_fibre_that_varies_by_rounding_only_is_not_blown_up() -> None:
     inputs = 3.3 + 1e-15 * np.random.default_rng(0).standard_normal((10, 2, 3))
-    scaling, _ = Scaling.fit(raw(inputs), np.zeros((10, 2)))
+    scaling, _ = Normalization.fit(raw(inputs), np.zeros((10, 2)))
     assert (scaling.spread == 1).all()

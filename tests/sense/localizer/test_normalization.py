@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sense.localizer.features import Inputs
-from sense.localizer.normalization import MAX_INPUT, Scaling
+from sense.localizer.normalization import MAX_INPUT, Normalization
 from sense.localizer.response_model import BUMPS, WIDTH, bumps
 
 PRESSES, FIBRES, WINDOWS = 300, 3, 4
@@ -23,7 +23,7 @@ def made(seed: int = 0) -> tuple[Inputs, np.ndarray]:
 
 def test_a_window_is_scaled_by_the_mean_of_its_own_spread_and_its_fibres() -> None:
     inputs, places = made()
-    scaling, table = Scaling.fit(inputs, places)
+    scaling, table = Normalization.fit(inputs, places)
     for fibre in range(FIBRES):
         own = inputs.windows[inputs.alive[:, fibre], fibre]
         variance = own.var(axis=0)
@@ -39,7 +39,7 @@ def test_a_window_is_scaled_by_the_mean_of_its_own_spread_and_its_fibres() -> No
 
 def test_what_lies_far_off_is_held() -> None:
     inputs, places = made()
-    scaling, _ = Scaling.fit(inputs, places)
+    scaling, _ = Normalization.fit(inputs, places)
     far = scaling.scaled(np.full((1, FIBRES, WINDOWS), 1e9))
     assert (far == MAX_INPUT).all()
     assert (scaling.scaled(-np.full((1, FIBRES, WINDOWS), 1e9)) == -MAX_INPUT).all()
@@ -48,7 +48,7 @@ def test_what_lies_far_off_is_held() -> None:
 def test_places_are_counted_from_the_middle_in_halves_of_the_longer_side() -> None:
     inputs, places = made()
     places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]
-    scaling, _ = Scaling.fit(inputs, places)
+    scaling, _ = Normalization.fit(inputs, places)
     np.testing.assert_allclose(scaling.middle_mm, [5, 5])
     assert scaling.span_mm == 25
     np.testing.assert_allclose(scaling.targets(places[:4]), [[-1, -0.2], [1, 0.2], [1, -0.2], [0, 0]], atol=1e-6)

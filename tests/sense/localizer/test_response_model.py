@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sense.localizer.response_model import STEPS, Response, bumps, settled
+from sense.localizer.response_model import STEPS, ResponseModel, bumps, settled
 
 FIBRES, PASTS, WINDOWS, PRESSES = 2, 3, 4, 1500
 
@@ -27,7 +27,7 @@ def answer(places: np.ndarray) -> np.ndarray:
 def test_map_and_memory_are_found_again() -> None:
     places, windows, history, memory = made(0, noise=0.05)
     alive = np.ones((PRESSES, FIBRES), dtype=bool)
-    found = Response.fit(places, windows, history, alive)
+    found = ResponseModel.fit(places, windows, history, alive)
     spread = history.std(axis=0)[:, :, None]
     assert np.abs((found.memory - memory) * spread).max() < 0.02
     assert found.usual == pytest.approx(history.mean(axis=0))
@@ -40,7 +40,7 @@ def test_map_and_memory_are_found_again() -> None:
 
 def test_settled_windows_depend_on_the_place_only() -> None:
     places, windows, history, _ = made(1, noise=0.0)
-    found = Response.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
+    found = ResponseModel.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
     left = settled(windows, history, found.memory, found.usual) - answer(places)
     assert np.abs(left).max() < 0.05 * np.abs(windows - answer(places)).max()
 
@@ -49,9 +49,9 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived() -> None:
     places, windows, history, _ = made(2, noise=0.1)
     alive = np.ones((PRESSES, FIBRES), dtype=bool)
     alive[::3, 0] = False
-    before = Response.fit(places, windows, history, alive)
+    before = ResponseModel.fit(places, windows, history, alive)
     windows[::3, 0], history[::3, 0] = 99.0, -99.0
-    after = Response.fit(places, windows, history, alive)
+    after = ResponseModel.fit(places, windows, history, alive)
     assert np.array_equal(before.table, after.table)
     assert np.array_equal(before.memory, after.memory)
     lived = alive[:, 0]
@@ -61,7 +61,7 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived() -> None:
     middle = answer(np.zeros((1, 2)))[0]
     np.testing.assert_allclose(after.table[STEPS // 2, STEPS // 2], middle, atol=0.1)
     alive[:, 1] = False
-    gone = Response.fit(places, windows, history, alive)
+    gone = ResponseModel.fit(places, windows, history, alive)
     assert not gone.table[:, :, 1].any()
     assert np.isfinite(gone.table).all()
 
@@ -69,7 +69,7 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived() -> None:
 def test_history_that_never_varied_tells_nothing() -> None:
     places, windows, history, _ = made(3, noise=0.1)
     history[:] = history[:1]
-    found = Response.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
+    found = ResponseModel.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
     assert np.isfinite(found.memory).all()
     assert not found.memory.any()
 

@@ -262,7 +262,7 @@ def test_the_staircase_keeps_its_height_exactly():
     y = np.random.default_rng(4).normal(size=100_000)
     low, high = np.empty((2, len(y)))
     for lam in (0.6, 4.3, np.pi, 1000 / 7):
-        _, (_, below, above) = robust_variation.forward(y, lam, robust_variation.silent(), low, high, np.empty(0))
+        _, (_, below, above) = robust_variation.forward_sweep(y, lam, robust_variation.silent(), low, high, np.empty(0))
         snapped = round(lam * robust_variation.GRAIN) / robust_variation.GRAIN
         assert math.fsum([*below[1], *above[1]]) == 2 * snapped
         assert below.shape[1] + above.shape[1] <= 2 * lam + 1

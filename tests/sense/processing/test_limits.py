@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from design.common.errors import InputError
-from sense.processing.limits import MAX_INDEX, numbers, refuse_beyond
+from sense.processing.limits import MAX_INDEX, as_numbers, refuse_beyond
 
 
 def test_what_lies_beyond_is_named_with_its_row_and_the_limit() -> None:
@@ -23,10 +23,10 @@ def test_what_is_not_finite_is_named_with_its_row(bad: float, missing: bool, tol
 
 
 def test_whole_numbers_are_whole_and_not_too_great() -> None:
-    assert numbers([1.0, -2.0], np.int64, "starts").tolist() == [1, -2]
-    assert numbers([MAX_INDEX], np.int64, "starts").tolist() == [MAX_INDEX]
+    assert as_numbers([1.0, -2.0], np.int64, "starts").tolist() == [1, -2]
+    assert as_numbers([MAX_INDEX], np.int64, "starts").tolist() == [MAX_INDEX]
     for values in ([0.5], [MAX_INDEX + 2], [-MAX_INDEX - 2], [np.nan], ["1"], [True]):
         with pytest.raises(InputError, match=r"starts are .*, expected an array of whole numbers"):
-            numbers(values, np.int64, "starts")
+            as_numbers(values, np.int64, "starts")
     with pytest.raises(InputError, match="expected an array of real numbers"):
-        numbers([1j], np.float64, "readings")
+        as_numbers([1j], np.float64, "readings")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from design import Morphology
 from design.common.errors import InputError
-from sense import Recording, Rig, import_mat, simulate
+from sense import Recording, RigSettings, import_mat, simulate
 from sense.processing.kernels import level_tracking as levels
 from sense.processing.kernels import pad_state
 from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder, Presses, as_commanded, find_presses
@@ -58,22 +58,22 @@ def test_found_presses_stand_for_commanded_ones(published: Path) -> None:
 @pytest.mark.parametrize(
     ("grid", "rig"),
     [
-        (4, Rig(presses=200)),
-        (4, Rig(presses=200, noise_mv=0)),
-        (4, Rig(presses=200, noise_mv=5)),
-        (4, Rig(presses=200, drift_mv=150)),
-        (4, Rig(presses=200, hysteresis=0.5, creep=0.4)),
-        (4, Rig(presses=200, hysteresis=0, creep=0)),
-        (4, Rig(presses=200, depth_mm=1)),
-        (4, Rig(presses=200, readings_per_press=12)),
-        (4, Rig(presses=200, rate_hz=5, readings_per_press=20)),
-        (4, Rig(presses=100, rate_hz=100, readings_per_press=200)),
-        (4, Rig(presses=50, rate_hz=1000, readings_per_press=2000)),
-        (1, Rig(presses=200)),
-        (256, Rig(presses=40)),
+        (4, RigSettings(presses=200)),
+        (4, RigSettings(presses=200, noise_mv=0)),
+        (4, RigSettings(presses=200, noise_mv=5)),
+        (4, RigSettings(presses=200, drift_mv=150)),
+        (4, RigSettings(presses=200, hysteresis=0.5, creep=0.4)),
+        (4, RigSettings(presses=200, hysteresis=0, creep=0)),
+        (4, RigSettings(presses=200, depth_mm=1)),
+        (4, RigSettings(presses=200, readings_per_press=12)),
+        (4, RigSettings(presses=200, rate_hz=5, readings_per_press=20)),
+        (4, RigSettings(presses=100, rate_hz=100, readings_per_press=200)),
+        (4, RigSettings(presses=50, rate_hz=1000, readings_per_press=2000)),
+        (1, RigSettings(presses=200)),
+        (256, RigSettings(presses=40)),
     ],
 )
-def test_presses_of_simulated_pads_are_found(grid: int, rig: Rig) -> None:
+def test_presses_of_simulated_pads_are_found(grid: int, rig: RigSettings) -> None:
     recording = simulate(Morphology.straight(grid), rig)
     found, false, touches, releases = score(find_presses(recording.readings, recording.times_s), recording)
     assert found >= 0.985
@@ -94,7 +94,7 @@ def recorded(
         signals = np.clip(rng.normal(0.3, 0.4, fibres), 0, None)
         signals[rng.integers(fibres)] += 0.5
         strain += depth[:, None] * signals
-    return times, Divider(fibres, rate_hz, Rig(), rng)(strain)
+    return times, Divider(fibres, rate_hz, RigSettings(), rng)(strain)
 
 
 def evenly(presses: int, held_s: float, apart_s: float) -> Spans:
@@ -213,7 +213,7 @@ def torn(readings: np.ndarray, rng: np.random.Generator) -> None:
     ids=lambda spoil: spoil.__name__,
 )
 def test_presses_are_found_in_spoilt_readings(spoil) -> None:
-    recording = simulate(Morphology.straight(4), Rig(presses=300, seed=3))
+    recording = simulate(Morphology.straight(4), RigSettings(presses=300, seed=3))
     readings = recording.readings.copy()
     spoil(readings, np.random.default_rng(0))
     found, false, *_ = score(find_presses(readings, recording.times_s), recording)

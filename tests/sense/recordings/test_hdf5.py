@@ -4,11 +4,11 @@ from click.testing import CliRunner
 
 from design import Morphology
 from design.common.errors import InputError
-from sense import Rig, open_recording, simulate
+from sense import RigSettings, open_recording, simulate
 from sense.cli.main import sense
 from sense.recordings.hdf5 import export_hdf5, import_hdf5
 
-RECORDING = simulate(Morphology.straight(2), Rig(presses=8))
+RECORDING = simulate(Morphology.straight(2), RigSettings(presses=8))
 
 
 def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import sense.recordings.recording
 from design.common.errors import InputError
 from sense import Recorder, Recording
-from sense.cli.rig import describe
+from sense.cli.rig import recording_line
 
 
 @pytest.fixture
@@ -181,14 +181,14 @@ def test_a_recording_of_one_press_and_two_readings_is_one(tmp_path: Path) -> Non
 
 
 def test_a_recording_tells_in_one_line_what_it_lacks(recording: Recording) -> None:
-    whole = describe(recording, Path("out"))
+    whole = recording_line(recording, Path("out"))
     assert whole == f"300 presses, 12000 readings of 4 fibres at {recording.rate_hz:.1f} Hz -> out"
     holed = replace(
         recording,
         readings=spoiled(recording.readings, slice(3), np.nan),
         presses_mm=spoiled(recording.presses_mm, [3, 5], np.nan),
     )
-    assert describe(holed, Path("out")) == (
+    assert recording_line(holed, Path("out")) == (
         f"300 presses (2 of unknown place), 12000 readings of 4 fibres, 12 values missing, "
         f"at {recording.rate_hz:.1f} Hz -> out"
     )

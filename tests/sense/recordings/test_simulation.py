@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from design import Contact, Morphology, signals, signals_quantized
-from sense import Rig, simulate
+from sense import RigSettings, simulate
 from sense.recordings.pad_model import (
     ADC_STEPS,
     SUPPLY_V,
@@ -26,13 +26,13 @@ CYCLE = Cycle(40, 13.3)
 
 
 def test_the_same_seed_gives_the_same_recording_and_another_another() -> None:
-    first = simulate(PAD, Rig(presses=20, seed=3))
-    assert simulate(PAD, Rig(presses=20, seed=3)) == first
-    assert simulate(PAD, Rig(presses=20, seed=4)) != first
+    first = simulate(PAD, RigSettings(presses=20, seed=3))
+    assert simulate(PAD, RigSettings(presses=20, seed=3)) == first
+    assert simulate(PAD, RigSettings(presses=20, seed=4)) != first
 
 
 def test_it_has_the_published_form() -> None:
-    recording = simulate(PAD, Rig(presses=400))
+    recording = simulate(PAD, RigSettings(presses=400))
     assert recording.readings.shape == (16_000, 8)
     assert np.array_equal(recording.begun, 40 * np.arange(400) + 20)
     assert np.array_equal(recording.lifted, recording.begun + 20)
@@ -42,7 +42,7 @@ def test_it_has_the_published_form() -> None:
 
 
 def test_touched_fibres_answer_and_others_do_not() -> None:
-    recording = simulate(PAD, Rig(presses=200, noise_mv=0.0, drift_mv=0.0, creep=0.0, hysteresis=0.0))
+    recording = simulate(PAD, RigSettings(presses=200, noise_mv=0.0, drift_mv=0.0, creep=0.0, hysteresis=0.0))
     touched = signals_quantized(PAD, PAD.to_grid(recording.presses_mm)) > 0
     cycles = recording.readings.reshape(200, 40, 8)
     change = cycles[:, 35] - cycles[:, 15]
@@ -51,7 +51,7 @@ def test_touched_fibres_answer_and_others_do_not() -> None:
 
 
 def test_untouched_fibres_stay_within_noise() -> None:
-    recording = simulate(PAD, Rig(presses=300, drift_mv=0.0, creep=0.0, hysteresis=0.0))
+    recording = simulate(PAD, RigSettings(presses=300, drift_mv=0.0, creep=0.0, hysteresis=0.0))
     touched = signals_quantized(PAD, PAD.to_grid(recording.presses_mm)) > 0
     cycles = recording.readings.reshape(300, 40, 8)
     change = cycles[:, 28:38].mean(axis=1) - cycles[:, 8:18].mean(axis=1)
@@ -134,7 +134,7 @@ def test_asked_bit_by_bit_the_model_gives_the_same(pieces: list[int], seed: int)
 
 
 def test_the_live_pad_answers_where_and_as_deep_as_the_tip_presses() -> None:
-    quiet = Rig(noise_mv=0, drift_mv=0, creep=0, hysteresis=0)
+    quiet = RigSettings(noise_mv=0, drift_mv=0, creep=0, hysteresis=0)
     pad = Morphology.straight(2)
     model = LivePad(pad, Contact(), quiet, 1000.0, np.random.default_rng(0))
     depths = np.repeat([-5.0, 0.0, 2.5, 5.0], 20)

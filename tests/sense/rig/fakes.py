@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from design import Contact, Morphology
 from sense.recordings.pad_model import LivePad
 from sense.recordings.recorder import STATE_COLUMNS
-from sense.rig.devices import ArmState, Pose, RigFault, Samples
+from sense.rig.devices import ArmState, ConverterSamples, Pose, RigFault
 from sense.rig.session.pad_frame import Frame
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
-RIG = Rig(
+RIG = RigSettings(
     presses=6,
     rate_hz=100,
     converter_rate_hz=1000,
@@ -111,7 +111,7 @@ class FakeArm:
 class FakeConverter:
     """Samples the simulated pad under a fake arm; samples may be lost, and the board may stall or go."""
 
-    def __init__(self, arm: FakeArm, rig: Rig = RIG, pad: Morphology = PAD) -> None:
+    def __init__(self, arm: FakeArm, rig: RigSettings = RIG, pad: Morphology = PAD) -> None:
         self.arm, self.rig, self.frame = arm, rig, Frame.of(rig)
         self.model = LivePad(pad, Contact(), rig, rig.converter_rate_hz, np.random.default_rng(1))
         self.rate_hz, self.taken_s = rig.converter_rate_hz, arm.time()
@@ -121,7 +121,7 @@ class FakeConverter:
     def connect(self) -> dict[str, float]:
         return {"rate_hz": self.rate_hz}
 
-    def read(self) -> Samples:
+    def read(self) -> ConverterSamples:
         if self.lost:
             raise RigFault("lost", "the board is gone")
         if self.stalled and self.arm.time() - self.taken_s > 1:
@@ -135,7 +135,7 @@ class FakeConverter:
         if len(times):
             missing[0] = skipped
         places, depths = self.frame.tip(self.arm.pose_at(times))
-        return Samples(times, self.model.volts(places, depths), missing)
+        return ConverterSamples(times, self.model.volts(places, depths), missing)
 
     def close(self) -> None:
         pass

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sense.rig.devices import ArmState, Pose, RigFault
 from sense.rig.safety import Limits, require_safe, tilt_deg, wait_until_still, watch
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
 SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)
@@ -153,9 +153,13 @@ def test_a_tip_rests_up_to_a_millimetre_a_second(speed: float, rests: bool) -> N
 
 
 def test_limits_of_the_settings() -> None:
-    limits = Limits.of(Rig(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20))
+    limits = Limits.of(RigSettings(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20))
     assert (limits.box_mm, limits.contact_mm, limits.max_speed_mm_s) == (((-1, 1), (-2, 2), (0, 90)), 30, 80)
-    for rig in (Rig(), Rig(box_mm=(1, -1, -2, 2, 0, 90)), Rig(box_mm=(-1, 1, -2, 2, 0, 90), tool_rad=(0, 0, 0))):
+    for rig in (
+        RigSettings(),
+        RigSettings(box_mm=(1, -1, -2, 2, 0, 90)),
+        RigSettings(box_mm=(-1, 1, -2, 2, 0, 90), tool_rad=(0, 0, 0)),
+    ):
         with pytest.raises(RigFault, match=r"\[rig\]") as caught:
             Limits.of(rig)
         assert caught.value.cause == "refused"

@@ -11,12 +11,12 @@ import pytest
 from design import InputError, Morphology
 from sense import Recording, open_recording
 from sense.recordings.simulation import simulate
-from sense.settings import Rig
+from sense.settings import RigSettings
 from sense.studies.drift.study import FILTERS, SCHEMES, SLOW_PRESSES, drift_study, scheme_inputs, values
-from sense.studies.study import Study, lines, run
+from sense.studies.study import Study, run, study_lines
 
 PAD = Morphology.random(2, knots=3, seed=5)
-STRONG = Rig(drift_mv=300, creep=0, hysteresis=0)
+STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0)
 CYCLES = 5
 BEGUN, LIFTED = 40 * np.arange(CYCLES) + 20, 40 * np.arange(1, CYCLES + 1)
 
@@ -24,7 +24,7 @@ BEGUN, LIFTED = 40 * np.arange(CYCLES) + 20, 40 * np.arange(1, CYCLES + 1)
 @pytest.fixture(scope="module")
 def recorded() -> Recording:
     """200 presses, not said to be simulated; a fibre's readings are missing now and then, and one place unknown."""
-    recording = simulate(PAD, Rig(presses=200, seed=3))
+    recording = simulate(PAD, RigSettings(presses=200, seed=3))
     readings, places = recording.readings.copy(), recording.presses_mm.copy()
     readings[100:110, 0] = np.nan
     places[7] = np.nan
@@ -141,7 +141,7 @@ def test_a_study_is_told_in_sentences_and_json(document: dict[str, Any]) -> None
         assert f"{best:.2f} mm off" in text
     for each in document["idle"]:
         assert f"{each['idle_percent']:.1f} % ({each['label']}" in text
-    assert len(lines(document)) > len(document["rows"])
+    assert len(study_lines(document)) > len(document["rows"])
 
 
 def test_a_resumed_study_gives_the_same(recorded: Recording, document: dict[str, Any], tmp_path: Path) -> None:

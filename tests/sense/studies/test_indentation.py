@@ -12,7 +12,7 @@ from design.pad.indentation import Indenter
 from sense.studies.indentation import shape
 from sense.studies.indentation.force import COUNTS, force_study, readings
 from sense.studies.indentation.shape import FOOTPRINTS, SETS, shape_study
-from sense.studies.study import Study, lines, run
+from sense.studies.study import Study, run, study_lines
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 
@@ -116,6 +116,6 @@ def test_a_resumed_study_gives_the_same(
 def test_a_study_is_told_in_a_table_sentences_and_json(name: str, request: pytest.FixtureRequest) -> None:
     document = request.getfixturevalue(name)
     json.dumps(document, allow_nan=False)
-    text = "\n".join(lines(document))
+    text = "\n".join(study_lines(document))
     for row in document["rows"]:
         assert row["pad"] in text

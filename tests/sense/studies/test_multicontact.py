@@ -10,7 +10,7 @@ from design import Morphology, signals
 from design.common.computing import one_torch_thread
 from sense.studies.multicontact.pairs import LABELLED, WAYS, learnt, moments, pairs_of_moments, unordered_distances
 from sense.studies.multicontact.study import COUNTED, multicontact_study
-from sense.studies.study import Study, lines, run
+from sense.studies.study import Study, run, study_lines
 
 PADS = {"square": Morphology.straight(4), "random": Morphology.random(4, 3, 0)}
 BAR = 0.7
@@ -112,6 +112,6 @@ def test_a_resumed_study_gives_the_same(document: dict, tmp_path: Path) -> None:
 
 def test_the_study_is_told_in_a_table_sentences_and_json(document: dict) -> None:
     json.dumps(document, allow_nan=False)
-    text = "\n".join(lines(document))
+    text = "\n".join(study_lines(document))
     for label in PADS:
         assert f"{label}: " in text

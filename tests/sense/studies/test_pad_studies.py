@@ -15,13 +15,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from design import Contact, InputError, Morphology, signals
-from design.evaluation.localisation_error import evaluate
+from design.evaluation.localisation_error import localisation_error
 from sense.studies import scaling, sensitivity
 from sense.studies.pads import load_pads
 from sense.studies.robustness import robustness_study
 from sense.studies.scaling import around, scaling_study, shares, spread_presses
 from sense.studies.sensitivity import sensitivity_study
-from sense.studies.study import Findings, Study, Task, lines, run
+from sense.studies.study import Findings, Study, Task, run, study_lines
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 
@@ -53,7 +53,7 @@ def test_robustness_tells_the_errors_of_every_set_of_lost_fibres(tmp_path: Path)
 
 def test_robustness_agrees_with_evaluate(tmp_path: Path) -> None:
     document = run(small(rule="exact"), tmp_path)
-    found = evaluate(PADS["random"], lost=(2,), hidden=10, presses=144, test=300)
+    found = localisation_error(PADS["random"], lost=(2,), hidden=10, presses=144, test=300)
     (row,) = rows_of(document, pad="random", lost=2)
     # Each of the six sets is trained three times here, and once there.
     for key in ("mean", "std", "max"):
@@ -82,7 +82,7 @@ def test_files_of_a_study_say_the_same(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         f"robustness.{end}" for end in ("csv", "json", "md", "png")
     ]
-    assert len(lines(document)) == 1 + len(document["rows"]) + 1 + len(document["text"])
+    assert len(study_lines(document)) == 1 + len(document["rows"]) + 1 + len(document["text"])
 
 
 def test_a_study_broken_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:

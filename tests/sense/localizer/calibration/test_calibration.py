@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from design.common.errors import InputError
 from design.common.settings import validated
 from design.criteria.fibre_loss import lost_subsets
-from sense import Localizer, Recording, Rig, calibrate, evaluate, import_mat, locate
+from sense import Localizer, Recording, RigSettings, calibrate, evaluate, import_mat, locate
 from sense.health.health_model import FELT, RECORDED, HealthModel
 from sense.health.learning import learn_health
-from sense.health.monitor import Finding
+from sense.health.monitor import FibreFault
 from sense.localizer.calibration.calibration import split_presses
-from sense.settings import Localizer as Options
+from sense.settings import LocalizerSettings as Options
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
 
@@ -51,7 +51,7 @@ def test_presses_held_back_leave_no_trace_in_the_localizer(recording: Recording,
     assert spoilt.test == plain.test
     assert np.array_equal(spoilt.factors, plain.factors)
     assert all(np.array_equal(spoilt.weights[name], weight) for name, weight in plain.weights.items())
-    assert np.array_equal(spoilt.scaling.spread, plain.scaling.spread)
+    assert np.array_equal(spoilt.normalization.spread, plain.normalization.spread)
 
 
 def test_training_presses_do_leave_a_trace(recording: Recording) -> None:
@@ -131,7 +131,7 @@ def test_options_out_of_range_are_refused(recording: Recording) -> None:
 @pytest.mark.parametrize(("features", "size"), [("causal", 9), ("early", 6), ("published", 3)])
 def test_other_inputs_can_be_learnt_from_too(recording: Recording, features: str, size: int) -> None:
     localizer, document = calibrate(recording, SHORT.model_copy(update={"features": features}))
-    assert localizer.scaling.centre.shape == (4, size)
+    assert localizer.normalization.centre.shape == (4, size)
     assert np.isfinite(document["errors"][0]["mean_mm"])
 
 
@@ -185,7 +185,7 @@ def test_a_short_training_on_the_published_recording_is_already_near(published: 
 def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     import sense.localizer.calibration.training
 
-    train = sense.localizer.calibration.training.train
+    train = sense.localizer.calibration.training.train_members
 
     def diverged(*arguments: Any) -> Any:
         return {name: weight * np.float32(np.nan) for name, weight in train(*arguments).items()}
@@ -213,7 +213,7 @@ def test_levels_and_test_presses_that_are_not_there_are_refused(localizer: Local
 
 def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Localizer, recording: Recording) -> None:
     whole, without = (locate(localizer, recording, lost).places_mm for lost in ((), (1,)))
-    found = locate(localizer, recording, findings=[Finding(9, 5, (1,), "weak", 6.0)]).places_mm
+    found = locate(localizer, recording, findings=[FibreFault(9, 5, (1,), "weak", 6.0)]).places_mm
     assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
     np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)
     np.testing.assert_allclose(found[5:], without[5:], atol=1e-4)
@@ -233,4 +233,4 @@ def test_health_is_learnt_from_the_presses_that_were_not_held_back(
 @pytest.mark.parametrize("rate_hz", [1e-300, 0.0999, np.inf])
 def test_a_rate_no_rig_has_is_refused(rate_hz: float) -> None:
     with pytest.raises(InputError, match=r"\[rig\] rate_hz: got"):
-        validated(Rig, {"rate_hz": rate_hz}, "[rig]")
+        validated(RigSettings, {"rate_hz": rate_hz}, "[rig]")

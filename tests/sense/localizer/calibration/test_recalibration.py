@@ -20,7 +20,7 @@ from sense.localizer.calibration import fine_tuning as adaptation
 from sense.localizer.calibration.affine_correction import _corrected, _parts, fit_correction
 from sense.localizer.calibration.fine_tuning import FAR_NOISE, _Presses, adapt
 from sense.localizer.calibration.recalibration import _Trial, recalibrate
-from sense.localizer.calibration.training import INPUT_NOISE, MOVED, Samples
+from sense.localizer.calibration.training import INPUT_NOISE, MOVED, TrainingPresses
 from sense.localizer.evaluation import distances
 from sense.localizer.localizer import Found
 
@@ -178,7 +178,7 @@ def test_a_correction_does_what_it_says(localizer: Localizer, recording: Recordi
     scaled = replace(recording, readings=recording.readings * gains)
     # Gains of the readings are taken off again: what enters the network is the same.
     np.testing.assert_allclose(found.inputs(scaled).inputs, localizer.inputs(recording).inputs, atol=2e-3)
-    scaling = localizer.scaling
+    scaling = localizer.normalization
     before, after = (
         (each.locate(each.inputs(readings)).places_mm - scaling.middle_mm) / scaling.span_mm
         for each, readings in ((localizer, recording), (found, scaled))
@@ -187,7 +187,7 @@ def test_a_correction_does_what_it_says(localizer: Localizer, recording: Recordi
 
 
 def test_a_known_correction_is_found(localizer: Localizer, recording: Recording) -> None:
-    scaling, numbers = localizer.scaling, np.array([1.0, -1.0, 0.5, -0.5, 1.0, 0.4, 0.6, -0.8])
+    scaling, numbers = localizer.normalization, np.array([1.0, -1.0, 0.5, -0.5, 1.0, 0.4, 0.6, -0.8])
     gains, turn, shift = _parts(localizer, numbers)
     pad = replace(recording, readings=recording.readings * gains)
     # Places are those that the localizer itself finds, so that nothing but the correction is to be found.
@@ -195,7 +195,7 @@ def test_a_known_correction_is_found(localizer: Localizer, recording: Recording)
     moved = ((places - scaling.middle_mm) / scaling.span_mm) @ turn.T + shift
     moved = moved * scaling.span_mm + scaling.middle_mm
     found = fit_correction(localizer, localizer.raw_inputs(pad), moved)
-    ratios = found.scaling.spread[:, 0] / scaling.spread[:, 0]
+    ratios = found.normalization.spread[:, 0] / scaling.spread[:, 0]
     np.testing.assert_allclose(ratios, gains, rtol=0.02)
     off = distances(found.locate(found.inputs(pad)).places_mm, moved)
     assert off.mean() < 0.1 * distances(localizer.locate(localizer.inputs(pad)).places_mm, moved).mean()
@@ -212,10 +212,10 @@ def test_the_table_of_a_turned_pad_is_turned(localizer: Localizer) -> None:
 
 def test_adapting_leaves_lost_fibres_alone(localizer: Localizer, recording: Recording) -> None:
     presses = localizer.inputs(recording)[NEW]
-    targets = localizer.scaling.targets(recording.presses_mm[NEW])
+    targets = localizer.normalization.targets(recording.presses_mm[NEW])
     spoilt, dead = presses.inputs.copy(), presses.alive.copy()
     spoilt[:, 1], dead[:, 1] = np.nan, False
-    samples = Samples(spoilt, dead, targets)
+    samples = TrainingPresses(spoilt, dead, targets)
     weights = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
     assert all(np.isfinite(weight).all() for weight in weights.values())
     assert not np.array_equal(weights["last.w"], localizer.weights["last.w"])
@@ -227,7 +227,7 @@ def test_the_more_was_learnt_before_the_less_new_presses_count(
 ) -> None:
     """Of what was learnt before nothing is kept where it counts nothing, and all where it alone counts."""
     presses = localizer.inputs(recording)[NEW]
-    samples = Samples(presses.inputs, presses.alive, localizer.scaling.targets(recording.presses_mm[NEW]))
+    samples = TrainingPresses(presses.inputs, presses.alive, localizer.normalization.targets(recording.presses_mm[NEW]))
     monkeypatch.setattr(adaptation, "OLD_PRESSES", old)
 
     def adapted(slope: float) -> np.ndarray:
@@ -245,7 +245,9 @@ def test_presses_are_moved_nearby_or_to_anywhere_on_the_pad() -> None:
     grid = np.linspace(-1, 1, 9, dtype=np.float32)
     table = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)[:, :, None]
     at = np.tile(np.array([0.25, -0.5], dtype=np.float32), (5, 1))
-    presses = _Presses(Samples(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0))
+    presses = _Presses(
+        TrainingPresses(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0)
+    )
     entries, places = presses.nearby()
     assert (entries[0, :, :2] - places).std().item() == pytest.approx(INPUT_NOISE, rel=0.2)
     np.testing.assert_allclose(places.std(dim=0), [MOVED] * 2, rtol=0.2)

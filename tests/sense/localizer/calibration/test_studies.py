@@ -14,9 +14,9 @@ import padforge
 from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fibre_loss_study as loss_study
-from sense.localizer.calibration.fibre_loss_study import MANY, ONE, robustness
-from sense.localizer.calibration.learning_curve import fit_power_law, power_law, size_curve
-from sense.settings import Localizer as Options
+from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
+from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
+from sense.settings import LocalizerSettings as Options
 
 QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
 
@@ -28,7 +28,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
-    document, expected = robustness(recording, localizer, lost=2), evaluate(localizer, recording, (0, 1, 2))
+    document, expected = fibre_loss_study(recording, localizer, lost=2), evaluate(localizer, recording, (0, 1, 2))
     (way,) = document["ways"].items()
     assert way[0] == ONE
     assert {name: way[1][name] for name in ("errors", "by_subset")} == {
@@ -45,7 +45,7 @@ def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: R
 
 
 def test_both_ways_stand_side_by_side_on_the_same_presses(localizer: Localizer, recording: Recording) -> None:
-    document = robustness(recording, localizer, retrain=True, lost=1)
+    document = fibre_loss_study(recording, localizer, retrain=True, lost=1)
     assert list(document["ways"]) == [ONE, MANY]
     for way in document["ways"].values():
         assert [row["subsets"] for row in way["errors"]] == [1, 4]
@@ -53,15 +53,15 @@ def test_both_ways_stand_side_by_side_on_the_same_presses(localizer: Localizer, 
     assert document["test_presses"] == len(localizer.test)
     assert document["training_presses"] == 300 - len(localizer.test)
     json.dumps(document, allow_nan=False)
-    assert len(loss_study.lines(document)) == 6
+    assert len(loss_study.fibre_loss_lines(document)) == 6
 
 
 def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recording: Recording) -> None:
-    plain = robustness(recording, retrain=True, lost=0)["ways"][MANY]
+    plain = fibre_loss_study(recording, retrain=True, lost=0)["ways"][MANY]
     test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
     places = recording.presses_mm.copy()
     places[test] += 5.0
-    moved = robustness(replace(recording, presses_mm=places), retrain=True, lost=0)["ways"][MANY]
+    moved = fibre_loss_study(replace(recording, presses_mm=places), retrain=True, lost=0)["ways"][MANY]
     assert moved["errors"][0]["mean_mm"] != plain["errors"][0]["mean_mm"]
     training = np.setdiff1d(np.arange(300), test)
     found = loss_study._train_without(
@@ -78,7 +78,7 @@ def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recordin
 def test_broken_off_work_goes_on_and_gives_the_same(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = robustness(recording, retrain=True, lost=1)
+    whole = fibre_loss_study(recording, retrain=True, lost=1)
     kept, real, trained = tmp_path / "unfinished", loss_study._train_without, []
 
     def interrupted(done: int, total: int) -> None:
@@ -90,11 +90,11 @@ def test_broken_off_work_goes_on_and_gives_the_same(
         return real(lost, *rest)  # type: ignore[arg-type]
 
     with pytest.raises(KeyboardInterrupt):
-        robustness(recording, retrain=True, lost=1, keep_in=kept, progress=interrupted)
+        fibre_loss_study(recording, retrain=True, lost=1, keep_in=kept, progress=interrupted)
     finished = len(list(kept.glob("start_*.npz")))
     assert finished >= 2
     monkeypatch.setattr(loss_study, "_train_without", counted)
-    assert robustness(recording, retrain=True, lost=1, keep_in=kept) == whole
+    assert fibre_loss_study(recording, retrain=True, lost=1, keep_in=kept) == whole
     assert len(trained) == 5 - finished
     assert not kept.exists()
 
@@ -105,14 +105,14 @@ def test_work_of_other_settings_is_not_gone_on_with(recording: Recording, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        robustness(recording, retrain=True, lost=0, keep_in=tmp_path / "k", progress=interrupted)
+        fibre_loss_study(recording, retrain=True, lost=0, keep_in=tmp_path / "k", progress=interrupted)
     with pytest.raises(InputError, match="begun with robustness"):
-        robustness(recording, retrain=True, lost=0, options=Options(seed=1), keep_in=tmp_path / "k")
+        fibre_loss_study(recording, retrain=True, lost=0, options=Options(seed=1), keep_in=tmp_path / "k")
 
 
 def test_no_way_is_one_line(recording: Recording) -> None:
     with pytest.raises(InputError, match="neither a localizer nor retraining"):
-        robustness(recording)
+        fibre_loss_study(recording)
 
 
 @given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
@@ -134,8 +134,8 @@ def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
 
 
 def test_a_size_curve_says_what_more_would_bring(recording: Recording) -> None:
-    document = size_curve(recording, QUICK)
-    assert document == size_curve(recording, QUICK)
+    document = learning_curve(recording, QUICK)
+    assert document == learning_curve(recording, QUICK)
     assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
     ahead = document["forecast"]
     assert ahead["presses"] == 510
@@ -149,7 +149,7 @@ def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
     places = recording.presses_mm.copy()
     places[100:] = np.nan
     with pytest.raises(InputError, match="85 presses to learn from, expected at least 160"):
-        size_curve(replace(recording, presses_mm=places), QUICK)
+        learning_curve(replace(recording, presses_mm=places), QUICK)
 
 
 def test_the_commands_write_documents_and_figures(
@@ -188,5 +188,5 @@ def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        size_curve(recording, long, progress=interrupted)
+        learning_curve(recording, long, progress=interrupted)
     assert max(heard) < 0.5

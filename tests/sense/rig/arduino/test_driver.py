@@ -15,16 +15,16 @@ import pytest
 from design.common.errors import InputError
 from sense.rig.arduino import driver as module
 from sense.rig.arduino.driver import Arduino, Assembler
-from sense.rig.arduino.framing import Block, Decoder, Settings, Status, encode
+from sense.rig.arduino.framing import Block, BoardSettings, Decoder, Status, encode
 from sense.rig.arduino.serial_link import BoardPort, find_ports, refusal
-from sense.rig.devices import RigFault, Samples
-from sense.rig.emulators.board import MAX_PERIOD_NS, MIN_NS_PER_CONVERSION, EmulatedBoard, judge
+from sense.rig.devices import ConverterSamples, RigFault
+from sense.rig.emulators.board import MAX_PERIOD_NS, MIN_NS_PER_CONVERSION, EmulatedBoard, judge_settings
 
 serial = pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
 STEP_V = 3.3 / 4095
-SETTINGS = Settings(1_000_000, 0xFF, 1)
+SETTINGS = BoardSettings(1_000_000, 0xFF, 1)
 
 
 @pytest.fixture(autouse=True)
@@ -45,11 +45,11 @@ def connected(board: EmulatedBoard, rate_hz: float = 1000.0, **options: Any) -> 
         yield converter
 
 
-def joined(parts: list[Samples]) -> Samples:
-    return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+def joined(parts: list[ConverterSamples]) -> ConverterSamples:
+    return ConverterSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
-def read_for(converter: Arduino, seconds: float) -> Samples:
+def read_for(converter: Arduino, seconds: float) -> ConverterSamples:
     parts, end = [converter.read()], time.monotonic() + seconds
     while time.monotonic() < end:
         time.sleep(0.02)
@@ -57,7 +57,7 @@ def read_for(converter: Arduino, seconds: float) -> Samples:
     return joined(parts)
 
 
-def check(samples: Samples, board: EmulatedBoard, within_s: float = 0.05) -> np.ndarray:
+def check(samples: ConverterSamples, board: EmulatedBoard, within_s: float = 0.05) -> np.ndarray:
     """Every reading is what the board read at that index, at the right time; returns the indices."""
     index = np.arange(len(samples.times_s)) + np.cumsum(samples.missing)
     truth = board.truth_s(index)
@@ -126,16 +126,16 @@ def test_a_sample_is_complete_a_period_after_the_one_before() -> None:
 @pytest.mark.parametrize(
     ("settings", "status"),
     [
-        (Settings(8 * MIN_NS_PER_CONVERSION, 0xFF, 1), Status.OK),
-        (Settings(8 * MIN_NS_PER_CONVERSION - 1, 0xFF, 1), Status.TOO_FAST),
-        (Settings(12 * 16 * MIN_NS_PER_CONVERSION, 0xFFF, 16), Status.OK),
-        (Settings(12 * 16 * MIN_NS_PER_CONVERSION - 1, 0xFFF, 16), Status.TOO_FAST),
-        (Settings(MAX_PERIOD_NS, 1, 1), Status.OK),
-        (Settings(MAX_PERIOD_NS + 1, 1, 1), Status.BAD_SETTINGS),
+        (BoardSettings(8 * MIN_NS_PER_CONVERSION, 0xFF, 1), Status.OK),
+        (BoardSettings(8 * MIN_NS_PER_CONVERSION - 1, 0xFF, 1), Status.TOO_FAST),
+        (BoardSettings(12 * 16 * MIN_NS_PER_CONVERSION, 0xFFF, 16), Status.OK),
+        (BoardSettings(12 * 16 * MIN_NS_PER_CONVERSION - 1, 0xFFF, 16), Status.TOO_FAST),
+        (BoardSettings(MAX_PERIOD_NS, 1, 1), Status.OK),
+        (BoardSettings(MAX_PERIOD_NS + 1, 1, 1), Status.BAD_SETTINGS),
     ],
 )
-def test_a_period_is_at_least_that_of_its_conversions(settings: Settings, status: Status) -> None:
-    assert judge(settings) == status
+def test_a_period_is_at_least_that_of_its_conversions(settings: BoardSettings, status: Status) -> None:
+    assert judge_settings(settings) == status
 
 
 def test_garbled_bytes_cost_samples_that_are_counted_and_never_give_a_wrong_one() -> None:
@@ -303,7 +303,7 @@ def test_a_block_that_cannot_follow_is_a_fault(second: Block) -> None:
 
 def test_blocks_of_other_channels_are_a_fault() -> None:
     with pytest.raises(RigFault, match="other channels"):
-        Assembler(Settings(1_000_000, 0x0F, 1), 3.3).samples([(1.0, block(0))])
+        Assembler(BoardSettings(1_000_000, 0x0F, 1), 3.3).samples([(1.0, block(0))])
 
 
 def test_nothing_new_is_an_empty_reading_of_the_right_shape() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sense.rig.arduino import framing
-from sense.rig.arduino.framing import Ack, Block, Decoder, Frame, Identity, Kind, Request, Settings, Status, encode
-from sense.rig.emulators.board import judge
+from sense.rig.arduino.framing import Ack, Block, BoardSettings, Decoder, Frame, Identity, Kind, Request, Status, encode
+from sense.rig.emulators.board import judge_settings
 
 HERE = Path(__file__).parent
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"
@@ -36,7 +36,7 @@ class Board:
         self.program = program
         self.script: list[str] = []
 
-    def host(self, *frames: Request | Settings) -> "Board":
+    def host(self, *frames: Request | BoardSettings) -> "Board":
         self.script += [f"host {encode(frame).hex()}" for frame in frames]
         return self
 
@@ -70,7 +70,7 @@ def expected(first: int, samples: int, inputs: list[int], averaging: int) -> np.
     return ((256 * channel + turns[:, None]) % 4096).reshape(samples, averaging, -1).sum(1)
 
 
-def check_blocks(blocks: list[Block], wanted: Settings) -> None:
+def check_blocks(blocks: list[Block], wanted: BoardSettings) -> None:
     inputs = [i for i in range(12) if wanted.mask >> i & 1]
     samples = min(max(20_000_000 // wanted.period_ns, 1), 16)
     for number, block in enumerate(blocks):
@@ -89,14 +89,14 @@ def test_the_board_says_what_it_is(board: Board) -> None:
 @pytest.mark.parametrize(
     "wanted",
     [
-        Settings(1_000_000, 0xFF, 1),
-        Settings(1_000_000, 0xFFF, 8),
-        Settings(100_000, 0xFF, 1),
-        Settings(75_000_000, 0b1000_0000_0101, 16),
-        Settings(100_000_000, 1, 1),
+        BoardSettings(1_000_000, 0xFF, 1),
+        BoardSettings(1_000_000, 0xFFF, 8),
+        BoardSettings(100_000, 0xFF, 1),
+        BoardSettings(75_000_000, 0b1000_0000_0101, 16),
+        BoardSettings(100_000_000, 1, 1),
     ],
 )
-def test_blocks_hold_every_conversion_in_its_place(board: Board, wanted: Settings) -> None:
+def test_blocks_hold_every_conversion_in_its_place(board: Board, wanted: BoardSettings) -> None:
     board.host(wanted, START)
     triggers = 16 * wanted.averaging
     ack, started, *blocks = board.do(*[f"trigger {triggers}", "loop 20"] * 8, "loop 200").frames()
@@ -108,7 +108,7 @@ def test_blocks_hold_every_conversion_in_its_place(board: Board, wanted: Setting
 
 
 def test_the_period_in_force_is_what_the_timer_can_keep(board: Board) -> None:
-    (ack,) = board.host(Settings(1_000_000_000 // 1300, 0xFF, 7)).frames()
+    (ack,) = board.host(BoardSettings(1_000_000_000 // 1300, 0xFF, 7)).frames()
     assert isinstance(ack, Ack)
     ticks = round(1e9 / 1300 * 0.042 / 7)
     assert ack.settings.period_ns == round(ticks * 7 / 0.042)
@@ -117,26 +117,26 @@ def test_the_period_in_force_is_what_the_timer_can_keep(board: Board) -> None:
 @pytest.mark.parametrize(
     ("wanted", "status"),
     [
-        (Settings(1_000_000, 0, 1), Status.BAD_SETTINGS),
-        (Settings(1_000_000, 0x1000, 1), Status.BAD_SETTINGS),
-        (Settings(1_000_000, 1, 0), Status.BAD_SETTINGS),
-        (Settings(1_000_000, 1, 17), Status.BAD_SETTINGS),
-        (Settings(0, 1, 1), Status.BAD_SETTINGS),
-        (Settings(2_000_000_000, 1, 1), Status.BAD_SETTINGS),
-        (Settings(47_000, 0xFF, 1), Status.TOO_FAST),
-        (Settings(1_000_000, 0xFFF, 16), Status.TOO_FAST),
+        (BoardSettings(1_000_000, 0, 1), Status.BAD_SETTINGS),
+        (BoardSettings(1_000_000, 0x1000, 1), Status.BAD_SETTINGS),
+        (BoardSettings(1_000_000, 1, 0), Status.BAD_SETTINGS),
+        (BoardSettings(1_000_000, 1, 17), Status.BAD_SETTINGS),
+        (BoardSettings(0, 1, 1), Status.BAD_SETTINGS),
+        (BoardSettings(2_000_000_000, 1, 1), Status.BAD_SETTINGS),
+        (BoardSettings(47_000, 0xFF, 1), Status.TOO_FAST),
+        (BoardSettings(1_000_000, 0xFFF, 16), Status.TOO_FAST),
     ],
 )
 def test_settings_it_cannot_keep_are_refused_as_the_emulated_board_does(
-    board: Board, wanted: Settings, status: Status
+    board: Board, wanted: BoardSettings, status: Status
 ) -> None:
     (ack,) = board.host(wanted).frames()
-    assert ack == Ack(Kind.SETTINGS, status, Settings(1_000_000, 0xFF, 1))
-    assert judge(wanted) == status
+    assert ack == Ack(Kind.SETTINGS, status, BoardSettings(1_000_000, 0xFF, 1))
+    assert judge_settings(wanted) == status
 
 
 def test_start_twice_goes_on_and_settings_wait_for_stop(board: Board) -> None:
-    default, other = Settings(1_000_000, 0xFF, 1), Settings(2_000_000, 3, 1)
+    default, other = BoardSettings(1_000_000, 0xFF, 1), BoardSettings(2_000_000, 3, 1)
     board.host(START).do("trigger 16", "loop 2").host(START, other).do("trigger 16", "loop 2")
     frames = board.host(STOP, other, START).do("trigger 10", "loop 2").frames()
     acks = [(ack.command, ack.status) for ack in frames if isinstance(ack, Ack)]
@@ -168,12 +168,12 @@ def test_it_stops_when_the_host_closes_the_port(board: Board) -> None:
 
 
 def test_damaged_commands_are_passed_over(board: Board) -> None:
-    wanted = encode(Settings(2_000_000, 3, 2))
+    wanted = encode(BoardSettings(2_000_000, 3, 2))
     for i in range(len(wanted)):
         for damaged in (wanted[:i] + bytes([wanted[i] ^ 0x10]) + wanted[i + 1 :], wanted[:i] + wanted[i + 1 :]):
             board.do(f"host {damaged.hex()}")
     frames = board.do(f"host {'55' * 100}").host(IDENTIFY).frames()
-    whole = Ack(Kind.SETTINGS, Status.OK, Settings(2_000_000, 3, 2))
+    whole = Ack(Kind.SETTINGS, Status.OK, BoardSettings(2_000_000, 3, 2))
     assert [frame for frame in frames if frame != whole] == [
         Identity((1, 0, 0), 12, 12, "padforge-due", b"serial-of-a-chip")
     ]
@@ -181,5 +181,5 @@ def test_damaged_commands_are_passed_over(board: Board) -> None:
 
 
 def test_both_sides_write_the_same_bytes(board: Board) -> None:
-    sent = board.host(Settings(1_000_000, 0xFFF, 4), START).do("trigger 256", "loop 20").bytes()
+    sent = board.host(BoardSettings(1_000_000, 0xFFF, 4), START).do("trigger 256", "loop 20").bytes()
     assert sent == b"".join(map(encode, Decoder().feed(sent)))

@@ -15,12 +15,12 @@ from sense.rig.arduino.framing import (
     MAX_SAMPLES,
     Ack,
     Block,
+    BoardSettings,
     Decoder,
     Frame,
     Identity,
     Kind,
     Request,
-    Settings,
     cobs_decode,
     cobs_encode,
     encode,
@@ -28,7 +28,7 @@ from sense.rig.arduino.framing import (
 
 U8, U16, U32 = st.integers(0, 2**8 - 1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
 NAMES = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=16)
-SETTINGS = st.builds(Settings, U32, U16, U8)
+SETTINGS = st.builds(BoardSettings, U32, U16, U8)
 
 
 @st.composite
@@ -191,11 +191,11 @@ def test_the_bytes_of_a_frame_are_as_documented() -> None:
     """A board of another make relies on them. CRC-16/CCITT-FALSE of "123456789" is 29B1."""
     assert encode(Request(Kind.START)) == b"\0\x02\x03" + _check_bytes(b"\x02\x03") + b"\0"
     for period in range(1, 4000, 7):
-        coded = cobs_encode(Settings(period, 0x0FF, 4).pack())
-        assert encode(Settings(period, 0x0FF, 4)) == b"\0" + coded + _check_bytes(coded) + b"\0"
+        coded = cobs_encode(BoardSettings(period, 0x0FF, 4).pack())
+        assert encode(BoardSettings(period, 0x0FF, 4)) == b"\0" + coded + _check_bytes(coded) + b"\0"
     assert _check_bytes(b"123456789") == bytes([0x80, 0x80 | 0x29B1 >> 7 & 0x7F, 0x80 | 0x29B1 & 0x7F])
-    assert Settings(1_000_000, 0x0FF, 4).pack() == bytes.fromhex("02 40420f00 ff00 04")
-    assert Ack(3, 1, Settings(1, 2, 3)).pack() == bytes.fromhex("82 03 01 01000000 0200 03")
+    assert BoardSettings(1_000_000, 0x0FF, 4).pack() == bytes.fromhex("02 40420f00 ff00 04")
+    assert Ack(3, 1, BoardSettings(1, 2, 3)).pack() == bytes.fromhex("82 03 01 01000000 0200 03")
     block = Block(np.array([[1, 2], [3, 4]], np.uint16), 5, 0x0011, 6, 7, 8, 9)
     head = bytes.fromhex("90 02 05 1100 0600 07000000 08000000 09000000")
     assert block.pack() == head + bytes.fromhex("0100 0200 0300 0400")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sense.rig.emulators import ur_controller
-from sense.rig.emulators.ur_controller import Controller, Surface
+from sense.rig.emulators.ur_controller import Controller, SpringySurface
 from sense.rig.emulators.ur_motion import Line, Motion, Ramp
 from sense.rig.ur5 import rtde_frames as ur_frames
 
@@ -65,7 +65,7 @@ def test_an_interrupted_move_goes_on_only_when_told() -> None:
 class Client:
     """Does to a controller without sockets what ur-rtde does over them."""
 
-    def __init__(self, surface: Surface | None = None) -> None:
+    def __init__(self, surface: SpringySurface | None = None) -> None:
         self.controller, self.now = Controller("cb3", START, surface), 0.0
         self.controller.upload()
         self.until(lambda: self.ready == 1)
@@ -195,7 +195,7 @@ def test_an_unknown_command_ends_the_program() -> None:
 
 
 def test_pressing_gives_force() -> None:
-    client = Client(Surface(0.15, 2000.0))
+    client = Client(SpringySurface(0.15, 2000.0))
     assert client.controller.state()["actual_TCP_force"][2] == 0
     client.move(0.14)
     assert client.controller.state()["actual_TCP_force"][2] == pytest.approx(20)

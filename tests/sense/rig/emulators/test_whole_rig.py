@@ -21,14 +21,14 @@ from sense.rig.emulators.whole_rig import emulated, emulated_rig
 from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Session
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 pytest.importorskip("rtde_control")
 pytestmark = pytest.mark.usefixtures("ports")
 
 PAD = Morphology.straight(2)
 QUICK = {"readings_per_press": 20, "travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 1200}
-RIG = emulated_rig(Rig.model_validate({"rate_hz": 125, "presses": 6, **QUICK}), PAD)
+RIG = emulated_rig(RigSettings.model_validate({"rate_hz": 125, "presses": 6, **QUICK}), PAD)
 PLAN = planned(PAD, RIG, np.random.default_rng(0))
 
 

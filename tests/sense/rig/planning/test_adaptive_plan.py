@@ -6,7 +6,7 @@ from sense.recordings.recording import Recording
 from sense.rig.planning.adaptive_plan import EVERY, Steering, uncertainty
 from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.press_loop import Session
-from sense.settings import Localizer as LocalizerSettings
+from sense.settings import LocalizerSettings
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 

@@ -4,13 +4,13 @@ import pytest
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
 from sense.rig.planning.press_plan import PressPlan, planned, read_plan
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 PAD = Morphology.straight(4)
 
 
 def made(**settings: object) -> PressPlan:
-    return planned(PAD, Rig.model_validate(settings), np.random.default_rng(0))
+    return planned(PAD, RigSettings.model_validate(settings), np.random.default_rng(0))
 
 
 def test_a_plan_survives_json():

@@ -7,10 +7,10 @@ from design.common.settings import Spec
 from design.pad.morphology import Morphology
 from sense.rig.planning.press_plan import planned
 from sense.rig.planning.setup import Order, plan_of, recorder_of
-from sense.settings import Rig
+from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
-RIG = Rig(presses=5, channels=4)
+RIG = RigSettings(presses=5, channels=4)
 
 
 def order(out: Path, pad: Morphology = PAD) -> Order:

@@ -2,15 +2,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.rig.devices import Samples
+from sense.rig.devices import ConverterSamples
 from sense.rig.session.averaging import Averager
 
 
-def samples(count: int, lost: set[int]) -> Samples:
+def samples(count: int, lost: set[int]) -> ConverterSamples:
     """A ramp of `count` samples at 1 kHz without those in `lost`."""
     kept = np.array([i for i in range(count) if i not in lost], dtype=np.int64)
     missing = np.diff(kept, prepend=-1) - 1
-    return Samples(kept / 1000, np.column_stack([kept, -kept]).astype(float), missing)
+    return ConverterSamples(kept / 1000, np.column_stack([kept, -kept]).astype(float), missing)
 
 
 @given(st.integers(1, 12), st.integers(1, 200), st.sets(st.integers(0, 199), max_size=60), st.data())
@@ -19,7 +19,7 @@ def test_any_pieces_give_the_means_of_whole_stretches(ratio, count, lost, data):
     cuts = sorted(data.draw(st.lists(st.integers(0, len(whole.times_s)), max_size=6)))
     averager = Averager(ratio, 2)
     pieces = [
-        averager.feed(Samples(whole.times_s[a:b], whole.volts[a:b], whole.missing[a:b]))
+        averager.feed(ConverterSamples(whole.times_s[a:b], whole.volts[a:b], whole.missing[a:b]))
         for a, b in zip([0, *cuts], [*cuts, len(whole.times_s)], strict=True)
     ]
     times, volts = (np.concatenate(column) for column in zip(*pieces, strict=True))
