@@ -1,35 +1,48 @@
-"""padforge: the front door. One command; `run` chains design, fabricate and sense, `report` shows what they made."""
+"""padforge: the front door. `import padforge` hands out all there is; the command line chains the stages.
+
+`padforge.design`, `padforge.fabricate` and `padforge.sense` are the packages, and whatever these three hand out is here
+as well: `padforge.search`, `padforge.build`, `padforge.calibrate`, with the settings they take.
+"""
 
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.cli import design
+import design
+import fabricate
+import sense
+from design.benchmarking.cli import bench_command
+from design.cli import design as design_group
 from design.common.command_line import (
     INTERRUPTED,
-    json_option,
     load_spec,
     out_option,
     profile_option,
-    progress,
     run_to_end,
     seed_option,
-    show_result,
     spec_option,
 )
 from design.common.errors import InputError
-from fabricate.cli import fabricate
-from sense.cli.main import sense
-from sense.studies.cli import study
+from fabricate.cli import fabricate as fabricate_group
+from sense.cli.main import sense as sense_group
+from sense.studies.cli import study as study_group
 
 if TYPE_CHECKING:
+    from design import *  # noqa: F403  what an editor completes `padforge.` with
     from design.common.settings import Settings, Spec
+    from fabricate import *  # noqa: F403
+    from sense import *  # noqa: F403
 
+PACKAGES = {"design": design, "fabricate": fabricate, "sense": sense}
 
 SECTIONS = {
     "pad": "design.settings:PadSettings",
@@ -42,6 +55,53 @@ SECTIONS = {
     "localizer": "sense.settings:LocalizerSettings",
 }
 """The sections of a `pad.toml`, and where the settings of each are."""
+
+BENCHES = {
+    "contact": "design.pad.benchmark:BENCH",
+    "objective": "design.criteria.benchmark:BENCH",
+    "search": "design.optimisers.benchmark:BENCH",
+    "networks": "design.evaluation.benchmark:BENCH",
+    "filter": "sense.processing.benchmark:BENCH",
+    "localizer": "sense.localizer.calibration.benchmark:BENCH",
+    "mould": "fabricate.mould.benchmark:BENCH",
+}
+"""Where each bench is, imported when it is asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    for package in PACKAGES.values():
+        if name in package.__all__:
+            return getattr(package, name)
+    raise AttributeError(f"module 'padforge' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *(name for package in PACKAGES.values() for name in package.__all__)})
+
+
+class _Packages(MetaPathFinder, Loader):
+    """Finds `padforge.design.pad` where it lies, in `design.pad`: one module by two names, not two modules."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
+        """What makes an alias, for the names of the packages and all below."""
+        top, _, name = fullname.partition(".")
+        return ModuleSpec(fullname, self) if top == "padforge" and name.partition(".")[0] in PACKAGES else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """The module itself; its own specification is kept for `exec_module`."""
+        module = import_module(spec.name.removeprefix("padforge."))
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Nothing but what importing by another name has changed: it ran when it was imported."""
+        assert module.__spec__ is not None
+        module.__spec__ = module.__spec__.loader_state
+
+
+__path__: list[str] = []
+"""None of its own: all that is in this package is found by `_Packages`."""
+sys.meta_path.insert(0, _Packages())
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -60,15 +120,13 @@ def cli(context: click.Context) -> None:
     context.obj = list(SECTIONS)
 
 
-cli.add_command(design)
-cli.add_command(fabricate)
-cli.add_command(sense)
-cli.add_command(study)
+for group in (design_group, fabricate_group, sense_group, study_group, bench_command(BENCHES)):
+    cli.add_command(group)
 
 
-@cli.command()
+@cli.command("init")
 @click.argument("path", type=click.Path(dir_okay=False, path_type=Path), default="pad.toml")
-def init(path: Path) -> None:
+def _init(path: Path) -> None:
     """Write a settings file, pad.toml, with every default and a comment a key.
 
     \b
@@ -84,13 +142,13 @@ def init(path: Path) -> None:
     click.echo(f"settings -> {path}")
 
 
-@cli.command()
+@cli.command("run")
 @spec_option
 @seed_option
 @out_option("out/pad")
 @profile_option
 @click.pass_context
-def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) -> None:
+def _run(context: click.Context, spec: Path | None, seed: int | None, out: Path) -> None:
     """Do the whole job: optimise, mould, record presses on the simulated rig, calibrate, report.
 
     \b
@@ -112,70 +170,15 @@ def run(context: click.Context, spec: Path | None, seed: int | None, out: Path) 
     context.exit(code)
 
 
-@cli.command()
+@cli.command("report")
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path), default="out/pad")
-def report(folder: Path) -> None:
+def _report(folder: Path) -> None:
     """Write report.html for the pad in FOLDER: whatever its stages have left there, on one page.
 
     \b
     padforge report out/pad
     """
     click.echo(f"report: {write_report(folder)}")
-
-
-BENCHES = {
-    "contact": "design.pad.benchmark:BENCH",
-    "objective": "design.criteria.benchmark:BENCH",
-    "search": "design.optimisers.benchmark:BENCH",
-    "networks": "design.evaluation.benchmark:BENCH",
-    "filter": "sense.processing.benchmark:BENCH",
-    "localizer": "sense.localizer.calibration.benchmark:BENCH",
-    "mould": "fabricate.mould.benchmark:BENCH",
-}
-"""Where each bench is, imported when it is asked for."""
-
-
-@cli.command()
-@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice(list(BENCHES)))
-@click.option(
-    "--against",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="bench.json or NAME.json of an earlier run: say what has become worse since, exit 1 if anything has.",
-)
-@out_option("out/bench")
-@json_option
-@click.pass_context
-def bench(context: click.Context, names: tuple[str, ...], against: Path | None, out: Path, as_json: bool) -> None:
-    """Measure run time against error, beside plain ways of doing the same.
-
-    \b
-    padforge bench                                   all of them, some minutes
-    padforge bench contact filter                    of contact, objective, search, networks, filter, localizer, mould
-    padforge bench --against before/bench.json       what has become slower or less accurate, by ratio
-
-    Writes NAME.json, NAME.csv and NAME.png for each, and bench.json and bench.csv with the summary.
-    """
-    from dataclasses import asdict
-    from pkgutil import resolve_name
-
-    from design.benchmarking.comparison import compared, comparison_lines, read_earlier
-    from design.benchmarking.suite import run_benches
-    from design.benchmarking.table import bench_lines, summary_lines
-
-    before = read_earlier(against) if against else {}
-    chosen = names or [name for name in BENCHES if not before or name in before]
-    if not chosen:
-        raise InputError(f"{against}: holds none of the benches {', '.join(BENCHES)}")
-    with progress() as bar:
-        task = bar.add_task("bench", total=None, note="")
-        benches = [resolve_name(BENCHES[name]) for name in dict.fromkeys(chosen)]
-        summary, changes = run_benches(benches, out, lambda step: bar.update(task, note=step), before)
-    tables = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
-    verdict = ["", *comparison_lines(changes, compared(before, summary["benches"]))] if against else []
-    document = summary | {"worse": [asdict(change) for change in changes]}
-    show_result(document, [*tables, *summary_lines(summary["summary"]), *verdict], as_json)
-    context.exit(int(bool(changes)))
 
 
 def _sections() -> "dict[str, type[Settings]]":
@@ -191,6 +194,7 @@ def _check_ahead(spec: "Spec", out: Path) -> None:
     from design.settings import PadSettings
     from fabricate import FabricationSettings
     from sense.localizer.calibration.calibration import split_presses
+    from sense.recordings.recorder import refuse_replacing
     from sense.settings import LocalizerSettings, RigSettings
 
     for model in _sections().values():
@@ -198,52 +202,35 @@ def _check_ahead(spec: "Spec", out: Path) -> None:
     FabricationSettings.from_spec(spec).require_consistent(spec.section(PadSettings).pitch_mm)
     learning = spec.section(LocalizerSettings)
     split_presses(spec.section(RigSettings).presses, learning.split, learning.test_share, np.random.default_rng(0))
-    _require_replaceable(out / "recording")
+    refuse_replacing(out / "recording")
 
 
 def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     """All stages into `out`, each with its summary on stdout; the exit code: 0, 1 if a rule or check fails, or 130."""
-    from design.cli import run_search
-    from design.cli import search_lines as design_summary
+    from design.cli import run_search, search_lines
     from fabricate import FabricationSettings, build
-    from fabricate.cli import mould_lines as mould_summary
-    from sense.cli.calibration import calibration_lines as calibration_summary
-    from sense.cli.calibration import run_calibration
+    from fabricate.cli import mould_lines
+    from sense.cli.calibration import calibration_lines, run_calibration
     from sense.cli.rig import run_recording
+    from sense.recordings.recorder import refuse_replacing
 
     seeds = {"seed": seed}
     _, found = run_search(spec, out, seeds)
-    click.echo("\n".join(design_summary(found, out)))
+    click.echo("\n".join(search_lines(found, out)))
     if found.stopped:
         return INTERRUPTED
     written = [out / "morphology.json"]
     mould = build(found.morphology, out, settings=FabricationSettings.from_spec(spec), inputs=written)
-    click.echo("\n".join(mould_summary(mould, out)))
+    click.echo("\n".join(mould_lines(mould, out)))
     recorded = out / "recording"
-    _require_replaceable(recorded)
+    refuse_replacing(recorded)
     if recorded.exists():
         shutil.rmtree(recorded)
     recording = run_recording(spec, found.morphology, recorded, seeds, written)
     click.echo(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {recorded}")
     calibration = run_calibration(spec, recording, out, seeds)
-    click.echo("\n".join(f"  {line}" for line in calibration_summary(calibration)))
+    click.echo("\n".join(f"  {line}" for line in calibration_lines(calibration)))
     return int(bool(found.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))
-
-
-def _require_replaceable(recorded: Path) -> None:
-    """Refuse to run over a recording, unless it is a simulated one, which the same seed gives again."""
-    from design.common.files import read_json
-    from sense.recordings.recorder import FILES, FORMAT, START
-
-    if not recorded.exists() or (recorded.is_dir() and not any(recorded.iterdir())):
-        return
-    source = read_json(recorded / START, FORMAT).get("source")
-    kind = source.get("kind") if isinstance(source, dict) else None
-    if kind != "simulated":
-        raise InputError(f"{recorded}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
-    strange = sorted(path.name for path in recorded.iterdir() if path.name not in FILES)
-    if strange:
-        raise InputError(f"{recorded}: holds {strange[0]}, which is no part of a recording; choose another --out")
 
 
 def write_report(folder: Path) -> Path:

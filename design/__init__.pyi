@@ -1,6 +1,13 @@
+from .common.errors import Fault as Fault
 from .common.errors import InputError as InputError
 from .common.settings import Spec as Spec
 from .criteria.published_objective import published_objective as published_objective
+from .criteria.rules import Violation as Violation
+from .criteria.rules import check_rules as check_rules
+from .criteria.score import score as score
+from .evaluation.localisation_error import LossError as LossError
+from .evaluation.localisation_error import localisation_error as localisation_error
+from .optimisers.search import SearchResult as SearchResult
 from .optimisers.search import search as search
 from .pad.contact import signals as signals
 from .pad.contact import signals_quantized as signals_quantized
@@ -10,4 +17,8 @@ from .pad.curves import flatten as flatten
 from .pad.indentation import Indenter as Indenter
 from .pad.indentation import indented_signals as indented_signals
 from .pad.morphology import Morphology as Morphology
+from .report.plan_drawing import draw_plan as draw_plan
 from .settings import Contact as Contact
+from .settings import PadSettings as PadSettings
+from .settings import RulesSettings as RulesSettings
+from .settings import SearchSettings as SearchSettings

@@ -1,4 +1,5 @@
 from .health.health_model import HealthModel as HealthModel
+from .health.monitor import FibreFault as FibreFault
 from .health.monitor import Monitor as Monitor
 from .health.monitor import examine as examine
 from .live.pipeline import Live as Live
@@ -24,4 +25,5 @@ from .recordings.import_export import open_recording as open_recording
 from .recordings.recorder import Recorder as Recorder
 from .recordings.recording import Recording as Recording
 from .recordings.simulation import simulate as simulate
+from .settings import LocalizerSettings as LocalizerSettings
 from .settings import RigSettings as RigSettings

@@ -239,5 +239,18 @@ def refuse_existing(path: Path) -> None:
         raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
 
 
+def refuse_replacing(path: Path) -> None:
+    """Raise InputError if `path` holds anything but a simulated recording, which the same seed gives again."""
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    source = read_json(path / START, FORMAT).get("source")
+    kind = source.get("kind") if isinstance(source, dict) else None
+    if kind != "simulated":
+        raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
+    strange = sorted(file.name for file in path.iterdir() if file.name not in FILES)
+    if strange:
+        raise InputError(f"{path}: holds {strange[0]}, which is no part of a recording; choose another --out")
+
+
 STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
 """Columns of a row of `Arm.drain`; force is NaN where the arm has no sensor, safety 1 normal, 0 stopped."""

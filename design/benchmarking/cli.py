@@ -1,0 +1,57 @@
+"""`padforge bench`: run time against error, of whichever benches there are."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+
+from design.common.command_line import json_option, out_option, progress, show_result
+from design.common.errors import InputError
+
+
+def bench_command(benches: Mapping[str, str]) -> click.Command:
+    """The command that runs benches, given by name as `module:NAME`, imported when they are asked for."""
+
+    @click.command()
+    @click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice(list(benches)))
+    @click.option(
+        "--against",
+        type=click.Path(dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help="bench.json or NAME.json of an earlier run: say what has become worse since, exit 1 if anything has.",
+    )
+    @out_option("out/bench")
+    @json_option
+    @click.pass_context
+    def bench(context: click.Context, names: tuple[str, ...], against: Path | None, out: Path, as_json: bool) -> None:
+        """Measure run time against error, beside plain ways of doing the same.
+
+        \b
+        padforge bench                                all of them, some minutes
+        padforge bench contact filter                 of contact, objective, search, networks, filter, localizer, mould
+        padforge bench --against before/bench.json    what has become slower or less accurate, by ratio
+
+        Writes NAME.json, NAME.csv and NAME.png for each, and bench.json and bench.csv with the summary.
+        """
+        from dataclasses import asdict
+        from pkgutil import resolve_name
+
+        from .comparison import compared, comparison_lines, read_earlier
+        from .suite import run_benches
+        from .table import bench_lines, summary_lines
+
+        before = read_earlier(against) if against else {}
+        chosen = names or [name for name in benches if not before or name in before]
+        if not chosen:
+            raise InputError(f"{against}: holds none of the benches {', '.join(benches)}")
+        with progress() as bar:
+            task = bar.add_task("bench", total=None, note="")
+            found = [resolve_name(benches[name]) for name in dict.fromkeys(chosen)]
+            summary, changes = run_benches(found, out, lambda step: bar.update(task, note=step), before)
+        tables = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
+        verdict = ["", *comparison_lines(changes, compared(before, summary["benches"]))] if against else []
+        document = summary | {"worse": [asdict(change) for change in changes]}
+        show_result(document, [*tables, *summary_lines(summary["summary"]), *verdict], as_json)
+        context.exit(int(bool(changes)))
+
+    return bench
