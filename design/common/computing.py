@@ -1,17 +1,112 @@
-"""Spreading compiled work over the cores: the kernels let go of the interpreter while they run."""
+"""Spreading work over the cores of this machine or of a cluster, and keeping what is compiled.
+
+Threads serve here, since torch and the kernels let go of the interpreter while they work: nothing is copied, and
+compiled code is shared.
+"""
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from hashlib import sha256
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import TypeVar
+from threading import Lock, Thread
+from typing import Any, TypeVar
 
 import numpy as np
 
+from .errors import InputError
+
+Key = TypeVar("Key")
 Result = TypeVar("Result")
+
+SCHEDULER_S = 10.0
+"""How long a cluster's scheduler is waited for."""
+LOOK_S = 0.1
+"""Between two looks for Ctrl-C where the system does not wake a thread that waits."""
+
+
+def run_tasks(
+    tasks: Iterable[tuple[Key, Callable[[], Result]]],
+    executor: Executor | None = None,
+    *,
+    at_once: int | None = None,
+    then: Callable[[Key, Result], Callable[[], Result] | None] = lambda key, result: None,
+) -> Iterator[tuple[Key, Result]]:
+    """Results of tasks as they come, in any order, each with its task's key.
+
+    The one way in which searches, studies and trainings spread work: `for key, result in run_tasks(...)`, the caller
+    keeping each result and telling of the progress. A task begins only while the caller listens: what an exception or
+    Ctrl-C in the caller leaves is kept, no further task begins, and those at work are not waited for. An exception in
+    a task comes out here, at once. Tasks may share torch under `one_torch_thread`.
+
+    Args:
+        tasks: what to call, by key, in the order they begin; drawn one by one as there is room. For other processes,
+            such as those of a cluster, they must be picklable: `functools.partial` of a module's function.
+        executor: of the `concurrent.futures` kind; daemon threads of this machine if None.
+        at_once: tasks at most; as many as there are cores if there is no executor, else as the executor has it.
+        then: the next task of the same key once a result has been listened to, None if there is none.
+    """
+    pool = executor or DaemonThreads()
+    most = at_once or (None if executor else os.cpu_count() or 1)
+    waiting, running = iter(tasks), dict[Future[Result], Key]()
+    try:
+        while True:
+            for key, work in islice(waiting, most and most - len(running)):
+                running[pool.submit(work)] = key
+            if not running:
+                return
+            for future in wait(running, LOOK_S, FIRST_COMPLETED).done:
+                key, result = running.pop(future), future.result()
+                yield key, result
+                if next_one := then(key, result):
+                    running[pool.submit(next_one)] = key
+    finally:
+        for future in running:
+            future.cancel()
+
+
+class DaemonThreads(Executor):
+    """A thread for whatever is submitted, which does not hold up the end of the program."""
+
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Begin at once."""
+        future: Future[Any] = Future()
+
+        def run() -> None:
+            try:
+                result = work(*arguments, **named)
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        future.set_running_or_notify_cancel()
+        Thread(target=run, daemon=True).start()
+        return future
+
+
+@contextmanager
+def cluster(address: str | None) -> Iterator[Executor | None]:
+    """The Dask cluster at `address` as an executor, or None for this machine.
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers there.
+    """
+    if address is None:
+        yield None
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError("--scheduler needs Dask: pip install 'padforge[cluster]'") from error
+    try:
+        client = Client(address, timeout=SCHEDULER_S)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--scheduler is {address}: no Dask scheduler answers there ({error})") from error
+    with client, client.get_executor(pure=False, retries=10) as there:
+        yield there
 
 
 def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:
@@ -28,18 +123,33 @@ def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> lis
         return list(pool.map(lambda ends: work(*ends), pairwise(edges)))
 
 
+class _OneThread:
+    """Who is within `one_torch_thread`, and the number of threads before: torch has one of them for all."""
+
+    lock, inside, before = Lock(), 0, 1
+
+
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread: small matrices gain little from more, and where another program has a core, threads
-    that wait for each other take many times as long."""
+    """Keep torch to one thread in the body, from any thread, several bodies beside each other or within.
+
+    Small matrices gain little from more, where another program has a core threads that wait for each other take many
+    times as long, and sums in another order would give another result. The last one to leave sets it back.
+    """
     import torch
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _OneThread.lock:
+        if not _OneThread.inside:
+            _OneThread.before = torch.get_num_threads()
+        _OneThread.inside += 1
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        with _OneThread.lock:
+            _OneThread.inside -= 1
+            if not _OneThread.inside:
+                torch.set_num_threads(_OneThread.before)
 
 
 def forget_outdated(package: Path) -> None:
