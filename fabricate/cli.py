@@ -5,9 +5,16 @@ from typing import Any
 
 import click
 
-from design.common.command_line import json_option, load_spec, profile_option, show_result, spec_option
+from design.common.command_line import (
+    json_option,
+    load_spec,
+    out_option,
+    pad_folder,
+    profile_option,
+    show_result,
+    spec_option,
+)
 
-MESHES = (".stl", ".3mf")
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
 
@@ -39,11 +46,7 @@ def fabricate() -> None:
     "--formats", default="stl,step,svg,png", show_default=True, help="Which to write, of stl, 3mf, step, svg, dxf, png."
 )
 @spec_option
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for the files (default: beside a morphology.json, out/NAME for NAME.mat).",
-)
+@out_option(what="Folder for the files")
 @json_option
 @profile_option
 def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, as_json: bool) -> None:
@@ -63,7 +66,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
 
     settings = FabricationSettings.from_spec(load_spec(spec))
     pad = Morphology.load(morphology)
-    folder = out or (Path("out") / morphology.stem if morphology.suffix == ".mat" else morphology.parent)
+    folder = out or pad_folder(morphology)
     wanted = [name.strip() for name in formats.split(",") if name.strip()]
     with claimed(folder):
         document = build_files(pad, folder, wanted, settings, [path for path in (morphology, spec) if path])
@@ -100,23 +103,15 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     padforge fabricate check out/pad/morphology.json --picture found.png
     """
     from design.common.files import atomic
-    from design.pad.morphology import Morphology
-    from fabricate.checks import mesh_checks as soundness
-    from fabricate.checks.plan_checks import meshed
-    from fabricate.mould.plan import Plan
-    from fabricate.report import pictures as drawings
+    from fabricate.checks.plan_checks import inspect_file
+    from fabricate.report.pictures import draw_findings
 
     from .settings import FabricationSettings
 
-    settings = FabricationSettings.from_spec(load_spec(spec))
-    if mesh_or_morphology.suffix.lower() in MESHES:
-        vertices, triangles = soundness.read_mesh(mesh_or_morphology)
-        findings = soundness.inspect_mesh(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)
-    else:
-        vertices, triangles, findings = meshed(Plan(Morphology.load(mesh_or_morphology), settings))
+    vertices, triangles, findings = inspect_file(mesh_or_morphology, FabricationSettings.from_spec(load_spec(spec)))
     if picture is not None:
         with atomic(picture) as temporary:
-            drawings.draw_findings(vertices, triangles, findings, temporary)
+            draw_findings(vertices, triangles, findings, temporary)
     passed = all(finding.status != "fail" for finding in findings)
     documents = [finding.document() for finding in findings]
     show_result({"passed": passed, "findings": documents}, list(map(_line, documents)), as_json)

@@ -16,9 +16,9 @@ from design.common import profiling
 from design.common.errors import InputError, instance, path, shown
 from design.common.files import atomic, provenance, require_file, write_json, write_text
 from design.pad.morphology import Morphology
-from fabricate.checks import mesh_checks as soundness
-from fabricate.checks import plan_checks as printability
 from fabricate.checks.findings import Finding
+from fabricate.checks.mesh_checks import SOUND, sound
+from fabricate.checks.plan_checks import inspect
 from fabricate.mould.assembly import (
     conductive_body,
     conductive_plan,
@@ -30,11 +30,11 @@ from fabricate.mould.assembly import (
 )
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body
-from fabricate.report import laying_guide as laying
-from fabricate.report import pictures as drawings
-from fabricate.report import track_drawings as tracks
+from fabricate.report import laying_guide
+from fabricate.report.pictures import draw_mould, draw_tracks
+from fabricate.report.track_drawings import tracks_dxf, tracks_svg
 
-from . import mesh_files as writers
+from .mesh_files import write_3mf, write_step, write_stl, write_utf8
 from .settings import DEFAULTS, FabricationSettings
 
 if TYPE_CHECKING:
@@ -96,11 +96,11 @@ def build(
         plan.require_levels()
         printed = [_meshed(name, body) for name, body in _bodies(plan)]
     with profiling.stage("checks"):
-        findings = printability.inspect(plan, printed[0].vertices, printed[0].triangles)
+        findings = inspect(plan, printed[0].vertices, printed[0].triangles)
         _require_sound(printed[0], findings)
         for body in printed[1:]:
             holes = lid_holes(plan) if body.name == "lid" else 0
-            _require_sound(body, soundness.sound(body.vertices, body.triangles, genus=holes))
+            _require_sound(body, sound(body.vertices, body.triangles, genus=holes))
     writes = [
         *(write for body in printed for write in _solids(body, formats)),
         *_drawings(plan, findings, formats),
@@ -109,7 +109,7 @@ def build(
     for name, write in writes:
         with profiling.stage(f"write {name}"), atomic(out / name) as temporary:
             write(temporary)
-    write_text(out / "laying.md", laying.laying_page(document))
+    write_text(out / "laying.md", laying_guide.laying_page(document))
     write_json(out / "fabrication.json", document)
     return document
 
@@ -132,7 +132,7 @@ def _meshed(name: str, body: Body) -> Printed:
 
 
 def _require_sound(body: Printed, findings: Sequence[Finding]) -> None:
-    broken = [f.message for f in findings if f.name in soundness.SOUND and f.status == "fail"]
+    broken = [f.message for f in findings if f.name in SOUND and f.status == "fail"]
     if broken:
         raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
 
@@ -140,25 +140,25 @@ def _require_sound(body: Printed, findings: Sequence[Finding]) -> None:
 def _solids(body: Printed, formats: Sequence[str]) -> Iterator[Write]:
     """The wanted files of a body; its CAD solid is made and checked here, before anything is written."""
     if "stl" in formats:
-        yield f"{body.name}.stl", partial(writers.write_stl, vertices=body.vertices, triangles=body.triangles)
+        yield f"{body.name}.stl", partial(write_stl, vertices=body.vertices, triangles=body.triangles)
     if "3mf" in formats:
-        yield f"{body.name}.3mf", partial(writers.write_3mf, vertices=body.vertices, triangles=body.triangles)
+        yield f"{body.name}.3mf", partial(write_3mf, vertices=body.vertices, triangles=body.triangles)
     if "step" in formats:
         with profiling.stage("CAD solid"):
             solid, volume = valid_solid(body.mesh, body.name), body.mesh.volume()
         if abs(solid.volume - volume) > _VOLUME_RATIO * volume:
             raise InputError(f"{body.name}: solid {solid.volume:.1f} mm³, mesh {volume:.1f}; nothing was written")
-        yield f"{body.name}.step", partial(writers.write_step, solid=solid)
+        yield f"{body.name}.step", partial(write_step, solid=solid)
 
 
 def _drawings(plan: Plan, findings: Sequence[Finding], formats: Sequence[str]) -> Iterator[Write]:
     if "svg" in formats:
-        yield "tracks.svg", partial(writers.write_utf8, text=tracks.tracks_svg(plan))
+        yield "tracks.svg", partial(write_utf8, text=tracks_svg(plan))
     if "dxf" in formats:
-        yield "tracks.dxf", partial(writers.write_utf8, text=tracks.tracks_dxf(plan))
+        yield "tracks.dxf", partial(write_utf8, text=tracks_dxf(plan))
     if "png" in formats:
-        yield "mould.png", lambda path: drawings.draw_mould(plan, findings, path)
-        yield "tracks.png", lambda path: drawings.draw_tracks(plan, path)
+        yield "mould.png", lambda path: draw_mould(plan, findings, path)
+        yield "tracks.png", lambda path: draw_tracks(plan, path)
 
 
 def _document(
@@ -175,7 +175,7 @@ def _document(
     size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
     rim = settings.mould.floor_mm + plan.silicone_mm
     pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
-    bench = laying.document(plan, printed[0].mesh.volume() - pins)
+    bench = laying_guide.document(plan, printed[0].mesh.volume() - pins)
     return {
         "format": FORMAT,
         "files": list(files),

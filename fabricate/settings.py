@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -73,6 +73,10 @@ STEP_MM = 0.03
 """Width of the terraces of a tapered ridge: no wider than what printers place a line by."""
 
 
+_SECTIONS: dict[str, type[Any]] = {"mould": MouldSettings, "printer": PrinterSettings}
+_SECTIONS |= {"pad": PadSettings, "rules": RulesSettings}
+
+
 @dataclass(frozen=True)
 class FabricationSettings:
     """All that shapes a mould beside the morphology; of `[pad]` only the fibre and the deep family are used."""
@@ -83,23 +87,13 @@ class FabricationSettings:
     rules: RulesSettings = field(default_factory=RulesSettings)
 
     def __post_init__(self) -> None:
-        for name, model in (
-            ("mould", MouldSettings),
-            ("printer", PrinterSettings),
-            ("pad", PadSettings),
-            ("rules", RulesSettings),
-        ):
+        for name, model in _SECTIONS.items():
             instance(name, getattr(self, name), model)
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """The sections of one `pad.toml`."""
-        return cls(
-            spec.section(MouldSettings),
-            spec.section(PrinterSettings),
-            spec.section(PadSettings),
-            spec.section(RulesSettings),
-        )
+        return cls(*map(spec.section, _SECTIONS.values()))
 
     @property
     def flare_mm(self) -> float:

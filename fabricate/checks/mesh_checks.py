@@ -13,7 +13,7 @@ from design.common.errors import instance, real, whole
 from fabricate.mesh_files import read_mesh
 from fabricate.settings import DEFAULTS, PrinterSettings
 
-from . import self_intersections as intersections
+from . import self_intersections
 from .findings import Finding, verdict
 from .leaks import tight
 from .overhangs import overhang, undercut
@@ -115,8 +115,8 @@ def _watertight(surface: Surface) -> Finding:
 
 
 def _self_intersection(surface: Surface) -> Finding:
-    pairs = intersections.penetrating(surface.corners, _MOST_PAIRS)
-    places, count = spread(intersections.places(surface.corners, pairs)), len(pairs)
+    pairs = self_intersections.penetrating(surface.corners, _MOST_PAIRS)
+    places, count = spread(self_intersections.places(surface.corners, pairs)), len(pairs)
     many = f"{count} pairs of triangles" if count < _MOST_PAIRS else f"{count} pairs of triangles and more"
     message = f"{many} cut through each other" if count else "no triangles cut through each other"
     return verdict("self_intersection", count == 0, count, 0, message, places)

@@ -1,10 +1,11 @@
 """Whether a mould prints, demoulds and lets the fibres be laid: each check one finding with its places.
 
 Nothing here changes a mould or stops its making: a pass, warn or fail with what was measured is all there is. The
-checks here need the plan; those that a mesh of any origin goes through are in `soundness`.
+checks here need the plan; those that a mesh of any origin goes through are in `mesh_checks`.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -14,12 +15,13 @@ from shapely.geometry.base import BaseGeometry
 
 from design.criteria.rules import tight_bends
 from design.pad.morphology import Morphology
+from fabricate.mesh_files import read_mesh
 from fabricate.mould.assembly import plan_mesh
 from fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
 from fabricate.settings import DEFAULTS, FabricationSettings
 
-from . import mesh_checks as soundness
 from .findings import Finding, Status, as_places, graded, verdict
+from .mesh_checks import inspect_mesh
 from .thickness import least_line_mm
 
 _SPECK_MM2 = 0.01
@@ -32,6 +34,10 @@ _SLENDER, _TOO_SLENDER = 5.0, 10.0
 _NAMED = 8
 """More fibres than this are counted instead of named."""
 
+MESHES = (".stl", ".3mf")
+Inspected = tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]
+"""Vertices (n, 3) mm, triangles (m, 3) vertex numbers, and what the checks found."""
+
 
 def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Finding]:
     """Every check on the mould of a pad.
@@ -42,8 +48,20 @@ def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Fin
     return meshed(Plan(pad, settings))[-1]
 
 
-def meshed(plan: Plan) -> tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]:
-    """The mesh of a plan, vertices (n, 3) mm and triangles (m, 3) vertex numbers, and every check on both."""
+def inspect_file(source: Path, settings: FabricationSettings = DEFAULTS) -> Inspected:
+    """The mesh in a .stl or .3mf, or of the mould of the morphology in any other file, and every check on it.
+
+    Raises:
+        InputError: the file cannot be read, or settings contradict each other.
+    """
+    if source.suffix.lower() not in MESHES:
+        return meshed(Plan(Morphology.load(source), settings))
+    vertices, triangles = read_mesh(source)
+    return vertices, triangles, inspect_mesh(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)
+
+
+def meshed(plan: Plan) -> Inspected:
+    """The mesh of a plan, and every check on both."""
     from fabricate.mould.mesh import arrays
 
     vertices, triangles = arrays(plan_mesh(plan))
@@ -52,7 +70,7 @@ def meshed(plan: Plan) -> tuple[NDArray[np.floating], NDArray[np.integer], list[
 
 def inspect(plan: Plan, vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> list[Finding]:
     """Every check on a plan and its mesh: vertices (n, 3) mm, triangles (m, 3) vertex numbers."""
-    of_mesh = soundness.inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, unplanned=False)
+    of_mesh = inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, unplanned=False)
     return [*of_mesh, *check_plan(plan)]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from design.common.page.elements import PageSection, figures, folded, heading, html_pieces, paragraph, table
 
-from . import laying_guide as laying
+from .laying_guide import laying_page
 from .mould_view import packed, script, view
 
 _SHOWN_PLACES = 3
@@ -59,7 +59,7 @@ def _mould(folder: Path, document: Mapping[str, Any]) -> PageSection:
 
 def _bench(document: Mapping[str, Any]) -> PageSection:
     """How to make the pad, as `laying.md` has it: what to print and to mix, lengths to cut, the order of laying."""
-    guide, _, _ = laying.laying_page(document).partition("\n## Checks\n")  # which the mould's section has in full
+    guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section has in full
     return PageSection("Making the pad", list(html_pieces(guide)))
 
 

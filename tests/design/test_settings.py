@@ -7,7 +7,7 @@ import pytest
 from design import Contact, InputError, Spec
 from design.common.settings import commented_toml
 from design.settings import PadSettings, RulesSettings, SearchSettings
-from tests.limits import require_ends
+from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 

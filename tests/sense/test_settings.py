@@ -3,7 +3,7 @@
 import pytest
 
 from sense.settings import LocalizerSettings, RigSettings
-from tests.limits import require_ends
+from tests.helpers.limits import require_ends
 
 
 def test_the_defaults_are_those_of_the_published_bench() -> None:

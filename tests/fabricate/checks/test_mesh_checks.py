@@ -6,7 +6,7 @@ import trimesh.exchange.stl
 from manifold3d import Manifold, OpType
 
 from design.common.errors import InputError
-from fabricate.checks import mesh_checks as soundness
+from fabricate.checks import mesh_checks
 from fabricate.checks.mesh_checks import SOUND, check_mesh, inspect_mesh, sound
 from fabricate.settings import PrinterSettings
 from tests.fabricate.trays import CROSS, block, faults, inspected, line, near, prism, tray
@@ -28,7 +28,7 @@ class TestSound:
 
     @pytest.mark.parametrize(("most", "more"), [(4, True), (1000, False)])
     def test_pairs_that_cut_through_each_other_are_counted_up_to_a_limit(self, monkeypatch, most, more):
-        monkeypatch.setattr(soundness, "_MOST_PAIRS", most)
+        monkeypatch.setattr(mesh_checks, "_MOST_PAIRS", most)
         crossing = _together(self.box, block(2, 30, 2, at=(0.3, 0.2, 0.1)))
         found = {f.name: f for f in sound(*crossing)}["self_intersection"]
         assert found.status == "fail"

@@ -12,7 +12,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense.live.page_server import HOST, LivePage
-from tests.chromium import CHROMIUM, Chromium
+from tests.helpers.chromium import CHROMIUM, Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
 VIEW = {

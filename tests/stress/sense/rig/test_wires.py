@@ -15,7 +15,7 @@ from sense.rig.ur5 import messages as ur5_wire
 from sense.rig.ur5 import rtde_frames as ur_frames
 from sense.rig.ur5.rtde_reader import VARIABLES, RtdeReader
 from tests.stress.clock import ends_in_time, few
-from tests.stress.sense_cases import seeds
+from tests.stress.sense.cases import seeds
 
 SETTINGS = framing.BoardSettings(1_000_000, 0b1111, 4)
 FRAMES = (

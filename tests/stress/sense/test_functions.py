@@ -12,7 +12,7 @@ from design import Morphology
 from sense import settings as sense_settings
 from sense.rig.planning.press_plan import PressPlan
 from tests.stress.clock import few
-from tests.stress.sense_cases import (
+from tests.stress.sense.cases import (
     EXTREMES,
     ODD,
     TINY,

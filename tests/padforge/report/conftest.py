@@ -1,0 +1,43 @@
+"""A folder with what every stage leaves, and the report on it."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from design.common.figures import save_figure
+from design.common.files import provenance
+from design.report.plan_drawing import draw_plan
+from design.settings import Contact
+from fabricate import build
+from padforge import write_report
+from tests.padforge.report.documents import PAD, calibration_document, design_document, study_document, written
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what every stage leaves, and a study."""
+    folder = tmp_path_factory.mktemp("made")
+    PAD.save(folder / "morphology.json")
+    build(PAD, folder, ["stl", "png"], inputs=[folder / "morphology.json"])
+    save_figure(draw_plan(PAD, Contact()), folder / "design.svg")
+    written(folder / "design.json", design_document())
+    written(folder / "calibration.json", calibration_document())
+    source = {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}}
+    made_by = provenance("padforge sense record")
+    start = {"format": "padforge-recording/1", "fibres": 4, "source": source, "provenance": made_by}
+    written(folder / "recording" / "start.json", start)
+    written(folder / "studies" / "drift.json", study_document())
+    shutil.copy(folder / "tracks.png", folder / "studies" / "drift.png")
+    return folder
+
+
+@pytest.fixture
+def pad(made: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be changed."""
+    return shutil.copytree(made, tmp_path / "pad")
+
+
+@pytest.fixture(scope="session")
+def page(made: Path) -> Path:
+    return write_report(made)

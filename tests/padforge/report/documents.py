@@ -1,0 +1,62 @@
+"""What the stages leave for a report, made up."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from design.common.files import provenance
+from design.pad.morphology import Morphology
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+
+HOSTILE = '</script><img src="x" onerror="document.title=1"> & <b>'
+PAD = Morphology.random(2, 2, seed=1)
+
+
+def written(path: Path, document: dict) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(document))
+
+
+def design_document() -> dict:
+    used = {"pad": PadSettings(grid=2), "contact": Contact(), "search": SearchSettings(), "rules": RulesSettings()}
+    settings = {name: section.model_dump(mode="json") for name, section in used.items()}
+    return {
+        "format": "padforge-design/1",
+        "terms": {"ambiguity_lost_0": 0.1, "ambiguity_lost_1": 0.2, "information": 9.5},
+        "violations": [],
+        "provenance": provenance("padforge design", 3) | {"settings": settings},
+    }
+
+
+def errors(by_subset: dict[tuple[int, ...], float]) -> dict:
+    rows = []
+    for lost in sorted({len(each) for each in by_subset}):
+        means = [mean for each, mean in by_subset.items() if len(each) == lost]
+        names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm", "within_r50", "within_r90")
+        values = dict.fromkeys(names, 0.5) | {"mean_mm": float(np.mean(means)), "max_mm": max(means)}
+        rows.append({"lost": lost, "subsets": len(means), **values})
+    return {"errors": rows, "by_subset": [{"lost": list(lost), "mean_mm": mean} for lost, mean in by_subset.items()]}
+
+
+def calibration_document() -> dict:
+    found = {(): 1.0, (0,): 1.5, (1,): 4.25, (2,): 1.25, (3,): 2.0}
+    pairs = {(one, two): found[one,] + found[two,] for two in range(4) for one in range(two)}
+    return {
+        "format": "padforge-calibration/1",
+        **errors(found | pairs),
+        "split": "random",
+        "test_presses": 12,
+        "idle_share": [0.1, 0.2, 0.3, 0.4],
+        "provenance": provenance("padforge sense calibrate", 0),
+    }
+
+
+def study_document() -> dict:
+    return {
+        "format": "padforge-study-drift/1",
+        "title": "Drift",
+        "text": ["First.", "Second."],
+        "rows": [{"pad": "square", "error": 1.25, "kept": True}, {"pad": "ours", "error": None, "kept": False}],
+        "provenance": provenance("padforge study drift"),
+    }

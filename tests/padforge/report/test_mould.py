@@ -1,0 +1,146 @@
+"""The mould in the report: its mesh, and how a browser draws and turns it."""
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from fabricate.report.mould_view import Packed, packed
+from padforge import write_report
+from tests.helpers.chromium import CHROMIUM, SOFTWARE_GL, Chromium
+
+
+def unpacked(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) mm and triangles (m, 3) of the mesh in a page."""
+    found = re.search(r'<script type="application/json" id="mould-mesh">(.*?)</script>', text)
+    assert found
+    data = json.loads(found[1])
+    steps = np.frombuffer(base64.b64decode(data["vertices"]), "<u2").reshape(-1, 3)
+    kind = "<u4" if data["wide"] else "<u2"
+    triangles = np.frombuffer(base64.b64decode(data["triangles"]), kind).reshape(-1, 3)
+    return np.array(data["low"]) + steps / 65535 * np.array(data["size"]), triangles
+
+
+def test_the_mesh_in_the_page_is_the_mould(made: Path, page: Path) -> None:
+    vertices, triangles = unpacked(page.read_text())
+    mould = trimesh.load_mesh(made / "mould.stl", process=False)
+    half_step = np.ptp(mould.vertices, axis=0) / 65535 / 2
+    assert (np.abs(vertices[triangles] - mould.triangles).max(axis=(0, 1)) <= 1.001 * half_step).all()
+    assert len(vertices) < len(mould.vertices) / 4
+
+
+def test_a_mesh_of_many_vertices_has_wide_numbers(tmp_path: Path) -> None:
+    sphere = trimesh.creation.uv_sphere(radius=30, count=[257, 257])
+    sphere.export(tmp_path / "mould.stl")
+    mesh = packed(tmp_path / "mould.stl", most_bytes=10**8)
+    assert mesh
+    assert mesh.triangles.max() + 1 == len(mesh.vertices) > 65536
+    assert volume(mesh) == pytest.approx(sphere.volume, rel=1e-4)
+
+
+def test_a_mesh_that_is_too_large_is_made_coarser_or_left_out(made: Path, pad: Path, monkeypatch) -> None:
+    whole = packed(made / "mould.stl")
+    assert whole
+    assert whole.tolerance_mm == 0
+    coarse = packed(made / "mould.stl", most_bytes=whole.nbytes * 4 // 5)
+    assert coarse
+    assert coarse.tolerance_mm > 0
+    assert coarse.nbytes <= whole.nbytes * 4 // 5
+    assert volume(coarse) == pytest.approx(volume(whole), rel=0.01)
+    assert packed(made / "mould.stl", most_bytes=1000) is None
+    monkeypatch.setattr("fabricate.report.sections.packed", lambda path: None)
+    text = write_report(pad).read_text()
+    assert "mould.stl is too large to be turned" in text
+    assert "<canvas" not in text
+
+
+def volume(mesh: Packed) -> float:
+    vertices = mesh.low_mm + mesh.vertices / 65535 * mesh.size_mm
+    return float(trimesh.Trimesh(vertices, mesh.triangles, process=False).volume)
+
+
+@pytest.fixture
+def chromium(tmp_path: Path) -> Iterator[Chromium]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    with Chromium(tmp_path / "profile", *SOFTWARE_GL) as chromium:
+        yield chromium
+
+
+def changed(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of pixels that differ clearly."""
+    return float((np.abs(one - other).max(axis=-1) > 20).mean())
+
+
+def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) -> None:
+    chromium.open(page.as_uri())
+    assert chromium.ask("document.getElementById('mould-view').hidden") is False
+    first = chromium.picture("canvas")
+    blue = (first[..., 2] - first[..., 0] > 60).sum()
+    orange = (first[..., 0] - first[..., 2] > 100).sum()
+    assert min(blue, orange) > 200
+    chromium.ask("document.querySelector('canvas').focus()")
+    seen = [first]
+    for key in ("ArrowLeft", "ArrowUp", "+"):
+        chromium.press(key)
+        seen.append(chromium.picture("canvas"))
+        assert changed(seen[-1], seen[-2]) > 0.02
+    chromium.press("0")
+    assert changed(chromium.picture("canvas"), first) < 0.001
+    box = chromium.ask("(({x, y, width, height}) => [x + width / 2, y + height / 2])"
+                       "(document.querySelector('canvas').getBoundingClientRect())")  # fmt: skip
+    for kind, right in (("mousePressed", 0), ("mouseMoved", 90), ("mouseReleased", 90)):
+        at = {"x": box[0] + right, "y": box[1], "button": "left", "buttons": 1, "clickCount": 1}
+        chromium.call("Input.dispatchMouseEvent", type=kind, **at)
+    chromium.wait_for_frames()
+    assert changed(chromium.picture("canvas"), first) > 0.02
+
+    chromium.open(page.as_uri(), width=360, height=740)
+    assert chromium.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
+    assert chromium.ask("document.querySelectorAll('details').forEach(each => each.open = true)") is None
+    assert chromium.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
+    assert chromium.complaints == []
+    assert {address.split(",")[0][:20] for address in chromium.requests if address != page.as_uri()} <= {
+        "data:image/png;base6",
+        "data:image/svg+xml;b",
+    }
+    assert (
+        chromium.ask("performance.getEntriesByType('resource').filter(each => !each.name.startsWith('data:')).length")
+        == 0
+    )
+
+    # On paper there is the picture instead, and nothing is folded.
+    chromium.call("Emulation.setEmulatedMedia", media="print")
+    assert chromium.ask("document.querySelector('canvas').getClientRects().length") == 0
+    assert chromium.ask("document.querySelector('img[alt*=\"from above\"]').getClientRects().length") == 1
+    chromium.ask("dispatchEvent(new Event('beforeprint'))")
+    assert chromium.ask("document.querySelectorAll('details:not([open])').length") == 0
+    chromium.call("Emulation.setEmulatedMedia", media="")
+
+    # A context that is lost comes back.
+    chromium.ask(
+        "void (lose = document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context'))"
+    )
+    hidden = "new Promise(done => setTimeout(() => done(document.getElementById('mould-view').hidden), 100))"
+    chromium.ask("lose.loseContext()")
+    assert chromium.ask(hidden) is True
+    chromium.ask("lose.restoreContext()")
+    assert chromium.ask(hidden) is False
+    assert len(np.unique(chromium.picture("canvas").reshape(-1, 3), axis=0)) > 100
+
+
+def test_without_webgl_the_picture_stands_there(tmp_path: Path, page: Path) -> None:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    with Chromium(tmp_path / "profile", "--disable-gpu", "--disable-3d-apis") as chromium:
+        chromium.open(page.as_uri())
+        assert chromium.ask("document.getElementById('mould-view').hidden") is True
+        assert chromium.ask("document.querySelector('canvas').getClientRects().length") == 0
+        picture = "document.querySelector('img[alt*=\"from above\"]')"
+        assert chromium.ask(f"{picture}.complete && {picture}.naturalWidth > 0 && {picture}.clientWidth > 200") is True
+        assert chromium.complaints == []

@@ -1,0 +1,152 @@
+"""The report: one page that holds everything, lets nothing in, and is honest about files it cannot read."""
+
+import json
+import re
+import shutil
+from html import escape
+from pathlib import Path
+
+import pytest
+
+from design.common.errors import InputError
+from design.common.files import provenance
+from padforge import write_report
+from tests.padforge.report.documents import HOSTILE, design_document, errors, study_document, written
+
+MOST_PAGE_BYTES = 8_000_000
+
+
+def test_every_stage_has_its_section_and_a_link_to_it(page: Path) -> None:
+    text = page.read_text()
+    titles = re.findall(r'<h2 id="(.*?)">(.*?)</h2>', text)
+    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Robustness", "Studies", "Provenance"]
+    assert [title for _, title in titles] == names
+    assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
+    assert text.count("data:image/") == 4  # plan, mould, tracks, and the study's figure
+    assert page.stat().st_size < MOST_PAGE_BYTES
+
+
+def test_nothing_comes_from_elsewhere_and_only_known_scripts_run(page: Path) -> None:
+    text = page.read_text()
+    assert "http://" not in text
+    assert "https://" not in text
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="(.*?)"', text)
+    assert policy
+    assert policy[1].startswith("default-src 'none'")
+    assert "script-src 'sha256-" in policy[1]
+    assert "script-src 'unsafe" not in policy[1]
+
+
+def test_text_from_files_is_escaped(pad: Path) -> None:
+    design, mould, study = design_document(), json.loads((pad / "fabrication.json").read_text()), study_document()
+    design["violations"] = [{"rule": HOSTILE, "fibres": [HOSTILE], "measured": 1, "limit": 2, "place_mm": None}]
+    design["provenance"] |= {"command": HOSTILE, "inputs": {HOSTILE.replace("/", ""): HOSTILE}}
+    design["terms"][HOSTILE] = HOSTILE
+    mould["findings"][0] |= {"message": HOSTILE, "name": HOSTILE}
+    mould["silicone"]["name"] = HOSTILE
+    study |= {"title": HOSTILE, "text": [HOSTILE], "rows": [{HOSTILE: HOSTILE}]}
+    for name, document in (("design", design), ("fabrication", mould), ("studies/drift", study)):
+        written(pad / f"{name}.json", document)
+    text = write_report(pad.rename(pad.with_name("<b>&"))).read_text()
+    assert text.count(escape(HOSTILE)) >= 10
+    assert "<img src=" not in text
+    assert "<b>&" not in text
+    assert text.count("<script") == text.count("</script>") == 3
+
+
+def test_rules_and_checks_have_their_verdicts(pad: Path) -> None:
+    design, mould = design_document(), json.loads((pad / "fabrication.json").read_text())
+    broken = {"rule": "min_gap_mm", "fibres": [1, 2], "measured": 0.25, "limit": 0.8, "place_mm": [1.0, 2.0]}
+    design["violations"] = [broken]
+    mould["findings"][0] |= {"status": "warn", "message": "thin", "places_mm": [[k, 0.5] for k in range(5)]}
+    written(pad / "design.json", design)
+    written(pad / "fabrication.json", mould)
+    text = write_report(pad).read_text()
+    assert re.search(r'<td class="fail">fail</td><td.*?>min_gap_mm</td>', text)
+    assert re.search(r'<td class="pass">pass</td><td.*?>border_mm</td>', text)
+    assert "(1.0, 2.0)" in text
+    assert '<td class="warn">warn</td><td>thin</td>' in text.replace(' class="short"', "")
+    assert "(0.0, 0.5) (1.0, 0.5) (2.0, 0.5) and 2 more" in text
+
+
+def test_the_laying_guide_is_that_of_the_bench(made: Path, page: Path) -> None:
+    document, text = json.loads((made / "fabrication.json").read_text()), page.read_text()
+    for fibre in document["fibres"]:
+        assert f"{fibre['cut_mm']:.1f} mm</td>" in text
+    assert f"The mould holds {document['silicone_volume_ml']:.1f} ml" in text
+    for line in (made / "laying.md").read_text().split("\n"):
+        if line.startswith(("1. ", "2. ")):
+            assert escape(line[3:]) in text
+
+
+def test_the_loss_that_hurts_most_is_named(page: Path) -> None:
+    text = page.read_text()
+    assert "of one fibre, 2 (4.25 mm); of two fibres, 2 and 4 (6.25 mm)" in text
+    assert "<title>without 2 and 4: 6.25 mm</title>" in text
+    assert text.count("<title>without ") == 4 + 6
+
+
+def test_a_study_of_robustness_takes_the_place_of_the_calibration(pad: Path) -> None:
+    ways = {"one network": errors({(): 1.0, (0,): 7.5, (1,): 3.0}), "retrained": errors({(): 1.0, (0,): 2, (1,): 8.5})}
+    document = {"format": "padforge-robustness/1", "ways": ways, "test_presses": 9, "provenance": provenance("x")}
+    written(pad / "robustness.json", document)
+    text = write_report(pad).read_text()
+    assert "of one fibre, 1 (7.50 mm)" in text
+    assert "of one fibre, 2 (8.50 mm)" in text
+    assert "4.25 mm" not in text
+
+
+def test_provenance_says_which_inputs_are_the_ones_here(pad: Path) -> None:
+    assert "(the one here)" in write_report(pad).read_text()
+    (pad / "morphology.json").write_text("{}")
+    assert "(not the one here)" in write_report(pad).read_text()
+
+
+@pytest.mark.parametrize("name", ["design", "fabrication", "calibration", "studies/drift"])
+def test_a_stage_alone_is_enough(made: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / "studies").mkdir()
+    shutil.copy(made / f"{name}.json", tmp_path / f"{name}.json")
+    text = write_report(tmp_path).read_text()
+    assert "Provenance" in text
+    assert "<figure><img" not in text
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text("[1]")
+    with pytest.raises(InputError, match=r"no design\.json"):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+DAMAGED = {
+    "design.json": ['{"format": "padforge-design/1", "terms": {}}', '{"format": "padforge-design/2"}', "{", "[]"],
+    "fabrication.json": ['{"format": "padforge-fabrication/1", "findings": []}'],
+    "calibration.json": ['{"format": "padforge-calibration/1", "errors": []}'],
+    "robustness.json": ['{"format": "padforge-robustness/1", "ways": {"x": {"by_subset": [{"lost": [1]}]}}}'],
+    "recording/start.json": ['{"format": "padforge-recording/1", "fibres": 4}'],
+    "mould.stl": ["solid nothing", ""],
+    "mould.png": ["", "no picture"],
+    "design.svg": ["<svg", ""],
+    "studies/drift.json": [
+        "{",
+        '{"format": "padforge-study-drift/1"}',
+        '{"format": "padforge-study-drift/1", "title": "a", "text": "b", "rows": []}',
+        '{"format": "padforge-study-drift/1", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}',
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "content"), [(name, text) for name, texts in DAMAGED.items() for text in texts])
+def test_a_damaged_file_is_named_in_one_line(pad: Path, name: str, content: str) -> None:
+    (pad / name).write_text(content)
+    with pytest.raises(InputError) as told:
+        write_report(pad)
+    assert str(told.value).startswith(f"{pad / name}: ")
+    assert "\n" not in str(told.value)
+
+
+def test_a_torn_picture_is_named(pad: Path) -> None:
+    whole = (pad / "mould.png").read_bytes()
+    (pad / "mould.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"mould\.png: not a picture"):
+        write_report(pad)
