@@ -11,7 +11,7 @@ import pytest
 
 from design import Contact, Morphology, signals, signals_sparse
 from design.common import profiling
-from design.optimisers.search import search
+from design.optimisers.search import SearchRun, search
 from design.settings import PadSettings, RulesSettings, SearchSettings
 from fabricate import build
 from sense import RigSettings, calibrate, simulate
@@ -117,12 +117,12 @@ def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     settings = SearchSettings(knots=1, starts=2, steps=2, lost=0)
     asked = (PadSettings(grid=1), Contact(), settings, RulesSettings(enforce=False))
     with profiling.profiled() as profile:
-        search(*asked, keep_in=tmp_path / "search")
+        search(*asked, run=SearchRun(keep_in=tmp_path / "search"))
     assert profile.counts["starts"] == [2, 2]
     monkeypatch.setattr("design.common.checkpoints.Checkpoints.clear", lambda self: None)
-    first = search(*asked, keep_in=tmp_path / "search")
+    first = search(*asked, run=SearchRun(keep_in=tmp_path / "search"))
     with profiling.profiled() as profile:
-        again = search(*asked, keep_in=tmp_path / "search", resume=True)
+        again = search(*asked, run=SearchRun(keep_in=tmp_path / "search", resume=True))
     assert profile.counts["starts"] == [0, 2]
     np.testing.assert_array_equal(first.morphology.knots, again.morphology.knots)
 

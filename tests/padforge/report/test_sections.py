@@ -86,10 +86,10 @@ def test_the_loss_that_hurts_most_is_named(page: Path) -> None:
     assert text.count("<title>without ") == 4 + 6
 
 
-def test_a_study_of_robustness_takes_the_place_of_the_calibration(pad: Path) -> None:
+def test_a_study_of_lost_fibres_takes_the_place_of_the_calibration(pad: Path) -> None:
     ways = {"one network": errors({(): 1.0, (0,): 7.5, (1,): 3.0}), "retrained": errors({(): 1.0, (0,): 2, (1,): 8.5})}
-    document = {"format": "padforge-robustness/1", "ways": ways, "test_presses": 9, "provenance": provenance("x")}
-    written(pad / "robustness.json", document)
+    document = {"format": "padforge-fibre-loss/1", "ways": ways, "test_presses": 9, "provenance": provenance("x")}
+    written(pad / "fibre_loss.json", document)
     text = write_report(pad).read_text()
     assert "of one fibre, 1 (7.50 mm)" in text
     assert "of one fibre, 2 (8.50 mm)" in text
@@ -122,7 +122,7 @@ DAMAGED = {
     "design.json": ['{"format": "padforge-design/1", "terms": {}}', '{"format": "padforge-design/2"}', "{", "[]"],
     "fabrication.json": ['{"format": "padforge-fabrication/1", "findings": []}'],
     "calibration.json": ['{"format": "padforge-calibration/1", "errors": []}'],
-    "robustness.json": ['{"format": "padforge-robustness/1", "ways": {"x": {"by_subset": [{"lost": [1]}]}}}'],
+    "fibre_loss.json": ['{"format": "padforge-fibre-loss/1", "ways": {"x": {"by_subset": [{"lost": [1]}]}}}'],
     "recording/start.json": ['{"format": "padforge-recording/1", "fibres": 4}'],
     "mould.stl": ["solid nothing", ""],
     "mould.png": ["", "no picture"],

@@ -1,0 +1,87 @@
+"""Commands in the documentation and in helps parse."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from inspect import cleandoc
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from padforge import cli
+from tests.docs.pages import BLOCK, PAGES, relative
+
+
+def commands(text: str) -> Iterator[tuple[str, bool]]:
+    """Every `padforge ...` of a page: the lines of its shell blocks, and, where it need not be whole, of the text."""
+    for block in BLOCK.finditer(text):
+        if block["language"] == "sh":
+            lines = block["body"].replace("\\\n", " ").splitlines()
+            yield from ((line, True) for line in lines if re.search(r"(^|[\s/])padforge ", f"{line} "))
+    yield from ((found, False) for found in re.findall(r"`(padforge [^`]+)`", BLOCK.sub("", text)))
+
+
+def arguments(command: str) -> Iterator[list[str]]:
+    """The arguments of every call of padforge in a line of shell; `one|other` stands for two calls, [X] for none."""
+    words = shlex.shlex(command, posix=True, punctuation_chars="&;>")
+    words.whitespace_split = True
+    calls: list[list[str]] = [[]]
+    for word in words:
+        if set(word) <= set("&;>|") or word == "2>":
+            calls.append([])
+        else:
+            calls[-1].append(word)
+    for call in calls:
+        if call and call[0].rpartition("/")[2] == "padforge":
+            choices = [word.split("|") for word in call[1:] if not re.fullmatch(r"\[.*\](\.\.\.)?", word)]
+            yield from map(list, product(*choices))
+
+
+def every(command: click.Command, name: str = "padforge") -> Iterator[tuple[str, click.Command]]:
+    yield name, command
+    for word, each in command.commands.items() if isinstance(command, click.Group) else ():
+        yield from every(each, f"{name} {word}")
+
+
+@pytest.fixture
+def parser(monkeypatch: pytest.MonkeyPatch) -> click.Command:
+    """The command line, of which only the parser is left: no command does anything, no file has to exist."""
+    for _, command in every(cli):
+        monkeypatch.setattr(command, "callback", lambda *_, **__: None)
+
+    def convert(_: click.Path, value: Any, *__: Any) -> Path:
+        return Path(value)
+
+    monkeypatch.setattr(click.Path, "convert", convert)
+    return cli
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_every_command_parses(page: Path, parser: click.Command) -> None:
+    for command, whole in commands(page.read_text(encoding="utf-8")):
+        for call in arguments(command):
+            try:
+                parser.main(call, standalone_mode=False, prog_name="padforge")
+            except click.ClickException as error:
+                if not whole and isinstance(error, click.MissingParameter | click.exceptions.NoArgsIsHelpError):
+                    continue
+                pytest.fail(f"{relative(page)}: {command}: {error.format_message()}")
+
+
+@pytest.mark.parametrize(("name", "command"), every(cli), ids=lambda value: value if isinstance(value, str) else "")
+def test_help_has_examples_that_parse(name: str, command: click.Command, parser: click.Command) -> None:
+    lines = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
+    assert [line for line in lines if line.startswith(name)]
+    for line in lines:
+        example, _, _ = line.partition("  ")  # what follows explains it
+        for call in arguments(example):
+            parser.main(call, standalone_mode=False, prog_name="padforge")
+
+
+def test_the_parser_refuses_what_does_not_exist(parser: click.Command) -> None:
+    for wrong in ("padforge desing", "padforge design --no-such", "padforge sense locate x", "padforge init a b"):
+        with pytest.raises(click.ClickException):
+            parser.main(next(arguments(wrong)), standalone_mode=False)
