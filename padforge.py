@@ -207,11 +207,12 @@ def _check_ahead(spec: "Spec", out: Path) -> None:
 
 def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     """All stages into `out`, each with its summary on stdout; the exit code: 0, 1 if a rule or check fails, or 130."""
-    from design.cli import run_search, search_lines
+    from design.report.files import run_search, search_lines
     from fabricate import FabricationSettings, build
     from fabricate.cli import mould_lines
-    from sense.cli.calibration import calibration_lines, run_calibration
-    from sense.cli.rig import run_recording
+    from sense.cli.calibration import run_calibration
+    from sense.report.calibration_results import calibration_lines
+    from sense.rig.operation import record_simulated
     from sense.recordings.recorder import refuse_replacing
 
     seeds = {"seed": seed}
@@ -226,7 +227,7 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     refuse_replacing(recorded)
     if recorded.exists():
         shutil.rmtree(recorded)
-    recording = run_recording(spec, found.morphology, recorded, seeds, written)
+    recording = record_simulated(spec, found.morphology, recorded, seeds, written)
     click.echo(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {recorded}")
     calibration = run_calibration(spec, recording, out, seeds)
     click.echo("\n".join(f"  {line}" for line in calibration_lines(calibration)))
@@ -250,7 +251,7 @@ def write_report(folder: Path) -> Path:
         ("fabrication", folder / "fabrication.json", fabrication_sections),
         ("recording", folder / "recording" / "start.json", sensed.recording_sections),
         ("calibration", folder / "calibration.json", sensed.calibration_sections),
-        ("robustness", folder / "robustness.json", sensed.robustness_sections),
+        ("fibre-loss", folder / "fibre_loss.json", sensed.fibre_loss_sections),
     )
     sections: list[PageSection] = []
     origins: list[list[object]] = []

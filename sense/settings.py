@@ -1,14 +1,18 @@
 """The sections of `pad.toml` that sense owns: the rig and the localizer."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
+from pydantic_core import PydanticCustomError
 
 from design.common.settings import Settings
 
 Features = Literal["full", "causal", "early", "published"]
 Method = Literal["masked", "published"]
 Split = Literal["random", "chronological"]
+
+PLANS = ("uniform", "grid", "boustrophedon", "adaptive")
 
 
 def _unknown(value: object) -> object:
@@ -17,6 +21,12 @@ def _unknown(value: object) -> object:
 
 def _tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
+
+
+def _plan(value: str) -> str:
+    if value not in PLANS and not value.lower().endswith(".csv"):
+        raise PydanticCustomError("plan", "expected uniform, grid, boustrophedon, adaptive or a .csv file of places")
+    return value
 
 
 Unknown = PlainSerializer(lambda value: "unknown" if value is None else value)
@@ -37,8 +47,10 @@ class RigSettings(Settings):
     """
 
     presses: int = Field(default=1500, ge=1, le=1_000_000, description="presses in a recording")
-    plan: Literal["uniform", "grid", "boustrophedon", "adaptive"] = Field(
-        default="uniform", description="where they go; adaptive: where a localizer is least certain (--model)"
+    plan: Annotated[str, AfterValidator(_plan)] = Field(
+        default="uniform",
+        max_length=4096,
+        description="where they go: uniform, grid, boustrophedon, adaptive (by --model), or a .csv file of places",
     )
     rate_hz: float = Field(default=13.3, ge=0.1, le=10_000, description="readings per second")
     readings_per_press: int = Field(
@@ -80,6 +92,11 @@ class RigSettings(Settings):
     press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
     acceleration_mm_s2: float = Field(default=500.0, gt=0, le=3000, description="acceleration, mm/s^2")
     max_force_n: float = Field(default=60.0, gt=0, le=250, description="force at which the arm is stopped, N")
+
+    @property
+    def plan_file(self) -> Path | None:
+        """The file of places that `plan` names, None where it is a kind of plan."""
+        return None if self.plan in PLANS else Path(self.plan)
 
 
 class LocalizerSettings(Settings):

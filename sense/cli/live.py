@@ -59,6 +59,7 @@ def live(
     --replay RECORDING   what was recorded
 
     A fibre found bad is left out from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
+    Fibres are numbered from 1; in JSON "fibres" and "lost" hold indices, from 0.
     """
     from sense.live.page_server import LivePage
     from sense.live.pipeline import Live
@@ -104,9 +105,8 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
 
         return simulated(model)
     from sense.rig.arduino.driver import Arduino
+    from sense.rig.arduino.serial_link import port_of
     from sense.settings import RigSettings
-
-    from .rig import port_of
 
     options = load_spec(spec).section(RigSettings)
     return Arduino(port_of(options), options.converter_rate_hz, localizer.fibres)
@@ -114,9 +114,10 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
 
 def _health(model: Path) -> "HealthModel | None":
     """What was learnt of a healthy pad, if it was."""
-    from sense.health.health_model import FELT, HealthModel, files_of
+    from sense.health.health_model import FELT, HealthModel
+    from sense.health.model_folder import has_health
 
-    if not files_of(model, FELT)[0].exists():
+    if not has_health(model, FELT):
         click.echo(f"{model}: health was not learnt, so no fibre will be found bad", err=True)
         return None
     return HealthModel.load(model, FELT)
@@ -154,7 +155,7 @@ def view_lines(view: dict[str, Any]) -> list[str]:
     return [
         "pressed" if view["pressed"] else "waiting for a press",
         latest["text"] if latest else "no press yet",
-        *(f"fibre {c:<3} {_bar(fibre['swing'] or 0.0)} {fibre['state']}" for c, fibre in enumerate(view["fibres"])),
+        *(f"fibre {c:<3} {_bar(fibre['swing'] or 0.0)} {fibre['state']}" for c, fibre in enumerate(view["fibres"], 1)),
         *view["findings"],
     ]
 

@@ -2,12 +2,17 @@
 
 import click
 
-from .analysis import recalibrate, robustness, size_curve
+from .analysis import fibre_loss, learning_curve, recalibrate
 from .calibration import calibrate, evaluate
 from .live import live
 from .locate import health, locate
 from .recordings import export, import_
 from .rig import doctor, record
+
+COMMANDS = (
+    *(import_, export, calibrate, evaluate, locate, health, record, doctor, live),
+    *(recalibrate, fibre_loss, learning_curve),
+)
 
 
 @click.group()
@@ -21,7 +26,5 @@ def sense() -> None:
     """
 
 
-for command in (import_, export, calibrate, evaluate, locate, health):
-    sense.add_command(command)
-for command in (record, doctor, live, recalibrate, robustness, size_curve):
+for command in COMMANDS:
     sense.add_command(command)

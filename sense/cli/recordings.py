@@ -4,15 +4,16 @@ from pathlib import Path
 
 import click
 
-from .options import FILE, read_recording, recording_argument, recording_out_option
-from .rig import recording_line
+from design.common.command_line import out_option, pad_folder
+
+from .options import FILE, read_recording, recording_argument, recording_line
 
 
 @click.command("import")
 @click.argument("file", type=FILE)
-@recording_out_option("out/NAME/recording for NAME.mat")
+@out_option(what="Folder of the recording; must be new or empty")
 def import_(file: Path, out: Path | None) -> None:
-    """Make a recording of FILE, a published .mat, a .csv or a .h5 that export wrote.
+    """Make a recording of FILE, a published .mat, a .csv or a .h5 that export wrote: of NAME.csv out/NAME/recording.
 
     \b
     padforge sense import readings.csv --out out/lab/recording
@@ -25,7 +26,7 @@ def import_(file: Path, out: Path | None) -> None:
     from sense.recordings.import_export import import_file
     from sense.recordings.recorder import refuse_existing
 
-    folder = out or Path("out") / file.stem / "recording"
+    folder = out or pad_folder(file) / "recording"
     refuse_existing(folder)
     recording = import_file(file)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))

@@ -38,7 +38,7 @@ def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSe
 def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """Errors of a `calibration.json` in `folder`, by lost fibres and by place, and how often each fibre is idle.
 
-    Where no `robustness.json` says more, what the loss of which fibres does follows.
+    Where no `fibre_loss.json` says more, what the loss of which fibres does follows.
 
     Raises:
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
@@ -82,11 +82,11 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
             *([(f"{last['mean_mm']:.2f} mm", "mean error, " + _lost(last["lost"]))] if len(rows) > 1 else []),
         ],
     )
-    return [section, *([] if (folder / "robustness.json").exists() else robustness_sections(folder, document))]
+    return [section, *([] if (folder / "fibre_loss.json").exists() else fibre_loss_sections(folder, document))]
 
 
-def robustness_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """What the loss of which fibres does, from a `robustness.json` or `calibration.json`; none if none was lost.
+def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+    """What the loss of which fibres does, from a `fibre_loss.json` or `calibration.json`; none if none was lost.
 
     Raises:
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
@@ -105,14 +105,14 @@ def robustness_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
     if "" not in found:
         rows = [[name, *_errors(row)] for name, way in ways.items() for row in way["errors"]]
         head = ["way", "lost", "sets", "mean (mm)", "std", "worst"]
-        picture = figures([(folder / "robustness.png", "Error by number of lost fibres; every dot is a set of them.")])
+        picture = figures([(folder / "fibre_loss.png", "Error by number of lost fibres; every dot is a set of them.")])
         body = [
             paragraph(f"Errors on {document['test_presses']} presses never trained on, without every set of fibres."),
             table(head, rows),
             picture,
             *body,
         ]
-    return [PageSection("Robustness", body)]
+    return [PageSection("Lost fibres", body)]
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:

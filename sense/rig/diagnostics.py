@@ -58,7 +58,7 @@ def examine_converter(
         Diagnosis("rate", "ok" if abs(rate / wanted - 1) < 0.01 else "fail", f"{rate:.1f} Hz of {wanted:g}"),
         Diagnosis("samples", "fail" if missing else "ok", f"{missing} of {len(times) + missing} lost"),
         Diagnosis("latency", "ok" if delay < _LATE_S else "warn", f"{1e3 * delay:.1f} ms from sample to program"),
-        *(_channel(number, column, supply_v) for number, column in enumerate(volts.T)),
+        *(_channel(number, column, supply_v) for number, column in enumerate(volts.T, start=1)),
     ]
 
 

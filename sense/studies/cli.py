@@ -15,6 +15,7 @@ from design.common.command_line import (
     load_spec,
     out_option,
     progress,
+    seed_option,
     show_result,
     spec_option,
 )
@@ -50,7 +51,13 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
     def decorate(make: "Callable[..., Study]") -> click.Command:
         @wraps(make)
         def command(
-            names: tuple[str, ...], seed: int, jobs: int | None, resume: bool, out: Path, as_json: bool, **options: Any
+            names: tuple[str, ...],
+            seed: int | None,
+            jobs: int | None,
+            resume: bool,
+            out: Path,
+            as_json: bool,
+            **options: Any,
         ) -> None:
             from design.common.files import refuse_unwritable
 
@@ -59,7 +66,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             refuse_unwritable(out)
             with progress() as bar:
                 task = bar.add_task(name, total=None, note="pads")
-                made = make(names, seed=seed, **options)
+                made = make(names, seed=seed or 0, **options)
 
                 def report(done: int, total: int, last: str) -> None:
                     bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
@@ -75,7 +82,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
 
         options = (
             click.argument("names", metavar=f"[{of}]...", nargs=-1),
-            click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Seed of random choices."),
+            seed_option,
             click.option("--jobs", type=click.IntRange(1, 256), help="Tasks at once (default: one a core)."),
             click.option("--resume", is_flag=True, help="Go on where a study into the same folder was broken off."),
             out_option("out/study"),
@@ -95,7 +102,9 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
 
 
 @_command("robustness")
-@click.option("--lost", type=click.IntRange(0, 8), default=3, show_default=True, help="Fibres lost at once, at most.")
+@click.option(
+    "--lost", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
+)
 @click.option(
     "--signals",
     "rule",
@@ -112,7 +121,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
     \b
     padforge study robustness square random-5 --lost 2
 
-    For recordings of a built pad (figures 13 and 14) see `padforge sense robustness`.
+    For recordings of a built pad (figures 13 and 14) see `padforge sense fibre-loss`.
     """
     from design.settings import Contact
 

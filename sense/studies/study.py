@@ -5,15 +5,13 @@ import hashlib
 import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from design.common.checkpoints import Checkpoints, State
-from design.common.computing import one_torch_thread
+from design.common.computing import one_torch_thread, run_tasks
 from design.common.files import provenance, write_json, write_text
 
 if TYPE_CHECKING:
@@ -143,49 +141,13 @@ def _done(
     """The results of all tasks, those that are kept not made again."""
     states = kept.begin(resume)
     progress(len(states), len(tasks), "")
-    missing = [number for number in range(len(tasks)) if number not in states]
+    missing = [(number, task.make) for number, task in enumerate(tasks) if number not in states]
     with one_torch_thread():
-        for number, state in _results({number: tasks[number] for number in missing}, jobs):
+        for number, state in run_tasks(missing, at_once=jobs):
             states[number] = state
             kept.save(number, state)
             progress(len(states), len(tasks), tasks[number].name)
     return [states[number] for number in range(len(tasks))]
-
-
-def _results(tasks: Mapping[int, Task], jobs: int) -> Iterator[tuple[int, State]]:
-    """Results of tasks as they are done, so many at once.
-
-    Threads, since torch and the kernels let go of the interpreter: nothing is copied, and compiled code is shared. They
-    are daemons, so that a task of minutes does not hold up whoever interrupts the study.
-    """
-    begun: SimpleQueue[int] = SimpleQueue()
-    done: SimpleQueue[tuple[int, State | BaseException]] = SimpleQueue()
-    for number in tasks:
-        begun.put(number)
-
-    def work() -> None:
-        while not begun.empty():
-            try:
-                number = begun.get_nowait()
-            except Empty:  # another thread was faster
-                return
-            try:
-                done.put((number, tasks[number].make()))
-            except BaseException as error:
-                done.put((number, error))
-
-    for _ in range(min(jobs, len(tasks))):
-        Thread(target=work, daemon=True).start()
-    try:
-        for _ in tasks:
-            number, result = done.get()
-            if isinstance(result, BaseException):
-                raise result
-            yield number, result
-    finally:
-        while not begun.empty():
-            with suppress(Empty):
-                begun.get_nowait()
 
 
 def table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:

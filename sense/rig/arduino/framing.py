@@ -159,7 +159,10 @@ def encode(frame: Frame) -> bytes:
 
 
 def cobs_encode(payload: bytes) -> bytes:
-    """`payload` without zeros: every run between them with a count, 255 where a run of 254 goes on."""
+    """`payload` without zeros: every run between them with a count, 255 where a run of 254 goes on.
+
+    As the firmware does, and other than the package `cobs`, a run of 254 at the very end is followed by an empty one.
+    """
     coded = bytearray()
     for run in payload.split(b"\0"):
         while len(run) >= 254:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sense.rig.devices import RigFault
+from sense.settings import RigSettings
 
 from .framing import BoardSettings, Decoder, Frame, Request, encode
 
@@ -43,6 +44,15 @@ def find_ports() -> list[BoardPort]:
         if port.vid in _VENDORS and port.pid in _DUE_PORTS
     ]
     return sorted(found, key=lambda port: (port.kind, port.device))
+
+
+def port_of(rig: RigSettings) -> str:
+    """The board's port, looked for where `[rig]` does not set it; raises RigFault("refused") where none is found."""
+    if rig.port != "auto":
+        return rig.port
+    if not (ports := find_ports()):
+        raise RigFault("refused", '[rig] port is "auto" and no board is found', "plug it in, or name its port")
+    return ports[0].device
 
 
 class SerialLink:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -112,8 +111,3 @@ def _named(path: Path, rows: list[list[float]]) -> PressPlan:
         return PressPlan.of(np.array(rows, dtype=np.float64).reshape(-1, 3))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def plan_lines(plan: PressPlan) -> dict[str, Any]:
-    """The plan as a recording's start document keeps it."""
-    return {"columns": list(COLUMNS), "presses": plan.document()}

@@ -9,8 +9,8 @@ from design.common.errors import InputError
 from design.common.files import provenance, read_json
 
 if TYPE_CHECKING:
-    from design.common.settings import Spec
     from design.pad.morphology import Morphology
+    from design.settings import Contact
     from sense.recordings.recorder import Recorder
     from sense.settings import RigSettings
 
@@ -18,69 +18,69 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Order:
-    """What is to be recorded: the pad, settings and plan, and where they came from."""
+class Setup:
+    """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from."""
 
     pad: "Morphology"
+    contact: "Contact"
     rig: "RigSettings"
-    spec: "Spec"
     out: Path
     command: str
-    inputs: Sequence[Path]
+    inputs: Sequence[Path] = ()
 
 
-def plan_of(order: Order, rig: "RigSettings", plan_file: Path | None, resume: bool) -> "PressPlan":
-    """The plan of a resumed recording, of a file, or of the settings."""
+def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
+    """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
 
     from sense.recordings.recorder import FORMAT, START
 
     from .press_plan import PressPlan, planned, read_plan
 
-    if resume and (order.out / START).exists():
-        source = read_json(order.out / START, FORMAT).get("source")
+    if resume and (setup.out / START).exists():
+        source = read_json(setup.out / START, FORMAT).get("source")
         source = source if isinstance(source, dict) else {}
         kept = source.get("plan")
         if not isinstance(kept, dict) or "presses" not in kept:
-            raise InputError(f"{order.out}: has no plan, so that it cannot be resumed")
-        _require_same(order, rig, source)
+            raise InputError(f"{setup.out}: has no plan, so that it cannot be resumed")
+        _require_same(setup, rig, source)
         return PressPlan.of(kept["presses"])
-    if plan_file is not None:
-        return read_plan(plan_file, rig.depth_mm)
-    return planned(order.pad, rig, np.random.default_rng(rig.seed))
+    if (file := rig.plan_file) is not None:
+        return read_plan(file, rig.depth_mm)
+    return planned(setup.pad, rig, np.random.default_rng(rig.seed))
 
 
 _LASTING = ("channels", "rate_hz", "converter_rate_hz", "readings_per_press", "pad_mm", "pad_angle_deg", "contact_mm")
 """Settings that all of a recording has to share."""
 
 
-def _require_same(order: Order, rig: "RigSettings", source: Mapping[str, Any]) -> None:
+def _require_same(setup: Setup, rig: "RigSettings", source: Mapping[str, Any]) -> None:
     """Refuse to go on with a recording under other settings, or of another pad."""
     was, now = source.get("rig"), rig.model_dump(mode="json")
     for key in _LASTING:
         before = was.get(key) if isinstance(was, dict) else None
         if before != now[key]:
-            raise InputError(f"[rig] {key}: got {now[key]}, the recording in {order.out} was begun with {before}")
-    if source.get("morphology") != _morphology(order):
-        raise InputError(f"{order.out}: was begun with another pad than the one given")
+            raise InputError(f"[rig] {key}: got {now[key]}, the recording in {setup.out} was begun with {before}")
+    if source.get("morphology") != _morphology(setup):
+        raise InputError(f"{setup.out}: was begun with another pad than the one given")
 
 
-def _morphology(order: Order) -> dict[str, Any]:
-    return {"pitch_mm": order.pad.pitch_mm, "knots": order.pad.knots.tolist()}
+def _morphology(setup: Setup) -> dict[str, Any]:
+    return {"pitch_mm": setup.pad.pitch_mm, "knots": setup.pad.knots.tolist()}
 
 
-def recorder_of(order: Order, rig: "RigSettings", plan: "PressPlan", folder: Path, resume: bool) -> "Recorder":
+def recorder_of(setup: Setup, rig: "RigSettings", plan: "PressPlan", folder: Path, resume: bool) -> "Recorder":
     """The recorder of a new recording, or of the one in `folder` that is gone on with."""
     from sense.recordings.recorder import START, Recorder
 
-    from .press_plan import plan_lines as describe_plan
+    from .press_plan import COLUMNS
 
     if resume and (folder / START).exists():
         return Recorder.resume(folder)
     source = {
         "kind": "rig",
         "rig": rig.model_dump(mode="json"),
-        "morphology": _morphology(order),
-        "plan": describe_plan(plan),
+        "morphology": _morphology(setup),
+        "plan": {"columns": list(COLUMNS), "presses": plan.document()},
     }
-    return Recorder(folder, rig.channels, source, provenance(order.command, rig.seed, order.inputs))
+    return Recorder(folder, rig.channels, source, provenance(setup.command, rig.seed, setup.inputs))

@@ -63,7 +63,7 @@ def _levels(axes: "Axes", stretch: Mapping[str, Any]) -> None:
         axes.scatter(times_s / 60, own, s=2.5, color=colour, label=name, linewidths=0)
     axes.set_xlabel("time (min)")
     axes.set_ylabel("filtered (V)")
-    axes.set_title(f"{stretch['recording']}, fibre {stretch['fibre']}", loc="left", color=INK, fontsize=10)
+    axes.set_title(f"{stretch['recording']}, fibre {stretch['fibre'] + 1}", loc="left", color=INK, fontsize=10)
     tidy(axes)
 
 

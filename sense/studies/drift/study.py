@@ -107,11 +107,9 @@ def drift_study(
     rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": drawn})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
     sources |= {label: partial(_same, recording) for label, recording in recordings.items()}
+    recorded = {label: own.source.get("kind") != SIMULATED for label, own in recordings.items()}
     kinds = dict.fromkeys(pads, SIMULATED)
-    kinds |= {
-        label: SIMULATED if recording.source.get("kind") == SIMULATED else "recorded"
-        for label, recording in recordings.items()
-    }
+    kinds |= {label: "recorded" if real else SIMULATED for label, real in recorded.items()}
     known = {**dict.fromkeys(pads, presses), **{label: int(own.known.sum()) for label, own in recordings.items()}}
     for label, count in known.items():
         try:

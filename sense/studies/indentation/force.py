@@ -1,6 +1,7 @@
 """Force: how well the fibres that locate a press also tell how deep, and so how hard, it is."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -33,16 +34,33 @@ COLUMNS = 4
 """Most pads side by side in the figure."""
 
 
+@dataclass(frozen=True)
+class Learning:
+    """How many presses are learnt from and tested on, and the neurons of a network and its epochs of training."""
+
+    presses: int = 2048
+    test: int = 1024
+    hidden: int = 50
+    epochs: int = EPOCHS
+
+
+@dataclass(frozen=True)
+class _Presses:
+    """How presses are made and read; whether networks are given their depth, and so do not find it."""
+
+    indenter: Indenter
+    depths: tuple[float, float]
+    depth_told: bool
+    noise_counts: float
+
+
 def force_study(
     pads: Mapping[str, Morphology],
     *,
     indenter: Indenter | None = None,
     depths: tuple[float, float] = (0.1, 0.45),
     noise_counts: Sequence[float] = (1.0, 4.0),
-    presses: int = 2048,
-    test: int = 1024,
-    hidden: int = 50,
-    epochs: int = EPOCHS,
+    learning: Learning | None = None,
     seed: int = 0,
 ) -> Study:
     """Place, depth and force of presses of random depth, from the signals of the indentation model.
@@ -52,20 +70,19 @@ def force_study(
     Args:
         pads: by label. indenter: a sphere of 0.7 grid units if None. depths: least and greatest, grid units.
         noise_counts: standard deviations of the readings' noise, in counts of a 12-bit converter.
-        presses, test: how many are learnt from and tested on. hidden, epochs: of a network.
-        seed: of presses, noise and networks.
+        learning: from how many presses, and by what networks; see `Learning`. seed: of presses, noise and networks.
 
     Raises:
         InputError: depths the indenter does not allow.
     """
-    indenter = indenter or Indenter()
+    indenter, learning = indenter or Indenter(), learning or Learning()
     indenter.contact_radius(depths)
     middle = float(np.mean(depths))
     cases = (("depth unknown", depths, False), ("depth told", depths, True), ("one depth", (middle, middle), False))
     tasks = [
         Task(
             f"{label}, noise of {_counts(noise)}, {name}",
-            partial(_found, pad, indenter, each, told, noise, presses, test, hidden, epochs, seed),
+            partial(_found, pad, _Presses(indenter, each, told, noise), learning, seed),
         )
         for label, pad in pads.items()
         for noise in noise_counts
@@ -77,11 +94,11 @@ def force_study(
         "depths": list(depths),
         "noise_counts": list(noise_counts),
         "reduced_modulus_kpa": REDUCED_MODULUS_KPA,
-        "presses": presses,
-        "test": test,
+        "presses": learning.presses,
+        "test": learning.test,
         "members": MEMBERS,
-        "hidden": hidden,
-        "epochs": epochs,
+        "hidden": learning.hidden,
+        "epochs": learning.epochs,
         "seed": seed,
     }
     conclude = partial(_conclude, dict(pads), indenter, settings)
@@ -112,34 +129,21 @@ def committee(
     return lambda given: np.mean([network(given) for network in members], axis=0)
 
 
-def _found(
-    pad: Morphology,
-    indenter: Indenter,
-    depths: tuple[float, float],
-    told: bool,
-    noise_counts: float,
-    presses: int,
-    test: int,
-    hidden: int,
-    epochs: int,
-    seed: int,
-) -> State:
+def _found(pad: Morphology, made: _Presses, learning: Learning, seed: int) -> State:
     """The test presses as they were made, "pressed", and as networks find them, "found": (T, 3) x, y, depth.
 
     The full scale of a fibre is the greatest signal it gave in the presses that were learnt from.
-
-    Args:
-        told: whether the networks are given the depth, beside the readings; then they do not find it.
     """
     rng = np.random.default_rng([3, seed])
-    places = fresh_presses(pad.grid, presses + test, int(rng.integers(2**32)))
-    deep = rng.uniform(*depths, presses + test)
-    signals = indented_signals(pad, places, deep, indenter)
-    given = magnitudes(readings(signals, signals[:presses].max(axis=0), noise_counts, rng))
+    presses, count = learning.presses, learning.presses + learning.test
+    places = fresh_presses(pad.grid, count, int(rng.integers(2**32)))
+    deep = rng.uniform(*made.depths, count)
+    signals = indented_signals(pad, places, deep, made.indenter)
+    given = magnitudes(readings(signals, signals[:presses].max(axis=0), made.noise_counts, rng))
     targets = np.column_stack([places, deep])
-    if told:
+    if made.depth_told:
         given, targets = np.column_stack([given, deep]), places
-    locate = committee(given[:presses], targets[:presses], rng, hidden, epochs)
+    locate = committee(given[:presses], targets[:presses], rng, learning.hidden, learning.epochs)
     return {"pressed": targets[presses:], "found": locate(given[presses:])}
 
 

@@ -11,7 +11,7 @@ import pytest
 import sense.recordings.recording
 from design.common.errors import InputError
 from sense import Recorder, Recording
-from sense.cli.rig import recording_line
+from sense.cli.options import recording_line
 
 
 @pytest.fixture

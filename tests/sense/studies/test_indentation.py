@@ -10,7 +10,7 @@ import pytest
 from design import InputError, Morphology
 from design.pad.indentation import Indenter
 from sense.studies.indentation import shape
-from sense.studies.indentation.force import COUNTS, force_study, readings
+from sense.studies.indentation.force import COUNTS, Learning, force_study, readings
 from sense.studies.indentation.shape import FOOTPRINTS, SETS, shape_study
 from sense.studies.study import Study, run, study_lines
 
@@ -18,7 +18,7 @@ PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 
 
 def small_force() -> Study:
-    return force_study(PADS, presses=300, test=120, noise_counts=(1.0, 30.0), hidden=12, epochs=25)
+    return force_study(PADS, noise_counts=(1.0, 30.0), learning=Learning(presses=300, test=120, hidden=12, epochs=25))
 
 
 def small_shape() -> Study:

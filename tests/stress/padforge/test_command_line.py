@@ -128,7 +128,7 @@ COMMANDS: dict[tuple[str, ...], tuple[list[tuple[str, ...]], dict[str, tuple[str
             "--rig": ("simulated",),
             "--morphology": MORPHOLOGY,
             "--presses": ("4", "5"),
-            "--plan": ("presses.csv",),
+            "--plan": ("presses.csv", "grid", "adaptive"),
             "--model": MODEL,
             "--dry-run": None,
             "--resume": None,
@@ -150,15 +150,15 @@ COMMANDS: dict[tuple[str, ...], tuple[list[tuple[str, ...]], dict[str, tuple[str
             "--json": None,
         },
     ),
-    ("sense", "evaluate"): ([RECORDING], {"--model": MODEL, "--lost": ("0", "0,1", "3"), "--json": None}),
-    ("sense", "locate"): ([RECORDING], {"--model": MODEL, "--mask": ("0", "0,1,2"), "--out": ("new.csv",)}),
+    ("sense", "evaluate"): ([RECORDING], {"--model": MODEL, "--lost": ("0", "1", "3"), "--json": None}),
+    ("sense", "locate"): ([RECORDING], {"--model": MODEL, "--mask": ("1", "1,2,3"), "--out": ("new.csv",)}),
     ("sense", "health"): ([RECORDING], {"--model": MODEL, "--json": None}),
     ("sense", "recalibrate"): ([RECORDING], {"--model": ("empty",), "--seed": SEED, "--out": FOLDER, "--json": None}),
-    ("sense", "robustness"): (
+    ("sense", "fibre-loss"): (
         [RECORDING],
         {"--model": MODEL, "--lost": ("0", "1"), "--seed": SEED, "--spec": SPEC, "--out": FOLDER, "--json": None},
     ),
-    ("sense", "size-curve"): ([RECORDING], {"--seed": SEED, "--spec": SPEC, "--out": FOLDER, "--json": None}),
+    ("sense", "learning-curve"): ([RECORDING], {"--seed": SEED, "--spec": SPEC, "--out": FOLDER, "--json": None}),
     ("sense", "live", "--replay", "pad/recording"): (
         [],
         {"--model": MODEL, "--speed": ("1e6", "1e300"), "--port": ("0",), "--spec": SPEC, "--json": None},

@@ -167,14 +167,14 @@ def test_the_commands_write_documents_and_figures(
         return caught.value.code or 0, *capsys.readouterr()
 
     for name, arguments in (
-        ("robustness", ("robustness", "rec", "--model", "model", "--retrain", "--lost", "1")),
-        ("size_curve", ("size-curve", "rec")),
+        ("fibre_loss", ("fibre-loss", "rec", "--model", "model", "--retrain", "--lost", "1")),
+        ("learning_curve", ("learning-curve", "rec")),
     ):
         code, out, _ = run(*arguments, "--out", "out", "--json")
         assert code == 0
         assert json.loads(out) == json.loads(Path("out", f"{name}.json").read_text())
         assert Path("out", f"{name}.png").read_bytes()[:4] == b"\x89PNG"
-    code, out, err = run("robustness", "rec", "--out", "other")
+    code, out, err = run("fibre-loss", "rec", "--out", "other")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "neither --model nor --retrain" in err
     assert not Path("other").exists()

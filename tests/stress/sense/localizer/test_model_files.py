@@ -85,12 +85,12 @@ def test_a_model_that_loads_finds_places_and_faults(tmp_path_factory: pytest.Tem
 
 @cache
 def results(tmp: Path) -> dict[str, bytes]:
-    """The documents of a calibration and of a robustness study, and a start of a recording."""
+    """The documents of a calibration and of a study of lost fibres, and a start of a recording."""
     _, document = sense.calibrate(made(4, presses=40), TINY)
     studied = sense.fibre_loss_study(SMALL, learnt(), lost=2)
     study = {"format": "padforge-study-x/1", "title": "A", "text": ["b"], "rows": [{"a": 1, "b": 2.5}]}
     study |= {"provenance": document["provenance"]}
-    named = {"calibration.json": document, "robustness.json": studied, "x.json": study}
+    named = {"calibration.json": document, "fibre_loss.json": studied, "x.json": study}
     return {name: dumped(content) for name, content in named.items()} | {"start.json": run_directory(tmp)["start.json"]}
 
 
@@ -129,7 +129,7 @@ def test_a_study_resumes_from_sound_networks_only(tmp_path_factory: pytest.TempP
 
 @cache
 def unfinished(tmp: Path) -> dict[str, bytes]:
-    """What a robustness study leaves that is broken off after its first network."""
+    """What a study of lost fibres leaves that is broken off after its first network."""
 
     def stop(done: int, of: int) -> None:
         if done:

@@ -1,4 +1,4 @@
-"""Figures of the studies: robustness to lost fibres, and error against the number of presses learnt from."""
+"""The figure of a study of lost fibres."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from design.common.figures import ALARM, FAINT, HORIZONTAL, INK, VERTICAL, canvas, explain, save_figure, tidy
-from sense.localizer.calibration.learning_curve import power_law
+from design.common.figures import FAINT, HORIZONTAL, INK, VERTICAL, explain, save_figure, tidy
 
 _WIDTH = 0.36
 
 
-def draw_robustness(document: Mapping[str, Any], path: Path) -> None:
+def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
     """Draw the error against the number of lost fibres, every way beside the others, and every set as a dot; below,
     each way's errors over the pad, with all fibres and without the worst set of each size."""
     ways = document["ways"]
@@ -63,40 +62,3 @@ def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
     lost = "+".join(str(fibre + 1) for fibre in found["lost"])
     axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
     return axes.imshow(errors, origin="lower", cmap="magma_r", vmin=0, vmax=highest_mm)
-
-
-def draw_size_curve(document: Mapping[str, Any], path: Path) -> None:
-    """Draw the error against the number of presses learnt from, the fit, and what twice as many would bring."""
-    figure, axes = canvas(6.4, 4.4)
-    presses = np.array([point["presses"] for point in document["points"]], dtype=float)
-    means = [point["mean_mm"] for point in document["points"]]
-    ahead, fit = document["forecast"], document["fit"]
-    along = np.geomspace(presses[0], ahead["presses"], 200)
-    axes.plot(along, power_law(along, (fit["floor_mm"], fit["factor_mm"], fit["exponent"])), color=FAINT, linewidth=1.6)
-    errors = [2 * point["standard_error_mm"] for point in document["points"]]
-    axes.errorbar(presses, means, errors, fmt="o", color=INK, markersize=5, linewidth=1.2, label="measured")
-    reach = [[ahead["mean_mm"] - ahead["low_mm"]], [ahead["high_mm"] - ahead["mean_mm"]]]
-    axes.errorbar(
-        [ahead["presses"]],
-        [ahead["mean_mm"]],
-        reach,
-        fmt="D",
-        color=ALARM,
-        markersize=6,
-        linewidth=1.2,
-        label="expected",
-    )
-    axes.set_xscale("log")
-    ticks = [*presses.astype(int).tolist(), ahead["presses"]]
-    axes.set_xticks(ticks, [str(tick) for tick in ticks])
-    axes.minorticks_off()
-    axes.set_ylim(0, None)
-    axes.set_xlabel("presses learnt from")
-    axes.set_ylabel("mean error (mm)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
-    axes.legend(frameon=False)
-    axes.set_title(
-        f"Error by number of presses, on the same {document['test_presses']}\n", loc="left", color=INK, fontsize=11
-    )
-    explain(axes, "bars: two standard errors; expected: 80 % of resamplings")
-    save_figure(figure, path)

@@ -1,0 +1,40 @@
+"""Health in the folder of a model, as `calibrate` leaves it there: what is known of a recording's fibres by it."""
+
+import shutil
+from pathlib import Path
+
+from sense.recordings.import_export import FOUND
+from sense.recordings.recording import Recording
+
+from .health_model import FELT, RECORDED, HealthModel, files_of
+from .monitor import FibreFault, examine
+
+
+def has_health(model: Path, name: str = RECORDED) -> bool:
+    """Whether health was learnt into a folder."""
+    return files_of(model, name)[0].exists()
+
+
+def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[FibreFault]]:
+    """What health is told by, presses that were found by what was learnt from such, and what is wrong.
+
+    Raises:
+        InputError: health was not learnt into this folder, or does not suit the recording.
+    """
+    known = HealthModel.load(model, FELT if FOUND.items() <= recording.source.items() else RECORDED)
+    return known, examine(known, recording.readings, recording.times_s, recording.begun, recording.lifted)
+
+
+def forget_health(folder: Path) -> None:
+    """Remove what an earlier calibration into a folder told health by: it must not speak for a later one."""
+    for name in (RECORDED, FELT):
+        for file in files_of(folder, name):
+            file.unlink(missing_ok=True)
+
+
+def copy_health(model: Path, folder: Path) -> None:
+    """What a model tells health by goes to another folder: it was learnt without places."""
+    for name in (RECORDED, FELT):
+        for file in files_of(model, name):
+            if file.exists():
+                shutil.copyfile(file, folder / file.name)

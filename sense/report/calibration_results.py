@@ -1,0 +1,82 @@
+"""All that a calibration leaves in a folder: the localizer, what health is told by, the document and its figures."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from design.common.errors import InputError
+from design.common.files import refuse_unwritable, staged, write_json
+from design.common.profiling import stage
+from sense.health.health_model import HealthModel
+from sense.health.learning import learn_health
+from sense.health.model_folder import forget_health
+from sense.localizer.calibration.calibration import calibrate
+from sense.localizer.localizer import Localizer
+from sense.recordings.recording import Recording
+from sense.settings import LocalizerSettings
+
+
+def calibrate_into(
+    recording: Recording,
+    out: Path,
+    options: LocalizerSettings,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    warn: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Calibrate, write all results to `out`, and return `calibration.json`.
+
+    Nothing in `out` changes before the last result is there.
+
+    Args:
+        progress: called with (steps of training done, in all), and (0, 0) when the health of the fibres is learnt.
+        warn: told in a line that health is not learnt where the recording does not suffice.
+
+    Raises:
+        InputError: as `calibrate`, or `out` cannot be written.
+    """
+    refuse_unwritable(out)
+    localizer, document = calibrate(recording, options, progress=progress)
+    progress(0, 0)
+    with stage("health"):
+        health = _health(recording, localizer, warn)
+    with staged(out) as folder:
+        localizer.save(folder)
+        for name, model in health.items():
+            model.save(folder, name)
+        write_json(folder / "calibration.json", document)
+        with stage("figures"):
+            _draw(document, folder)
+    if not health:
+        forget_health(out)
+    return document
+
+
+def _health(recording: Recording, localizer: Localizer, warn: Callable[[str], None]) -> dict[str, HealthModel]:
+    """Models that health is told by, by name, or none where the recording does not suffice."""
+    try:
+        return learn_health(recording, localizer)
+    except InputError as error:
+        warn(f"no watch is kept on the fibres' health: {error}")
+        return {}
+
+
+def _draw(document: Mapping[str, Any], folder: Path) -> None:
+    from .calibration_figures import draw_error_by_loss, draw_error_map
+
+    draw_error_map(document, folder / "error_map.png")
+    draw_error_by_loss(document, folder / "error_by_loss.png")
+
+
+def calibration_lines(document: Mapping[str, Any]) -> list[str]:
+    """The errors of a calibration document as a table for people."""
+    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
+    return [
+        f"error in mm on {document['test_presses']} presses (split: {document['split']})",
+        "lost  sets   mean    std    max median    p95  in r50  in r90",
+        *(
+            f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+            f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
+            for row in document["errors"]
+        ),
+    ]
