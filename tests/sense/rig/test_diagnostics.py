@@ -23,7 +23,8 @@ def test_a_healthy_rig(rig):
     assert {diagnosis.status for diagnosis in looked.values()} <= {"ok", "warn"}
     assert looked["rate"].found == "1000.0 Hz of 1000"
     assert looked["samples"].found.startswith("0 of")
-    assert {f"channel {number}" for number in range(RIG.channels)} < set(looked)
+    assert {f"channel {number}" for number in range(1, RIG.channels + 1)} < set(looked)
+    assert "channel 0" not in looked
     assert arm.moves == []
 
 
@@ -42,9 +43,9 @@ def test_a_channel_without_a_fibre(rig, volts, status, word):
 
     converter.model = Broken()
     looked = found(examine_converter(converter, 3.3, time, time.sleep))
-    assert looked["channel 2"].status == status
-    assert word in looked["channel 2"].found
-    assert looked["channel 1"].status == "ok"
+    assert looked["channel 3"].status == status
+    assert word in looked["channel 3"].found
+    assert looked["channel 2"].status == "ok"
 
 
 def test_a_noisy_channel_and_lost_samples(rig):
@@ -62,7 +63,7 @@ def test_a_noisy_channel_and_lost_samples(rig):
 
     converter.model = Noisy()
     looked = found(examine_converter(converter, 3.3, time, time.sleep))
-    assert looked["channel 0"].status == "warn"
+    assert looked["channel 1"].status == "warn"
     assert (looked["samples"].status, looked["samples"].found.split()[0]) == ("fail", "7")
 
 
