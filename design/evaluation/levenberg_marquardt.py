@@ -4,7 +4,7 @@ The protocol is the authors': damped Gauss-Newton steps (Hagan & Menhaj 1994, Tr
 Marquardt algorithm) from spread-out neurons (Nguyen & Widrow 1990, Improving the learning speed of 2-layer neural
 networks), ended by presses held back for validation. Networks of one shape are trained as one batch, each on its own
 inputs, split and weights, and each ending when it has learnt; how steps are found, and how long a training waits for
-validation to gain, is our own (`marquardt_batch`).
+validation to gain, is our own (`variable_projection`).
 
 Torch does the algebra on as many threads as it is set to. Set it to one: the matrices are too small to gain from more,
 and where another program has a core, threads that wait for each other take many times as long.
@@ -126,18 +126,10 @@ def fit_many(
     """
     from .variable_projection import train_batch
 
-    if min(len(rngs), hidden, inputs.shape[-1]) < 1:
-        raise InputError(
-            f"{len(rngs)} networks of {hidden} neurons for {inputs.shape[-1]} inputs, allowed is at least 1 of each"
-        )
-    if not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
-        raise InputError("inputs or targets hold NaN or infinity, expected finite numbers")
-    inputs = np.broadcast_to(inputs, (len(rngs), *inputs.shape[-2:]))
-    samples = inputs.shape[1]
-    if samples != len(targets) or samples < 3:
-        raise InputError(f"{samples} inputs and {len(targets)} targets, allowed is as many of both, at least 3")
+    inputs = _require_samples(inputs, targets, len(rngs), hidden)
     right = targets[None] if also is None else np.concatenate([targets[None], also])
     into, onto = [Scale.of(own) for own in inputs], Scale.of(right.reshape(-1, targets.shape[1]))
+    samples = inputs.shape[1]
     learnt = round(LEARN * samples) if check is None else samples
     held = max(1, round(VALIDATE * samples))
     learn, validate, starts = [], [], []
@@ -160,6 +152,21 @@ def fit_many(
             into, *(part.cpu().numpy() for part in trained), strict=True
         )
     ]
+
+
+def _require_samples(inputs: Array, targets: Array, networks: int, hidden: int) -> Array:
+    """The inputs (S, Q, D) of so many networks, if they and the targets (Q, O) can be learnt."""
+    if min(networks, hidden, inputs.shape[-1]) < 1:
+        raise InputError(
+            f"{networks} networks of {hidden} neurons for {inputs.shape[-1]} inputs, allowed is at least 1 of each"
+        )
+    if not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
+        raise InputError("inputs or targets hold NaN or infinity, expected finite numbers")
+    inputs = np.broadcast_to(inputs, (networks, *inputs.shape[-2:]))
+    samples = inputs.shape[1]
+    if samples != len(targets) or samples < 3:
+        raise InputError(f"{samples} inputs and {len(targets)} targets, allowed is as many of both, at least 3")
+    return inputs
 
 
 def best_device() -> str:

@@ -1,15 +1,14 @@
 """The paper's evaluation by simulation: how far off a freshly trained localizer finds presses, fibres lost or not."""
 
 import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from design.common.computing import one_torch_thread
+from design.common.computing import one_torch_thread, run_tasks
 from design.common.errors import InputError, instance, shown, whole
 from design.common.settings import or_default
 from design.criteria.fibre_loss import lost_subsets
@@ -95,9 +94,10 @@ def localisation_error(
         networks = trial.learn(batch, hidden)
         return np.array([trial.errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
 
-    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = [pool.map(means, batches(level)) for level in losses]
-        by_level = [np.concatenate(list(parts)) for parts in found]
+    parts = {(at, k): batch for at, level in enumerate(losses) for k, batch in enumerate(batches(level))}
+    with one_torch_thread():
+        found = dict(run_tasks((key, partial(means, batch)) for key, batch in parts.items()))
+    by_level = [np.concatenate([found[key] for key in parts if key[0] == at]) for at in range(len(losses))]
     return [
         LossError(number, len(level), float(level.mean()), float(level.std()), float(level.max()))
         for number, level in zip(levels, by_level, strict=True)

@@ -10,7 +10,7 @@ from design.criteria.rules import check_rules
 from design.evaluation.localisation_error import localisation_error
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-from .search import SearchResult, search
+from .search import SearchResult, SearchRun, search
 
 KNOTS = (5, 20)
 SEEDS = (0, 1)
@@ -55,7 +55,7 @@ def trials() -> Iterator[BenchTrial]:
         for way, size, settings, rules in ways:
             for seed in SEEDS:
                 chosen = settings.model_copy(update={"knots": knots, "seed": seed})
-                work = partial(search, PadSettings(), Contact(), chosen, rules, executor=InThisThread())
+                work = partial(search, PadSettings(), Contact(), chosen, rules, run=SearchRun(executor=InThisThread()))
                 yield BenchTrial(f"N={knots}", way, size, work, judge_pad, repetition=seed)
 
 

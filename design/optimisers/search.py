@@ -1,19 +1,19 @@
 """One face for both searches: settings in, the best morphology with its scores and its history out.
 
-A search is a number of starts, each a task that advances in slices from one plain state to the next. Slices run on any
-executor of the `concurrent.futures` kind, here or on a cluster; between them a start can be noted, kept on disk, or
-stopped, and nothing of that changes what it finds.
+A search is a number of starts, each a chain of slices from one plain state to the next. Slices run on any executor of
+the `concurrent.futures` kind, here or on a cluster; between them a start can be noted, kept on disk, or stopped, and
+nothing of that changes what it finds.
 """
 
 import math
-import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 
 from design.common import profiling
 from design.common.checkpoints import Checkpoints, State
+from design.common.computing import one_torch_thread, run_tasks
 from design.common.errors import MOST_VALUES, InputError, instance, real, shown
 from design.common.errors import path as as_path
 from design.common.settings import or_default
@@ -40,6 +41,36 @@ MOST_SECONDS = 1e9
 """Longest time budget: some thirty years."""
 RESERVE = 0.15  # share of a time budget kept for repairing
 MENDING_S = 3.0  # of repair after Ctrl-C
+
+
+@dataclass(frozen=True)
+class SearchRun:
+    """How a search is run: nothing of what it finds depends on it, unless it is cut short.
+
+    Attributes:
+        report: hears of each start's progress, in the caller's thread.
+        keep_in: folder for the states of the starts; removed when the search completes.
+        resume: whether to go on from the states in `keep_in`.
+        time_budget: seconds after which the search ends with the best so far; None for no end.
+        executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None.
+    """
+
+    report: Report = lambda run, done, total, objective: None
+    keep_in: Path | None = None
+    resume: bool = False
+    time_budget: float | None = None
+    executor: Executor | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.report):
+            raise InputError(f"report is {shown(self.report)}, expected a function")
+        if self.keep_in is not None:
+            object.__setattr__(self, "keep_in", as_path("keep_in", self.keep_in))
+        instance("resume", self.resume, bool)
+        if self.time_budget is not None:
+            object.__setattr__(self, "time_budget", real("time_budget", self.time_budget, 0, MOST_SECONDS))
+        if self.executor is not None:
+            instance("executor", self.executor, Executor)
 
 
 @dataclass(frozen=True)
@@ -72,11 +103,7 @@ def search(
     rules: RulesSettings | None = None,
     *,
     origin: Morphology | None = None,
-    report: Report = lambda run, done, total, objective: None,
-    keep_in: Path | None = None,
-    resume: bool = False,
-    time_budget: float | None = None,
-    executor: Executor | None = None,
+    run: SearchRun | None = None,
 ) -> SearchResult:
     """Find the fibres of a pad by the method `settings` names; None stands for the defaults of `pad.toml`.
 
@@ -85,11 +112,7 @@ def search(
 
     Args:
         origin: morphology to start from, of the pad's grid and at most `settings.knots` knots a fibre; random if None.
-        report: hears of each start's progress, in this thread.
-        keep_in: folder for the states of the starts, from which `resume` goes on; removed when the search completes.
-        time_budget: seconds after which it ends with the best so far.
-        executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None,
-            since torch and the kernels let go of the interpreter while they work.
+        run: whom it tells, what it keeps, how long it may take and on what it runs; on this machine to its end if None.
 
     Raises:
         InputError: an origin that does not fit, a device that is not there, or states of other settings.
@@ -99,20 +122,15 @@ def search(
     problem = _problem(
         *sections, or_default("settings", settings, SearchSettings), or_default("rules", rules, RulesSettings), origin
     )
-    checkpoints = None if keep_in is None else Checkpoints(as_path("keep_in", keep_in), problem.settings())
-    time_budget = None if time_budget is None else real("time_budget", time_budget, 0, MOST_SECONDS)
-    if not callable(report):
-        raise InputError(f"report is {shown(report)}, expected a function")
-    if executor is not None:
-        instance("executor", executor, Executor)
-    instance("resume", resume, bool)
-    states = checkpoints.begin(resume) if checkpoints else {}
-    stop = _Stop(begin, time_budget)
+    run = SearchRun() if run is None else instance("run", run, SearchRun)
+    checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
+    states = checkpoints.begin(run.resume) if checkpoints else {}
+    stop = _Stop(begin, run.time_budget)
     kept = sum(bool(state["done"]) for state in states.values())
     profiling.looked_at("starts", len(problem.starts) - kept, len(problem.starts))
-    with profiling.stage("search"), _stopped_by_interrupt(stop), _threads(executor) as pool:
-        _run(problem, states, pool, stop, report, checkpoints)
-        found = _candidates(problem, states, pool, stop)
+    with profiling.stage("search"), _stopped_by_interrupt(stop), one_torch_thread():
+        _advance(problem, states, stop, run, checkpoints)
+        found = _candidates(problem, states, stop)
     with profiling.stage("check and score"):
         best, violations = _choose(found if origin is None else [*found, origin], problem)
         terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
@@ -188,53 +206,27 @@ def _stopped_by_interrupt(stop: _Stop) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-@contextmanager
-def _threads(executor: Executor | None) -> Iterator[Executor]:
-    """The executor given, or one thread a core; slices set torch to one thread each, which is undone here."""
-    import torch
-
-    if executor is not None:
-        yield executor
-        return
-    threads = torch.get_num_threads()
-    try:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _run(
-    problem: Problem,
-    states: dict[int, State],
-    pool: Executor,
-    stop: _Stop,
-    report: Report,
-    checkpoints: Checkpoints | None,
+def _advance(
+    problem: Problem, states: dict[int, State], stop: _Stop, run: SearchRun, checkpoints: Checkpoints | None
 ) -> None:
     """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
-    waiting = [start for start in problem.starts if start not in states or not states[start]["done"]]
-    running: dict[Future[Slice], int] = {}
-    while running or (waiting and not stop):
-        while waiting and not stop and len(running) < _width(pool):
-            start = waiting.pop(0)
-            running[pool.submit(advance_start, problem, start, states.get(start))] = start
-        for future in wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done:
-            start, reached = running.pop(future), future.result()
-            states[start] = reached.state
-            if checkpoints:
-                checkpoints.save(start, reached.state)
-            report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
-            if not reached.done and not stop:
-                running[pool.submit(advance_start, problem, start, reached.state)] = start
+
+    def first_slices() -> Iterator[tuple[int, Callable[[], Slice]]]:
+        for start in problem.starts:
+            if not stop and (start not in states or not states[start]["done"]):
+                yield start, partial(advance_start, problem, start, states.get(start))
+
+    def next_slice(start: int, reached: Slice) -> Callable[[], Slice] | None:
+        return None if reached.done or stop else partial(advance_start, problem, start, reached.state)
+
+    for start, reached in run_tasks(first_slices(), run.executor, then=next_slice):
+        states[start] = reached.state
+        if checkpoints:
+            checkpoints.save(start, reached.state)
+        run.report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
 
 
-def _width(pool: Executor) -> int:
-    """How many starts run at once: as many as threads here, all on a cluster."""
-    return (os.cpu_count() or 1) if isinstance(pool, ThreadPoolExecutor) else 10_000
-
-
-def _candidates(problem: Problem, states: dict[int, State], pool: Executor, stop: _Stop) -> list[Morphology]:
+def _candidates(problem: Problem, states: dict[int, State], stop: _Stop) -> list[Morphology]:
     """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
     if not states:
         return [finish(problem, 0, None)]

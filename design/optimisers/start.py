@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from design.common.checkpoints import State
+from design.common.computing import one_torch_thread
 from design.pad.morphology import Morphology
 
 from .problem import Problem
@@ -27,6 +28,7 @@ class Slice:
     done: bool
 
 
+@one_torch_thread()
 def advance_start(problem: Problem, start: int, state: State | None) -> Slice:
     """The next slice of a start, from its beginning if `state` is None."""
     run, until = _open(problem, start, state), time.perf_counter() + SLICE_S
@@ -37,6 +39,7 @@ def advance_start(problem: Problem, start: int, state: State | None) -> Slice:
     return Slice(run.state(), run.step, run.objective, run.done)
 
 
+@one_torch_thread()
 def finish(problem: Problem, start: int, state: State | None, until: float = 0.0) -> Morphology:
     """The fibres of a start as they are, what is broken being repaired `until` then by `time.perf_counter`."""
     run = _open(problem, start, state)
@@ -51,9 +54,6 @@ def _open(problem: Problem, start: int, state: State | None) -> "Descent | Breed
         from .genetic_search import Breeding
 
         return Breeding(problem, state)
-    import torch
-
     from .gradient_search import Descent
 
-    torch.set_num_threads(1)  # starts run beside each other, and sums in another order would give another result
     return Descent(problem, start, state)

@@ -13,7 +13,7 @@ from typing import cast
 import pytest
 
 from design.common.checkpoints import Checkpoints
-from design.optimisers.search import search
+from design.optimisers.search import SearchRun, search
 from design.settings import SearchSettings
 
 SETTINGS = """
@@ -112,7 +112,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
                 threading.Thread(target=os.kill, args=(victim, signal.SIGKILL)).start()
 
         executor = cast(Executor, client.get_executor(pure=False, retries=10))
-        there = search(settings=settings, report=report, executor=executor)
+        there = search(settings=settings, run=SearchRun(report, executor=executor))
         assert len(slices) > 4
         with pytest.raises(ProcessLookupError):
             os.kill(victim, 0)

@@ -11,7 +11,7 @@ from design import Contact, InputError, Morphology
 from design.common.checkpoints import Checkpoints
 from design.criteria.score import score
 from design.optimisers.problem import Problem
-from design.optimisers.search import search
+from design.optimisers.search import SearchRun, search
 from design.optimisers.start import advance_start
 from design.settings import PadSettings, RulesSettings, SearchSettings
 
@@ -63,7 +63,7 @@ def test_small_and_odd_pads_are_searched_too():
 def test_ctrl_c_keeps_the_best_so_far(method):
     """The signal comes from the first report; what was found by then is returned, and says so."""
     settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
-    found = search(settings=settings, report=lambda *step: signal.raise_signal(signal.SIGINT))
+    found = search(settings=settings, run=SearchRun(lambda *step: signal.raise_signal(signal.SIGINT)))
     assert found.stopped == "interrupted"
     assert found.morphology.grid == 4
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -93,7 +93,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
             if len(heard) == 2:
                 raise KilledError
 
-        return search(settings=settings, report=report, keep_in=tmp_path / "search", resume=True)
+        return search(settings=settings, run=SearchRun(report, tmp_path / "search", resume=True))
 
     while kills < 100:
         try:
@@ -115,7 +115,7 @@ def test_resuming_with_other_settings_is_refused_and_names_what_differs(tmp_path
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     other = SMALL.model_copy(update={"seed": 5})
     with pytest.raises(InputError, match="begun with search seed 0, now 5"):
-        search(settings=other, rules=QUICK, keep_in=tmp_path / "search", resume=True)
+        search(settings=other, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
 
 
 def test_a_damaged_state_is_named(tmp_path):
@@ -124,7 +124,7 @@ def test_a_damaged_state_is_named(tmp_path):
     path = tmp_path / "search" / "start_0000.npz"
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read"):
-        search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
+        search(settings=SMALL, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
 
 
 def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
@@ -135,7 +135,7 @@ def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
         state = {name: arrays[name] for name in arrays.files}
     np.savez(path, allow_pickle=False, **state | {"done": np.array([1, 2])})
     with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read \(it is not as it was written\)"):
-        search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
+        search(settings=SMALL, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
 
 
 def test_a_state_of_another_start_is_refused(tmp_path):
@@ -143,7 +143,7 @@ def test_a_state_of_another_start_is_refused(tmp_path):
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     (tmp_path / "search" / "start_0000.npz").rename(tmp_path / "search" / "start_0001.npz")
     with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
-        search(settings=SMALL, rules=QUICK, keep_in=tmp_path / "search", resume=True)
+        search(settings=SMALL, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
 
 
 def test_a_generation_that_fits_no_memory_is_refused():
@@ -154,12 +154,12 @@ def test_a_generation_that_fits_no_memory_is_refused():
 
 def test_the_executor_does_not_matter():
     with ThreadPoolExecutor(1) as one:
-        assert search(settings=SMALL, executor=one).morphology == search(settings=SMALL).morphology
+        assert search(settings=SMALL, run=SearchRun(executor=one)).morphology == search(settings=SMALL).morphology
 
 
 def test_a_time_budget_ends_it_with_the_best_so_far():
     settings = SMALL.model_copy(update={"steps": 1_000_000})
-    found = search(settings=settings, time_budget=1.0)
+    found = search(settings=settings, run=SearchRun(time_budget=1.0))
     assert found.stopped == "out of time"
     assert found.violations == []
     assert found.seconds < 30
@@ -176,10 +176,10 @@ def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatc
 
 def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch):
     monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    found = search(settings=SMALL, time_budget=1e-6)
+    found = search(settings=SMALL, run=SearchRun(time_budget=1e-6))
     assert found.stopped == "out of time"
     assert found.morphology.knots.shape == (8, 5, 2)
-    assert search(settings=SMALL, time_budget=0.5).stopped == "out of time"
+    assert search(settings=SMALL, run=SearchRun(time_budget=0.5)).stopped == "out of time"
 
 
 def test_a_search_from_a_pad_improves_on_it():

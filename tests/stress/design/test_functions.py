@@ -27,7 +27,7 @@ from design import (
 from design.criteria.rules import check_rules
 from design.criteria.score import score
 from design.evaluation.localisation_error import localisation_error
-from design.optimisers.search import search
+from design.optimisers.search import SearchRun, search
 from design.report.plan_drawing import draw_plan
 from design.settings import PadSettings, RulesSettings, SearchSettings
 from tests.stress.clock import ends_in_time, few
@@ -82,8 +82,8 @@ def numbers(found: Any, given: Arguments) -> None:
 def ignored(found: Any, given: Arguments) -> None: ...
 
 
-def quick_search(**given: Any) -> Any:
-    return search(PadSettings(grid=1), settings=SMALL, **given)
+def quick_search(contact: Any, rules: Any, origin: Any, **run: Any) -> Any:
+    return search(PadSettings(grid=1), contact, SMALL, rules, origin=origin, run=SearchRun(**run))
 
 
 CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Arguments], None]]] = {
@@ -267,7 +267,7 @@ def test_a_short_search_of_any_settings_gives_a_pad(data):
             asked,
             rules,
             origin=origin,
-            time_budget=3.0,
+            run=SearchRun(time_budget=3.0),
         )
     a_pad(found.morphology, {})
     numbers(found.terms, {})

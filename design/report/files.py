@@ -1,0 +1,105 @@
+"""A search as it is asked for: settings in; morphology.json, design.json and the plan out."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from design.common.command_line import progress
+from design.common.errors import InputError
+from design.common.figures import save_figure
+from design.common.files import provenance, write_json
+from design.common.profiling import stage
+from design.criteria.rules import check_rules
+from design.optimisers.search import SearchResult, SearchRun, search
+from design.pad.morphology import Morphology
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+
+from .plan_drawing import draw_plan
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from design.common.settings import Spec
+    from design.optimisers.search import Report
+
+
+def run_search(
+    spec: "Spec", out: Path, overrides: dict[str, Any], origin: str = "random", run: SearchRun | None = None
+) -> tuple[dict[str, Any], SearchResult]:
+    """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result.
+
+    Args:
+        overrides: of the settings of the search, by name; those that are not None count.
+        origin: "random", "straight" or the file of a morphology to start from, which also says how many knots a fibre
+            has unless `overrides` does.
+        run: how long it may take and on what it runs; its states are kept in `out`, and a bar tells its progress.
+    """
+    pad, contact, rules = spec.section(PadSettings), spec.section(Contact), spec.section(RulesSettings)
+    begin, inputs = None, []
+    if origin == "straight":
+        begin = Morphology.straight(pad.grid, pad.pitch_mm)
+    elif origin != "random":
+        begin, inputs = Morphology.load(origin), [Path(origin)]
+        overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
+    settings = spec.section(SearchSettings, **overrides)
+    with progress() as bar:
+        run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
+        result = search(pad, contact, settings, rules, origin=begin, run=run)
+    made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
+    used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
+    made_by["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}
+    Morphology(result.morphology.knots, pad.pitch_mm, made_by).save(out / "morphology.json")
+    document = {
+        "format": "padforge-design/1",
+        "terms": result.terms,
+        "violations": [asdict(violation) for violation in result.violations],
+        "history": result.history,
+        "seconds": round(result.seconds, 3),
+        "stopped": result.stopped,
+        "provenance": made_by,
+    }
+    with stage("figures"):
+        figure = draw_plan(result.morphology, contact, result.violations)
+        save_figure(figure, out / "design.svg")
+        save_figure(figure, out / "design.png")
+    write_json(out / "design.json", document)
+    return document, result
+
+
+def write_plan(spec: "Spec", pad: Morphology, path: Path) -> None:
+    """Draw a pad with the contact and rules of `spec` to `path`.
+
+    Raises:
+        InputError: a path that ends neither in .svg nor in .png, or cannot be written.
+    """
+    if path.suffix.lower() not in (".svg", ".png"):
+        raise InputError(f"--out is {path}, allowed are .svg and .png")
+    save_figure(draw_plan(pad, spec.section(Contact), check_rules(pad, spec.section(RulesSettings))), path)
+
+
+def search_lines(result: SearchResult, out: Path) -> list[str]:
+    """What a person wants to know of a search, in a few lines."""
+    spread = [value for name, value in result.terms.items() if name.startswith("ambiguity")]
+    lost = " / ".join(f"{value:.3f}" for value in spread)
+    broken = [f"  broken  {violation}" for violation in result.violations[:10]]
+    more = len(result.violations) - len(broken)
+    return [
+        f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
+        + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
+        f"  ambiguity {lost} grid units under noise, with {' / '.join(map(str, range(len(spread))))} fibres lost",
+        *(broken or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
+        *([f"  ... and {more} more"] if more > 0 else []),
+    ]
+
+
+def _shown_on(bar: "Progress") -> "Report":
+    tasks: dict[str, TaskID] = {}
+    best: list[float] = []
+
+    def report(run: str, done: int, total: int, objective: float) -> None:
+        if run not in tasks:
+            tasks[run] = bar.add_task(run, total=total, note="")
+        best[:] = [min([objective, *best])]
+        bar.update(tasks[run], completed=done, note=f"objective {objective:.4f}, best {best[0]:.4f}")
+
+    return report
