@@ -1,0 +1,67 @@
+"""`padforge sense` from the outside: files in, files out, one line for a mistake."""
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import padforge
+from design import Morphology
+from design.common.settings import Spec
+from sense.cli.calibration import run_calibration
+from sense.rig.operation import record_simulated
+
+SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Run `padforge sense ...` in a folder with a pad.toml; gives exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    Path("pad.toml").write_text(SPEC)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["padforge", "sense", *arguments])
+        with pytest.raises(SystemExit) as caught:
+            padforge.main()
+        out, err = capsys.readouterr()
+        return caught.value.code or 0, out, err  # type: ignore[return-value]
+
+    return run
+
+
+def made(folder: Path, presses: int) -> Path:
+    """A folder with a recording `rec` of so many presses, and `model`, calibrated by it."""
+    (folder / "pad.toml").write_text(SPEC)
+    spec = Spec.load(folder / "pad.toml")
+    recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
+    run_calibration(spec, recording, folder / "model", {})
+    return folder
+
+
+@pytest.fixture(scope="session")
+def _few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made(tmp_path_factory.mktemp("few"), 60)
+
+
+@pytest.fixture(scope="session")
+def _enough(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made(tmp_path_factory.mktemp("enough"), 360)
+
+
+@pytest.fixture
+def few(padforge_sense: Run, _few: Path) -> Run:
+    """As `padforge_sense`, in a folder with `rec` of 60 presses and `model`."""
+    shutil.copytree(_few, Path(), dirs_exist_ok=True)
+    return padforge_sense
+
+
+@pytest.fixture
+def enough(padforge_sense: Run, _enough: Path) -> Run:
+    """As `few`, with presses enough for health to be learnt."""
+    shutil.copytree(_enough, Path(), dirs_exist_ok=True)
+    return padforge_sense

@@ -1,0 +1,15 @@
+from pathlib import Path
+
+
+def test_the_model_given_is_never_written_over_unasked(few) -> None:
+    """Its folder may be that of the new recording too."""
+    few("record", "--presses", "20", "--seed", "2", "--out", "model/later")
+    before = {path.name: path.read_bytes() for path in Path("model").iterdir() if path.is_file()}
+    code, out, err = few("recalibrate", "--model", "./model", "model/later")
+    assert (code, out) == (2, "")
+    assert err == "padforge: model: holds the old model; name a folder for the new one with --out\n"
+    assert {path.name: path.read_bytes() for path in Path("model").iterdir() if path.is_file()} == before
+    assert few("recalibrate", "--model", "model", "rec")[0] == 0
+    assert Path("recalibration.json").exists()
+    assert Path("localizer.json").read_bytes() != before["localizer.json"]
+    assert {path.name: path.read_bytes() for path in Path("model").iterdir() if path.is_file()} == before

@@ -1,0 +1,73 @@
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import sense.cli.calibration
+import sense.report.calibration_figures
+
+
+def test_a_recording_is_learnt_from_and_evaluated(few) -> None:
+    code, out, _ = few("calibrate", "rec", "--test-split", "chronological", "--out", "new", "--json")
+    assert code == 0
+    document = json.loads(out)
+    assert document == json.loads(Path("new/calibration.json").read_text())
+    assert document["split"] == "chronological"
+    assert document["test"]["press"] == list(range(51, 60))
+    for name in ("error_map.png", "error_by_loss.png"):
+        assert Path("new", name).read_bytes()[:4] == b"\x89PNG"
+    for lost, levels in (("0", 1), ("2", 3), ("8", 4)):  # of 4 fibres one is left
+        code, out, _ = few("evaluate", "--model", "new", "rec", "--lost", lost, "--json")
+        assert code == 0
+        assert json.loads(out)["errors"] == document["errors"][:levels]
+
+
+def test_results_go_to_the_folder_of_the_pad(few) -> None:
+    before = Path("model/localizer.json").read_bytes()
+    assert few("calibrate", "rec", "--seed", "5")[0] == 0
+    assert json.loads(Path("calibration.json").read_text())["provenance"]["seed"] == 5
+    assert Path("localizer.json").exists()
+    assert Path("model/localizer.json").read_bytes() == before
+
+
+def test_interrupted_training_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def reported(name: str) -> Iterator[object]:
+        def report(done: int, total: int) -> None:
+            assert name == "training"
+            raise KeyboardInterrupt
+
+        yield report
+
+    monkeypatch.setattr(sense.cli.calibration, "reported", reported)
+    code, _, err = few("calibrate", "rec", "--out", "new")
+    assert code == 130
+    assert "interrupted" in err
+    assert not Path("new").exists()
+
+
+def test_a_torn_recording_is_said_to_be_one(few) -> None:
+    content = Path("rec/readings.bin").read_bytes()
+    Path("rec/readings.bin").write_bytes(content[:-100])
+    code, _, err = few("evaluate", "--model", "model", "rec", "--lost", "0")
+    assert code == 0
+    assert "last 1 presses are left out" in err
+
+
+def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {path.name: path.read_bytes() for path in Path("model").iterdir()}
+
+    def full(document: object, path: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sense.report.calibration_figures, "draw_error_by_loss", full)
+        code, _, err = few("calibrate", "rec", "--seed", "5", "--out", "model")
+    assert code == 2
+    assert "model: cannot be written (No space left on device)" in err.splitlines()[-1]
+    assert {path.name: path.read_bytes() for path in Path("model").iterdir()} == before
+    assert few("calibrate", "rec", "--seed", "5", "--out", "model")[0] == 0
+    assert {path.name for path in Path("model").iterdir()} == set(before)
+    assert Path("model/localizer.json").read_bytes() != before["localizer.json"]

@@ -1,0 +1,53 @@
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_mistakes_are_one_line_and_leave_nothing(padforge_sense) -> None:
+    Path("noise.mat").write_bytes(b"no matlab" * 100)
+    Path("noise.csv").write_text("a,b\n1,2\n")
+    Path("noise.txt").write_text("hello")
+    for name in ("noise.mat", "noise.csv", "noise.txt", "absent.mat", "absent.csv"):
+        code, out, err = padforge_sense("import", name, "--out", "rec")
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert name in err
+        assert not Path("rec").exists()
+    for arguments in (
+        ("calibrate", ".", "--out", "model"),
+        ("record", "--presses", "0", "--out", "rec"),
+        ("evaluate", "--model", "model", "rec", "--lost", "a"),
+        ("evaluate", "--model", "model", "rec", "--lost", "0,1"),
+        ("locate", "--model", "absent", ".", "--out", "p.csv"),
+    ):
+        code, out, err = padforge_sense(*arguments)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+    assert sorted(path.name for path in Path().iterdir()) == ["noise.csv", "noise.mat", "noise.txt", "pad.toml"]
+
+
+def test_importing_takes_no_torch() -> None:
+    modules = ("sense", "sense.cli.main", "sense.settings", "sense.localizer.localizer")
+    code = (
+        f"import importlib, sys\nfor name in {(*modules, 'sense.localizer.calibration.calibration')}:\n"
+        "    importlib.import_module(name)\n"
+        "    assert not {'torch', 'matplotlib'} & set(sys.modules), name\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_numbers_and_places_that_cannot_be_are_one_line(few) -> None:
+    huge = "9" * 20
+    for arguments, message in (
+        (("locate", "--model", "model", "rec", "--mask", huge, "--out", "p.csv"), f"fibre {huge}: no such fibre"),
+        (("evaluate", "--model", "model", "rec", "--lost", huge), f"{huge} is not in the range 0<=x<=8"),
+        (("evaluate", "--model", "model", "rec", "--lost", ""), "'' is not a valid integer"),
+        (("locate", "--model", "model", "rec", "--out", "pad.toml/p.csv"), "pad.toml/p.csv: cannot be written"),
+        (("locate", "--model", "model", "rec", "--out", "model"), "directory"),
+        (("calibrate", "rec", "--out", "pad.toml/model"), "pad.toml is a file, expected a folder"),
+        (("calibrate", "pad.toml", "--out", "m"), "pad.toml: no recording, expected a folder"),
+        (("calibrate", "absent", "--out", "m"), "absent: no recording, expected a folder with start.json"),
+        (("record", "--out", "pad.toml/rec"), "pad.toml is a file, expected a folder"),
+        (("import", "rec", "--out", "r"), "is a directory"),
+    ):
+        code, out, err = few(*arguments)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert message in err
