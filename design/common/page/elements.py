@@ -1,17 +1,27 @@
-"""Self-contained HTML pages: everything inlined, no network, readable on a phone and on paper."""
+"""Self-contained HTML pages: everything inlined, no network, readable on a phone and on paper.
+
+How they look is in `page.html`, `elements.html` and `page.css`; here is what goes into them.
+"""
 
 import base64
 import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from html import escape
+from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markdown_it import MarkdownIt
+from markdown_it.tree import SyntaxTreeNode
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
+
+_HERE = "design.common.page"
 
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
@@ -27,8 +37,8 @@ _SHORT = 16
 _LONG = 30
 """Words of more letters are broken."""
 
-_CLASSES = ("pass", "warn", "fail", "number", "short", "long")
-"""Styles of cells."""
+_VERDICTS = ("pass", "warn", "fail")
+"""Cells of these words are coloured."""
 
 
 @dataclass(frozen=True)
@@ -58,30 +68,35 @@ def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
 
     Nothing is let in from elsewhere, and no script runs but those of the sections and of the page itself.
     """
-    scripts = [resource("design.common.page", "page.js"), *(section.script for section in sections if section.script)]
-    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
-    allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
-    policy = (
-        "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
-        f"script-src {allowed}"
+    scripts = [resource(_HERE, "page.js"), *(section.script for section in sections if section.script)]
+    content = {
+        "title": title,
+        "lead": lead,
+        "sections": sections,
+        "key_figures": [figure for section in sections for figure in section.figures],
+        "style": resource(_HERE, "page.css"),
+        "scripts": scripts,
+        "digests": [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts],
+    }
+    return _templates().get_template("page.html").render(content)
+
+
+@cache
+def _templates() -> Environment:
+    return Environment(
+        loader=PackageLoader(_HERE, ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
-    links = "".join(f'<li><a href="#{section.anchor}">{escape(section.title)}</a></li>' for section in sections)
-    return "\n".join(
-        [
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<meta name="color-scheme" content="light"><link rel="icon" href="data:,">',
-            f"<title>{escape(title)}</title><style>\n{resource('design.common.page', 'page.css')}</style></head><body>",
-            f'<header><h1>{escape(title)}</h1><p class="lead">{escape(lead)}</p>',
-            f'<nav aria-label="Contents"><ul>{links}</ul></nav></header><main>',
-            tiles([figure for section in sections for figure in section.figures]),
-            *map(_section, sections),
-            "</main>",
-            *(f"<script>{script}</script>" for script in scripts),
-            "</body></html>\n",
-        ]
-    )
+
+
+def _element(kind: str, *content: object) -> str:
+    """An element of `elements.html`."""
+    elements: Any = _templates().get_template("elements.html").module
+    return getattr(elements, kind)(*content)
 
 
 def resource(package: str, name: str) -> str:
@@ -91,43 +106,32 @@ def resource(package: str, name: str) -> str:
 
 def heading(text: str) -> str:
     """A heading within a section."""
-    return f"<h3>{escape(text)}</h3>"
+    return _element("heading", text)
 
 
 def paragraph(text: str) -> str:
     """A paragraph of plain text."""
-    return f"<p>{escape(text)}</p>"
-
-
-def tiles(values: Sequence[tuple[str, str]]) -> str:
-    """Key figures side by side, as (value, what it is)."""
-    cells = "".join(f'<div class="tile"><b>{escape(value)}</b> {escape(name)}</div>' for value, name in values)
-    return f'<div class="tiles">{cells}</div>'
+    return _element("paragraph", text)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A table; cells that say pass, warn or fail are coloured, columns of numbers stand flush right."""
     cells = [[_text(value) for value in row] for row in rows]
     kinds = [_kind(column) for column in zip(*cells, strict=True)] or [""] * len(header)
-    head = "".join(
-        f'<th scope="col"{_class(kind)}>{escape(name)}</th>' for name, kind in zip(header, kinds, strict=True)
-    )
-    lines = (
-        "".join(f"<td{_class(text, kind)}>{escape(text)}</td>" for text, kind in zip(row, kinds, strict=True))
-        for row in cells
-    )
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    body = [
+        [(text, text if text in _VERDICTS else kind) for text, kind in zip(row, kinds, strict=True)] for row in cells
+    ]
+    return _element("table", list(zip(header, kinds, strict=True)), body)
 
 
 def beside(*columns: Sequence[str]) -> str:
     """Pieces in columns, below each other where there is no room."""
-    return f'<div class="columns">{"".join(f"<div>{chr(10).join(column)}</div>" for column in columns)}</div>'
+    return _element("beside", columns)
 
 
 def folded(summary: str, body: Sequence[str]) -> str:
     """Pieces that are seen once `summary` is clicked, and on paper."""
-    return f"<details><summary>{escape(summary)}</summary>{''.join(body)}</details>"
+    return _element("folded", summary, body)
 
 
 def figures(pictures: Sequence[tuple[Path, str]]) -> str:
@@ -136,39 +140,49 @@ def figures(pictures: Sequence[tuple[Path, str]]) -> str:
     Raises:
         InputError: a file that is no such picture, or is torn.
     """
-    found = [_figure(path, caption) for path, caption in pictures if path.is_file()]
-    return f'<div class="figures">{"".join(found)}</div>' if found else ""
+    found = [_picture(path, caption) for path, caption in pictures if path.is_file()]
+    return _element("figures", found) if found else ""
 
 
-def _section(section: PageSection) -> str:
-    head = f'<h2 id="{section.anchor}">{escape(section.title)}</h2>'
-    return f'<section aria-labelledby="{section.anchor}">{head}\n' + "\n".join(section.body) + "</section>"
+def html_pieces(text: str) -> Iterator[str]:
+    """HTML of Markdown: paragraphs, lists, tables, headings, **bold** and `code`; its title is left out.
+
+    What is no such mark is text, HTML too.
+    """
+    reader = MarkdownIt("zero", {"html": False}).enable(["heading", "list", "table", "emphasis", "backticks"])
+    for block in SyntaxTreeNode(reader.parse(text)).children:
+        if block.type == "heading":
+            if block.tag != "h1":
+                yield heading(block.children[0].content)
+        elif block.type == "table":
+            head, *rows = ([cell.children[0].content for cell in row.children] for part in block for row in part)
+            yield table(head, rows)
+        else:
+            yield reader.renderer.render(block.to_tokens(), reader.options, {})
 
 
-def _figure(path: Path, caption: str) -> str:
+def _picture(path: Path, caption: str) -> dict[str, Any]:
     content = read_bytes(path, _MOST_PICTURE)
     try:
         size = _png_size(path) if path.suffix == ".png" else _svg_size(content)
     except Exception as error:  # readers of broken pictures raise whatever comes
         raise InputError(f"{path}: not a picture that can be read ({error})") from error
     source = f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode()}"
-    image = f'<img alt="{escape(caption)}"{size} src="{source}">'
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+    return {"caption": caption, "size": size, "source": source}
 
 
-def _png_size(path: Path) -> str:
+def _png_size(path: Path) -> tuple[int, int]:
     from PIL import Image
 
     with Image.open(path, formats=["PNG"]) as picture:
-        width, height = picture.size
+        size = picture.size
         picture.verify()
-    return f' width="{width}" height="{height}"'
+    return size
 
 
-def _svg_size(content: bytes) -> str:
+def _svg_size(content: bytes) -> None:
     """None: an SVG says its own; but it must be one."""
     ElementTree.fromstring(content)
-    return ""
 
 
 def _text(value: object) -> str:
@@ -186,42 +200,3 @@ def _kind(column: Sequence[str]) -> str:
     if max(map(len, column)) <= _SHORT:
         return "short"
     return "long" if any(len(word) > _LONG for text in column for word in text.split()) else ""
-
-
-def _class(*names: str) -> str:
-    """The first of the names that stands for a style."""
-    known = [name for name in names if name in _CLASSES]
-    return f' class="{known[0]}"' if known else ""
-
-
-_ITEM = re.compile(r"(-|\d+\.) (.*)")
-
-_MARKS = ((re.compile(r"\*\*(.+?)\*\*"), r"<b>\1</b>"), (re.compile(r"`(.+?)`"), r"<code>\1</code>"))
-
-
-def html_pieces(text: str) -> Iterator[str]:
-    """HTML of paragraphs, lists, tables, headings below the title, **bold** and `code`; the title is left out.
-
-    A paragraph and an item of a list are a line each; what is no such mark is text.
-    """
-    for block in text.strip().split("\n\n"):
-        lines = block.strip().split("\n")
-        if block.startswith("# "):
-            continue
-        if block.startswith("## "):
-            yield heading(block[3:])
-        elif block.startswith("| "):
-            head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
-            yield table(head, rows)
-        elif items := [item for item in map(_ITEM.fullmatch, lines) if item]:
-            kind = "ul" if items[0][1] == "-" else "ol"
-            yield f"<{kind}>{''.join(f'<li>{_inline(item[2])}</li>' for item in items)}</{kind}>"
-        else:
-            yield from (f"<p>{_inline(line)}</p>" for line in lines)
-
-
-def _inline(text: str) -> str:
-    text = escape(text)
-    for mark, element in _MARKS:
-        text = mark.sub(element, text)
-    return text

@@ -3,10 +3,10 @@
 import json
 import re
 import shutil
-from html import escape
 from pathlib import Path
 
 import pytest
+from markupsafe import escape
 
 from design.common.errors import InputError
 from design.common.files import provenance
