@@ -23,7 +23,7 @@ from .assembly import mould_body
 from .plan import Plan, polygon_rings
 from .prisms import Body, Prism
 
-KNOTS = (1, 5, 20)
+GRID, KNOTS = 4, (1, 5, 20)
 TOLERANCES_MM = (0.05, 0.01, 0.002)
 FUSED_UP_TO = 5
 """Beyond so many knots a fibre, Boolean operations of the CAD kernel take minutes."""
@@ -43,7 +43,7 @@ def trials() -> Iterator[BenchTrial]:
     or faces of the CAD solid, "file_bytes" the size of its STL or of its STEP.
     """
     for knots in KNOTS:
-        pad = Morphology.random(4, knots, SEED)
+        pad = Morphology.random(GRID, knots, SEED)
         for tolerance in TOLERANCES_MM:
             settings = replace(DEFAULTS, mould=MouldSettings(tolerance_mm=tolerance, number_mm=0))
             plan = partial(Plan, pad, settings)
@@ -72,7 +72,6 @@ def _direct(new_plan: Callable[[], Plan]) -> Any:
 
 
 def _fused(new_plan: Callable[[], Plan]) -> Any:
-
     return fused_solid(mould_body(new_plan()))
 
 
