@@ -1,4 +1,6 @@
 from .health.health_model import HealthModel as HealthModel
+from .health.learning import fit_health_model as fit_health_model
+from .health.learning import learn_health as learn_health
 from .health.monitor import FibreFault as FibreFault
 from .health.monitor import Monitor as Monitor
 from .health.monitor import examine as examine

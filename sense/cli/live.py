@@ -114,13 +114,13 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
 
 def _health(model: Path) -> "HealthModel | None":
     """What was learnt of a healthy pad, if it was."""
-    from sense.health.health_model import FELT, HealthModel
+    from sense.health.health_model import DETECTED, HealthModel
     from sense.health.model_folder import has_health
 
-    if not has_health(model, FELT):
+    if not has_health(model, DETECTED):
         click.echo(f"{model}: health was not learnt, so no fibre will be found bad", err=True)
         return None
-    return HealthModel.load(model, FELT)
+    return HealthModel.load(model, DETECTED)
 
 
 def _json(view: dict[str, Any], events: "Sequence[Event]") -> None:

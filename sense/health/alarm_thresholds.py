@@ -1,12 +1,15 @@
+"""How high likelihood ratios climb on healthy presses by chance, and so what height names a fibre."""
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sense.health.fault_likelihoods import HYPOTHESES, Array
+from .fault_likelihoods import HYPOTHESES, Array
 
 NEVER = 1e5
 """A height that no climb reaches."""
+_LEAST_PEAKS = 30
 
 
 def climb(height: Array, stay: Array, begin: Array) -> Array:
@@ -65,9 +68,6 @@ def _tail(stay: Array, begin: Array) -> tuple[Array, Array]:
         rates = np.log([top / len(stay), 1 / len(stay)])
         level[hypothesis] = (np.array([base, peaks[-1]]) + slope[hypothesis] * rates).max()
     return level, slope
-
-
-_LEAST_PEAKS = 30
 
 
 def _peaks(heights: Array) -> Array:

@@ -10,7 +10,6 @@ distribution", IEEE ICNN 1994; ensembles of it: B. Lakshminarayanan, A. Pritzel,
 predictive uncertainty estimation using deep ensembles", NeurIPS 2017.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,7 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from design.common.computing import one_torch_thread
 from sense.processing.limits import LEAST_SPREAD_V
+
+from .trained_model import average_in, one_cycle
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -48,7 +50,7 @@ MEMBERS, HIDDEN, STEPS, BATCH, RATE = 3, 128, 2500, 96, 3e-3
 LEFT_OUT = (0.6, 0.25, 0.15)
 """How often training leaves out 1, 2 and 3 fibres."""
 INPUT_NOISE = 0.02
-WARM_UP, WEIGHT_DECAY, AVERAGE = 0.2, 1e-2, 0.998
+WEIGHT_DECAY = 1e-2
 LOG_SPREAD = (-4.0, 2.0)
 """Range of the logarithm of a predicted spread."""
 
@@ -188,15 +190,8 @@ def train_predictors(
     Returns:
         Weights of an ensemble of len(rows).
     """
-    import torch
-
-    # Matrices this small gain little from a second thread, and wait long for one that another program has.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         return _train(inputs, targets, rows, int(rng.integers(2**63)))
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _train(inputs: Floats, targets: Array, rows: list[Indices], seed: int) -> dict[str, Floats]:
@@ -223,7 +218,7 @@ def _train(inputs: Floats, targets: Array, rows: list[Indices], seed: int) -> di
     optimizer = torch.optim.AdamW(weights.values(), lr=RATE, weight_decay=WEIGHT_DECAY, fused=True)
     ranges = [torch.from_numpy(row) for row in rows]
     shares = torch.tensor(LEFT_OUT[: max(fibres - 1, 1)])
-    for step in range(STEPS):
+    for step in range(1, STEPS + 1):
         chosen = torch.stack([r[torch.randint(len(r), (BATCH,), generator=generator)] for r in ranges])
         count = 1 + torch.multinomial(shares, members * BATCH, replacement=True, generator=generator)
         order = torch.rand(members, BATCH, fibres, generator=generator).argsort(dim=2)
@@ -242,12 +237,7 @@ def _train(inputs: Floats, targets: Array, rows: list[Indices], seed: int) -> di
         loss = ((likelihood + error / 4) * out).sum(dim=(1, 2, 3)) / out.sum(dim=(1, 2, 3))
         optimizer.zero_grad()
         loss.sum().backward()
-        share = (step + 1) / STEPS
-        cosine = 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
-        optimizer.param_groups[0]["lr"] = RATE * (share / WARM_UP if share < WARM_UP else cosine)
+        optimizer.param_groups[0]["lr"] = RATE * one_cycle(step / STEPS)
         optimizer.step()
-        keep = min(AVERAGE, (step + 1) / (step + 10))
-        with torch.no_grad():
-            for kept, weight in zip(average, weights.values(), strict=True):
-                kept.lerp_(weight, 1 - keep)
+        average_in(average, weights.values(), step)
     return {name: weight.numpy() for name, weight in zip(weights, average, strict=True)}

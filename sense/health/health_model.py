@@ -3,8 +3,6 @@
 `monitor` follows presses by it and names the fibre that is lost, damaged or drifting.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,31 +10,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
-from design.common.errors import InputError, instance, real
-from design.common.files import atomic, read_bytes, read_json, writing
+from design.common.errors import InputError
+from design.common.files import read_json
 from design.common.settings import validated
-from sense.processing.limits import LEAST_SPREAD_V, as_numbers, stream_of
+from sense.processing.limits import as_numbers, stream_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import HYPOTHESES, Evidence
-from .fibre_prediction import MEMBERS, REST, Shapes, Weights, expected, member, shapes_of, traces_of, train_predictors
-from .schema import FORMAT, LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, WEAK_PRESSES, HealthDocument, refuse_unsound
+from .fibre_prediction import Shapes, Weights
+from .schema import FORMAT, HealthDocument, refuse_unsound
+from .trained_model import files_of, refuse_other_pad
 
-RECORDED, FELT = "health", "health_live"
+COMMANDED, DETECTED = "health", "health_live"
 """Names of the files of a model: learnt from presses as they were commanded, and as they are found in the readings."""
 FALSE_ALARMS = 1e-5
 """False alarms a press, all fibres and kinds of fault together: one in 100 000 healthy presses."""
-BLOCK = 50
-"""Each member learns from all presses but its own fold, of blocks of successive ones: neighbours share what drifts."""
-LOSSES = 4
-"""Random choices of fibres left out from which it is learnt what is chance without them."""
 SETTLED = 10
 """Presses after which the running level of a rest is worth comparing with."""
-RATE_TOLERANCE = 0.25
-"""Traces are counted in readings, so a recording must be about as fast as the one that was learnt from."""
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -77,106 +68,16 @@ class HealthModel:
         """Rarity (`Tail.rarity`) that names a fibre: every hypothesis has an equal part of the false alarms."""
         return float(np.log(len(HYPOTHESES) / self.false_alarms))
 
-    @classmethod
-    def fit(
-        cls,
-        readings: Array,
-        times_s: Array,
-        begun: Indices,
-        lifted: Indices,
-        *,
-        rng: np.random.Generator,
-        false_alarms: float = FALSE_ALARMS,
-        provenance: Mapping[str, Any] | None = None,
-    ) -> "HealthModel":
-        """Learn from a recording of a healthy pad.
-
-        Presses that lack a reading (NaN) of a living fibre are left out. One living fibre is enough for what its own
-        readings tell (stuck, noisy, offset); whether it answers rightly only two or more tell. From fewer than
-        WEAK_PRESSES a press at an unusual place looks like a weak fibre; such models never call one weak.
-
-        Args:
-            readings: (R, C) volts, NaN where missing. times_s: (R,) ascending, s.
-            begun, lifted: (Q,) first reading after the probe was sent down, and up.
-            rng: source of all that is random. false_alarms: above 0, at most 0.1.
-
-        Raises:
-            InputError: shapes, indices or the rate of false alarms out of range, fewer than 300 presses that are
-                whole, or no living fibre.
-        """
-        if not (false_alarms := real("false alarms a press", false_alarms, 0.0, MAX_FALSE_ALARMS)) > 0:
-            raise InputError(f"false alarms a press are {false_alarms}, allowed is above 0 to {MAX_FALSE_ALARMS}")
-        instance("rng", rng, np.random.Generator)
-        readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
-        dead = _dead(readings)
-        living = np.setdiff1d(np.arange(readings.shape[1]), dead)
-        if len(living) == 0:
-            raise InputError(f"all {len(dead)} fibres are dead: they read one value, or nothing; one must live")
-        traces = traces_of(readings[:, living], begun, lifted)
-        traces = traces[np.isfinite(traces).all(axis=(1, 2))]
-        if len(traces) < LEAST_PRESSES:
-            raise InputError(
-                f"recording has {len(traces)} whole presses, health is learnt from {LEAST_PRESSES} or more"
-            )
-
-        shapes, inputs, targets = shapes_of(traces)
-        presses = np.arange(len(traces))
-        fold, settled = presses // min(BLOCK, len(traces) // (4 * MEMBERS)) % MEMBERS, presses >= SETTLED
-        weights = train_predictors(
-            inputs, targets, [np.flatnonzero(settled & (fold != k)) for k in range(MEMBERS)], rng
-        )
-
-        def judged(lost: Indices) -> tuple[Array, Array]:
-            """Means and spreads without the fibres `lost`, by the member that never saw the press: of its own presses
-            a network thinks too well."""
-            mean, spread = np.empty_like(targets), np.empty_like(targets)
-            for k in range(MEMBERS):
-                own = fold == k
-                alive = np.tile(~np.isin(np.arange(len(living)), lost), (own.sum(), 1))
-                mean[own], spread[own] = expected(member(weights, k), inputs[own], alive)
-            return mean[settled], spread[settled]
-
-        measured = traces[settled], targets[settled]
-        evidence = Evidence.fit(*measured, *judged(np.array([], dtype=np.int64)), shapes.targets, rng)
-        ratios = []
-        for lost in range(min(MOST_LOST, len(living) - 1) + 1):
-            sets = [rng.permutation(len(living))[:lost] for _ in range(LOSSES if lost else 1)]
-            told = [_without(evidence.ratios(*measured, *judged(chosen)), chosen) for chosen in sets]
-            ratios.append((np.concatenate([stay for stay, _ in told]), np.concatenate([begin for _, begin in told])))
-        rests, tail = traces[:, :, :REST].mean(axis=2), Tail.fit(ratios)
-        return cls(
-            shapes=shapes,
-            weights=weights,
-            evidence=evidence,
-            tail=tail if len(traces) >= WEAK_PRESSES else tail.without("weak"),
-            rests=np.stack([rests.min(axis=0), rests.max(axis=0)]),
-            fibres=readings.shape[1],
-            dead=tuple(dead.tolist()),
-            rate_hz=_rate_hz(times_s),
-            presses=len(traces),
-            false_alarms=false_alarms,
-            provenance=provenance or {},
-        )
-
     def refuse_other(self, readings: Array, times_s: Array) -> None:
         """Raise InputError if a recording has other fibres or another rate than the one that was learnt from."""
-        if readings.shape[1] != self.fibres:
-            raise InputError(f"recording has {readings.shape[1]} fibres, health was learnt from {self.fibres}")
-        rate_hz = _rate_hz(times_s)
-        if abs(rate_hz / self.rate_hz - 1) > RATE_TOLERANCE:
-            raise InputError(
-                f"recording has {rate_hz:.3g} readings a second, allowed is {self.rate_hz:.3g}, "
-                f"at which health was learnt, within {RATE_TOLERANCE:.0%}"
-            )
+        refuse_other_pad(self, "health", readings.shape[1], rate_of(times_s))
 
-    def save(self, folder: str | Path, name: str = RECORDED) -> None:
+    def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; reading them back gives the same to the last bit.
 
         Raises:
             InputError: the provenance is no JSON, or `folder` cannot be written.
         """
-        path, weights = files_of(folder, name)
-        content = save({name: np.ascontiguousarray(array) for name, array in self._arrays().items()})
         document = {
             "format": FORMAT,
             "fibres": self.fibres,
@@ -184,38 +85,26 @@ class HealthModel:
             "rate_hz": self.rate_hz,
             "false_alarms": self.false_alarms,
             "presses": self.presses,
-            "weights_sha256": hashlib.sha256(content).hexdigest(),
+            "weights_sha256": "",  # known when they are written
             "provenance": dict(self.provenance),
         }
-        try:
-            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: health cannot be written as JSON ({error})") from error
-        with writing(path.parent), atomic(weights) as new_weights, atomic(path) as new_document:
-            new_weights.write_bytes(content)
-            new_document.write_text(text, encoding="utf-8")
+        files_of(folder, name).write(document, self._arrays(), "health")
 
     @classmethod
-    def load(cls, folder: str | Path, name: str = RECORDED) -> "HealthModel":
+    def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":
         """Read what `save` wrote.
 
         Raises:
             InputError: a file is missing, torn or of another kind, a value is none that `save` writes, or the two do
                 not belong together.
         """
-        path, weights = files_of(folder, name)
-        document = validated(HealthDocument, read_json(path, FORMAT), f"{path}:")
-        content = read_bytes(weights)
-        if hashlib.sha256(content).hexdigest() != document.weights_sha256:
-            raise InputError(f"{weights}: not the weights that {path.name} was written with; learn health again")
+        files = files_of(folder, name)
+        document = validated(HealthDocument, read_json(files.document, FORMAT), f"{files.document}:")
         dead = sorted(set(document.dead))
         if dead != document.dead or len(dead) >= document.fibres or not set(dead) < set(range(document.fibres)):
-            raise InputError(f"{path}: dead is {document.dead}, expected some of {document.fibres} fibres")
-        try:
-            arrays = load(content)
+            raise InputError(f"{files.document}: dead is {document.dead}, expected some of {document.fibres} fibres")
+        with files.arrays(document.weights_sha256, "the health") as arrays:
             refuse_unsound(arrays, document.fibres - len(dead))
-        except (KeyError, TypeError, ValueError, SafetensorError) as error:
-            raise InputError(f"{weights}: no weights of the health that {path.name} describes ({error})") from error
         parts: dict[str, dict[str, Any]] = {"shapes": {}, "weights": {}, "evidence": {}, "tail": {}}
         for name, array in arrays.items():
             part, _, key = name.partition(".")
@@ -242,11 +131,6 @@ class HealthModel:
         return flat | {"rests": self.rests}
 
 
-def files_of(folder: str | Path, name: str) -> tuple[Path, Path]:
-    """The document and the weights of the model `name` in a folder."""
-    return Path(folder) / f"{name}.json", Path(folder) / f"{name}.safetensors"
-
-
 def checked_presses(
     readings: ArrayLike, times_s: ArrayLike, begun: ArrayLike, lifted: ArrayLike
 ) -> tuple[Array, Array, Indices, Indices]:
@@ -271,23 +155,6 @@ def checked_presses(
     return readings, times_s, begun, lifted
 
 
-def _without(ratios: tuple[Array, Array], lost: Indices) -> tuple[Array, Array]:
-    """Ratios (Q, L, H) in which the fibres `lost` have no say."""
-    for ratio in ratios:
-        ratio[:, lost] = 0.0
-    return ratios
-
-
-def _rate_hz(times_s: Array) -> float:
+def rate_of(times_s: Array) -> float:
+    """Readings per second of a recording, by the median of the steps of its (R,) times, s."""
     return 1 / float(np.median(np.diff(times_s)))
-
-
-def _dead(readings: Array) -> Indices:
-    """Fibres that read one value, mostly nothing, or, unlike most, mostly the end of their range."""
-    missing = np.isnan(readings).mean(axis=0) > 0.5
-    spread = np.where(missing, 0.0, readings)
-    low, high = np.nanmin(spread, axis=0), np.nanmax(spread, axis=0)
-    at_end = np.maximum((spread == low).mean(axis=0), (spread == high).mean(axis=0))
-    # Where there is no noise every fibre rests at the end of its range.
-    saturated = (at_end > 0.5) & (np.median(at_end) <= 0.5)
-    return np.flatnonzero(missing | (high - low < LEAST_SPREAD_V) | saturated)

@@ -6,11 +6,12 @@ from pathlib import Path
 from sense.recordings.import_export import FOUND
 from sense.recordings.recording import Recording
 
-from .health_model import FELT, RECORDED, HealthModel, files_of
+from .health_model import COMMANDED, DETECTED, HealthModel
 from .monitor import FibreFault, examine
+from .trained_model import files_of
 
 
-def has_health(model: Path, name: str = RECORDED) -> bool:
+def has_health(model: Path, name: str = COMMANDED) -> bool:
     """Whether health was learnt into a folder."""
     return files_of(model, name)[0].exists()
 
@@ -21,20 +22,20 @@ def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[Fibre
     Raises:
         InputError: health was not learnt into this folder, or does not suit the recording.
     """
-    known = HealthModel.load(model, FELT if FOUND.items() <= recording.source.items() else RECORDED)
+    known = HealthModel.load(model, DETECTED if FOUND.items() <= recording.source.items() else COMMANDED)
     return known, examine(known, recording.readings, recording.times_s, recording.begun, recording.lifted)
 
 
 def forget_health(folder: Path) -> None:
     """Remove what an earlier calibration into a folder told health by: it must not speak for a later one."""
-    for name in (RECORDED, FELT):
+    for name in (COMMANDED, DETECTED):
         for file in files_of(folder, name):
             file.unlink(missing_ok=True)
 
 
 def copy_health(model: Path, folder: Path) -> None:
     """What a model tells health by goes to another folder: it was learnt without places."""
-    for name in (RECORDED, FELT):
+    for name in (COMMANDED, DETECTED):
         for file in files_of(model, name):
             if file.exists():
                 shutil.copyfile(file, folder / file.name)

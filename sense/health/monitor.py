@@ -67,8 +67,8 @@ class FibreFault:
 
     @property
     def text(self) -> str:
-        """One line."""
-        who = " and ".join(map(str, self.fibres))
+        """One line; fibres by number, the first is 1."""
+        who = " and ".join(str(fibre + 1) for fibre in self.fibres)
         return (
             f"fibre{'s' * (len(self.fibres) > 1)} {who} {TEXTS[self.kind]} ({self.kind}) since press {self.since}, "
             f"found at press {self.press}; by chance once in 1e{self.score:.0f} presses"
@@ -285,8 +285,11 @@ def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices,
 
 
 def fault_lines(findings: Sequence[FibreFault], fibres: int, dead: Sequence[int] = ()) -> list[str]:
-    """What to tell of a pad of so many fibres, of which `dead` never lived: a line each finding, and what is left."""
+    """What to tell of a pad of so many fibres, of which `dead` never lived: a line each finding, and what is left.
+
+    Fibres are counted from 1 in the lines, from 0 in `dead` and the findings.
+    """
     bad = {fibre for finding in findings for fibre in finding.fibres} | set(dead)
-    sound = [str(fibre) for fibre in range(fibres) if fibre not in bad]
-    told = [f"fibre {fibre} was dead in the recording that health was learnt from" for fibre in dead]
+    sound = [str(fibre + 1) for fibre in range(fibres) if fibre not in bad]
+    told = [f"fibre {fibre + 1} was dead in the recording that health was learnt from" for fibre in dead]
     return [*told, *(finding.text for finding in findings), f"sound fibres: {', '.join(sound) or 'none'}"]

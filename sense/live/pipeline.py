@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from design.common.errors import InputError, instance, real, shown, whole
 from sense.health.health_model import HealthModel
 from sense.health.monitor import FibreFault, Monitor
+from sense.health.trained_model import refuse_other_pad
 from sense.localizer.features import REST, bridged, press_inputs
-from sense.localizer.localizer import RATE_TOLERANCE, Localizer
+from sense.localizer.localizer import Localizer
 from sense.localizer.normalization import Scaled
 from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, stream_of
 from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
@@ -91,8 +92,10 @@ class Live:
             raise InputError(f"localizers are {shown(localizers)}, expected at least one")
         self._monitor = None if health is None else Monitor(health)
         models = [instance("localizers", each, Localizer) for each in localizers]
-        for model in (*models, *([] if health is None else [health])):
-            _refuse_other(model, fibres, rate_hz)
+        for model in models:
+            refuse_other_pad(model, "the localizer", fibres, rate_hz)
+        if health is not None:
+            refuse_other_pad(health, "health", fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda each: NEEDS[each.features][::-1])
         self._usual = _usual(self._localizers[-1])
         self._finder = Finder(fibres)
@@ -257,14 +260,3 @@ def _usual(localizer: Localizer) -> Array:
     """(C,) V, what a fibre's answer to a press goes up to."""
     usual = (np.abs(localizer.normalization.centre) + 2 * localizer.normalization.spread).max(axis=1)
     return np.where(usual > 0, usual, 1.0)
-
-
-def _refuse_other(model: Localizer | HealthModel, fibres: int, rate_hz: float) -> None:
-    name = "the localizer" if isinstance(model, Localizer) else "health"
-    if model.fibres != fibres:
-        raise InputError(f"readings are of {fibres} fibres, {name} was learnt from {model.fibres}")
-    if abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
-        raise InputError(
-            f"readings come {rate_hz:.3g} a second, allowed is {model.rate_hz:.3g}, at which {name} was learnt, "
-            f"within {RATE_TOLERANCE:.0%}"
-        )

@@ -1,7 +1,5 @@
 """The localizer: from the readings of a press to its place, with any fibres lost. Needs no torch."""
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
 from design.common.errors import InputError, instance, shown
-from design.common.files import atomic, read_bytes, read_json, writing
+from design.common.files import read_json
+from sense.health.trained_model import files_of, refuse_other_pad
 from sense.recordings.recording import Recording
 
 from .features import SIZES, Inputs, press_inputs
@@ -21,11 +18,10 @@ from .network import Floats, Weights, forward, masked, pooled, refuse_unsound
 from .normalization import Normalization, Scaled
 from .schema import FORMAT, read_document
 
-DOCUMENT, WEIGHTS = "localizer.json", "localizer.safetensors"
+NAME = "localizer"
+"""Of its files, `localizer.json` and `localizer.safetensors`."""
 TABLE = "table"
 """Name of the table among the weights."""
-RATE_TOLERANCE = 0.25
-"""Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
 UNKNOWN = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and the radii of 50 and 90 % for a place anywhere in a square of half-width 1."""
 _CHUNK = 8192
@@ -54,10 +50,10 @@ class Localizer:
 
     Attributes:
         weights: of the network, see `network.Weights`.
-        scaling: of its inputs and outputs.
-        table: (S, S, C, F) scaled inputs by place, see `response.Response`; what a recalibration moves presses by.
+        normalization: of its inputs and outputs.
+        table: (S, S, C, F) scaled inputs by place, see `ResponseModel`; what a recalibration moves presses by.
         method: which network and training, of `settings.Method`.
-        features: which inputs it takes, of `presses.FEATURES`.
+        features: which inputs it takes, of `features.FEATURES`.
         factors: (K, 3) by number of lost fibres, what makes of the expected error a standard deviation, and the radii
             of 50 % and of 90 %; found on presses never trained on.
         rate_hz: readings per second of the recording it learnt from.
@@ -96,13 +92,8 @@ class Localizer:
         Raises:
             InputError: the recording has other fibres or another rate than the one that was learnt from.
         """
-        if instance("recording", recording, Recording).fibres != self.fibres:
-            raise InputError(f"recording has {recording.fibres} fibres, the localizer was trained on {self.fibres}")
-        if abs(recording.rate_hz / self.rate_hz - 1) > RATE_TOLERANCE:
-            raise InputError(
-                f"recording has {recording.rate_hz:.3g} readings a second, allowed is {self.rate_hz:.3g}, "
-                f"at which the localizer was trained, within {RATE_TOLERANCE:.0%}"
-            )
+        instance("recording", recording, Recording)
+        refuse_other_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         return press_inputs(recording.readings, recording.begun, recording.lifted, self.features)
 
     def locate(self, presses: Scaled, lost: ArrayLike = ()) -> Found:
@@ -115,7 +106,7 @@ class Localizer:
         """
         alive: NDArray[np.bool_] = np.logical_and(presses.alive, self._alive(lost))
         if self.method == "published" and np.size(lost):
-            raise InputError(f"lost fibres {lost}: a published localizer knows none, train one of method masked")
+            raise InputError("fibres are lost: a published localizer knows none, train one of method masked")
         chunks = range(0, len(presses), _CHUNK)
         found = [self._pooled(presses.inputs[i : i + _CHUNK], alive[i : i + _CHUNK]) for i in chunks]
         places, spread = (
@@ -143,7 +134,7 @@ class Localizer:
             raise InputError(f"lost fibres are {shown(lost)}, expected their indices") from error
         for fibre in fibres:
             if type(fibre) is not int or not 0 <= fibre < self.fibres:
-                raise InputError(f"lost fibre {shown(fibre)}: no such fibre, allowed are 0 to {self.fibres - 1}")
+                raise InputError(f"lost fibre at index {shown(fibre)}: none, allowed are 0 to {self.fibres - 1}")
             alive[fibre] = False
         if not alive.any():
             raise InputError(f"all {self.fibres} fibres are lost, at least one must be left")
@@ -158,9 +149,6 @@ class Localizer:
         Raises:
             InputError: something is not finite or no JSON, or `folder` cannot be written.
         """
-        folder = Path(folder)
-        arrays = {**self.weights, TABLE: self.table}
-        content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {
             "format": FORMAT,
             "method": self.method,
@@ -176,7 +164,7 @@ class Localizer:
                 "span_mm": self.normalization.span_mm,
             },
             "factors": self.factors.tolist(),
-            "weights_sha256": hashlib.sha256(content).hexdigest(),
+            "weights_sha256": "",  # known when they are written
             "split": self.split,
             "test_presses": len(self.test),
             "errors": [dict(row) for row in self.errors],
@@ -185,13 +173,7 @@ class Localizer:
             "recalibrated_by": list(self.recalibrated_by),
             "provenance": dict(self.provenance),
         }
-        try:
-            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{folder / DOCUMENT}: localizer cannot be written as JSON ({error})") from error
-        with writing(folder), atomic(folder / WEIGHTS) as new_weights, atomic(folder / DOCUMENT) as new_document:
-            new_weights.write_bytes(content)
-            new_document.write_text(text, encoding="utf-8")
+        files_of(folder, NAME).write(document, {**self.weights, TABLE: self.table}, "localizer")
 
     @classmethod
     def load(cls, folder: str | Path) -> "Localizer":
@@ -201,12 +183,8 @@ class Localizer:
             InputError: a file is missing, torn or of another kind, a value is none that `save` writes, or the two do
                 not belong together.
         """
-        folder = Path(folder)
-        document = read_document(read_json(folder / DOCUMENT, FORMAT), str(folder / DOCUMENT))
-        path = folder / WEIGHTS
-        content = read_bytes(path)
-        if hashlib.sha256(content).hexdigest() != document.weights_sha256:
-            raise InputError(f"{path}: not the weights that {DOCUMENT} was written with; calibrate again")
+        files = files_of(folder, NAME)
+        document = read_document(read_json(files.document, FORMAT), str(files.document))
         normalization = Normalization(
             np.array(document.scaling.centre_v),
             np.array(document.scaling.spread_v),
@@ -215,13 +193,10 @@ class Localizer:
             np.array(document.scaling.middle_mm),
             document.scaling.span_mm,
         )
-        try:
-            weights = load(content)
+        with files.arrays(document.weights_sha256, "the localizer") as weights:
             table = weights.pop(TABLE)
             normalization.refuse_unsound(table)
             refuse_unsound(weights, normalization.entries(document.method), document.method)
-        except (KeyError, TypeError, ValueError, SafetensorError) as error:
-            raise InputError(f"{path}: no weights of the localizer that {DOCUMENT} describes ({error})") from error
         return cls(
             weights=weights,
             normalization=normalization,

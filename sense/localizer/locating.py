@@ -48,6 +48,6 @@ def locate(
     for finding in findings:
         fibres = list(instance("findings", finding, FibreFault).fibres)
         if max(fibres, default=0) >= localizer.fibres:
-            raise InputError(f"findings name fibre {max(fibres)}, allowed are 0 to {localizer.fibres - 1}")
+            raise InputError(f"findings name fibre {max(fibres) + 1}, allowed are 1 to {localizer.fibres}")
         alive[finding.since :, fibres] = False
     return localizer.locate(replace(presses, alive=alive), lost)

@@ -17,8 +17,8 @@ EARLY = 2
 """Readings before its command at which a press may show: commands are noted a little late."""
 
 
-def felt(readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> tuple[Indices, Indices]:
-    """Presses as `live.Live` would have them.
+def as_detected(readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> tuple[Indices, Indices]:
+    """Presses as one who follows the readings live would have them.
 
     Args:
         readings: (R, C) volts, NaN where missing. times_s: (R,) s.

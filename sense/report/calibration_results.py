@@ -55,7 +55,7 @@ def calibrate_into(
 def _health(recording: Recording, localizer: Localizer, warn: Callable[[str], None]) -> dict[str, HealthModel]:
     """Models that health is told by, by name, or none where the recording does not suffice."""
     try:
-        return learn_health(recording, localizer)
+        return learn_health(recording, localizer.test, localizer.provenance)
     except InputError as error:
         warn(f"no watch is kept on the fibres' health: {error}")
         return {}

@@ -53,7 +53,7 @@ def _parts(localizer: Localizer, numbers: Array) -> tuple[Array, Array, Array]:
 
 def _corrected(localizer: Localizer, numbers: Array) -> Localizer:
     gains, turn, shift = _parts(localizer, numbers)
-    scaling, weights = localizer.normalization, dict(localizer.weights)
+    before, weights = localizer.normalization, dict(localizer.weights)
     gains = gains[:, None]
     last, bias = weights["last.w"].copy(), weights["last.b"].copy()
     last[..., :2] = last[..., :2] @ turn.T
@@ -61,8 +61,8 @@ def _corrected(localizer: Localizer, numbers: Array) -> Localizer:
     return replace(
         localizer,
         weights=weights | {"last.w": last, "last.b": bias},
-        scaling=replace(
-            scaling, centre=gains * scaling.centre, spread=gains * scaling.spread, usual=gains * scaling.usual
+        normalization=replace(
+            before, centre=gains * before.centre, spread=gains * before.spread, usual=gains * before.usual
         ),
     )
 

@@ -103,9 +103,9 @@ def learn(
     raw = press_inputs(recording.readings, *edges, options.features)
     shown_raw, shown_mm, held_mm = raw[taught], recording.presses_mm[taught], recording.presses_mm[checked]
     if options.method == "masked":
-        from sense.processing.press_alignment import felt  # compiled, which takes a moment to load
+        from sense.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
-        again = felt(recording.readings, recording.times_s, *edges)
+        again = as_detected(recording.readings, recording.times_s, *edges)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         shown_mm = np.concatenate([shown_mm, shown_mm])
     scaling, table = Normalization.fit(shown_raw, shown_mm)

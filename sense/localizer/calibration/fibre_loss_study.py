@@ -5,9 +5,7 @@ experiment) knows beforehand which fibres will be lost, and trains on the others
 which up to 3 are lost.
 """
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.common.checkpoints import Checkpoints, State
+from design.common.computing import one_torch_thread, run_tasks
 from design.common.errors import InputError, instance, path, shown, whole
 from design.common.files import provenance
 from design.common.settings import or_default
@@ -29,7 +28,7 @@ from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses
 
-FORMAT = "padforge-robustness/1"
+FORMAT = "padforge-fibre-loss/1"
 ONE, MANY = "one network", "retrained"
 """The two ways, as the document calls them."""
 
@@ -83,13 +82,9 @@ def fibre_loss_study(
         locate = partial(localizer.locate, localizer.inputs(recording)[test])
         ways[ONE] = _way(recording.fibres, levels, locate, places_mm)
     if retrain:
-        about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
-        kept = Checkpoints(keep_in, {"robustness": about}) if keep_in else None
-        found = _retrained(recording, training, test, options, levels, kept, progress)
+        found = _retrained(recording, training, test, options, levels, keep_in, progress)
         ways[MANY] = _way(recording.fibres, levels, found.__getitem__, places_mm)
-        if kept:
-            kept.clear()
-    made_by = provenance("padforge sense robustness", options.seed, packages=("torch",))
+    made_by = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
     return {
         "format": FORMAT,
@@ -132,30 +127,27 @@ def _retrained(
     test: Indices,
     options: settings.LocalizerSettings,
     levels: range,
-    kept: Checkpoints | None,
+    keep_in: Path | None,
     progress: Callable[[int, int], None],
 ) -> dict[Lost, Found]:
     """What the network of each set of lost fibres finds for the test presses; finished ones are not made again."""
     subsets = [subset for level in levels for subset in lost_subsets(recording.fibres, level)]
+    about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
+    kept = Checkpoints(keep_in, {"fibre-loss": about}) if keep_in else None
     states = kept.begin(resume=True) if kept else {}
     found = {lost: _found_of(states[_number(lost)], len(test)) for lost in subsets if _number(lost) in states}
     progress(len(found), len(subsets))
     options = options.model_copy(update={"method": "published", "features": "published"})
-    from design.common.computing import one_torch_thread
-
-    # Threads, since torch lets go of the interpreter: no copies of the recording.
-    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        missing = [lost for lost in subsets if lost not in found]
-        running = {pool.submit(_train_without, lost, recording, training, test, options): lost for lost in missing}
-        try:
-            for future in as_completed(running):
-                lost = running[future]
-                found[lost] = future.result()
-                if kept:
-                    kept.save(_number(lost), _state(found[lost]))
-                progress(len(found), len(subsets))
-        finally:
-            pool.shutdown(cancel_futures=True)
+    missing = [lost for lost in subsets if lost not in found]
+    trainings = ((lost, partial(_train_without, lost, recording, training, test, options)) for lost in missing)
+    with one_torch_thread():
+        for lost, result in run_tasks(trainings):
+            found[lost] = result
+            if kept:
+                kept.save(_number(lost), _state(result))
+            progress(len(found), len(subsets))
+    if kept:
+        kept.clear()
     return found
 
 

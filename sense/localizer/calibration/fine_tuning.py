@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from design.common.computing import one_torch_thread
+from sense.health.trained_model import one_cycle
 from sense.localizer.network import Floats, Weights
 
-from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, looked_up, masked, one_cycle
+from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, looked_up, masked
 
 STEPS, BATCH, RATE = 200, 128, 1e-4
 """Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""

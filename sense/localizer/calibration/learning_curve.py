@@ -5,15 +5,14 @@ floor, e(n) = c + a n^-b, is what such curves follow (Hestness et al. 2017, Deep
 empirically); it leads on to what more presses would bring.
 """
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from threading import Event, Lock
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from design.common.computing import one_torch_thread, run_tasks
 from design.common.errors import InputError, instance
 from design.common.files import provenance
 from design.common.settings import or_default
@@ -23,7 +22,7 @@ from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses
 
-FORMAT = "padforge-size-curve/1"
+FORMAT = "padforge-learning-curve/1"
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Shares of the training presses."""
 LEAST_PRESSES = 10
@@ -77,7 +76,7 @@ def learning_curve(
     table, counts = np.array(errors), np.array(sizes, dtype=float)
     fit = fit_power_law(counts, table.mean(axis=1))
     forecast = _forecast(counts, table, fit, rng)
-    made_by = provenance("padforge sense size-curve", options.seed, packages=("torch",))
+    made_by = provenance("padforge sense learning-curve", options.seed, packages=("torch",))
     made_by["inputs"] = {"recording": recording.digest}
     return {
         "format": FORMAT,
@@ -102,34 +101,25 @@ def _found(
     progress: Callable[[int, int], None],
 ) -> list[Array]:
     """Places (Q, 2) that localizers trained on each of `trainings` find for the test presses."""
-    from design.common.computing import one_torch_thread
-
-    from .training import StoppedError, training_steps
+    from .training import JointProgress, training_steps
 
     # As many as a calibration takes for so many presses: of one short training for all, the most presses would seem to
     # bring little.
     steps = [training_steps(len(training), options) for training in trainings]
-    done, lock, stop = [0] * len(steps), Lock(), Event()
+    joint = JointProgress(steps, progress)
 
     def train(number: int) -> Array:
         def report(step: int, total: int) -> None:
-            if stop.is_set():
-                raise StoppedError
-            with lock:
-                done[number] = round(step / total * steps[number])
-                progress(sum(done), sum(steps))
+            joint.tell(number, round(step / total * steps[number]))
 
         training = trainings[number]
         localizer = learn(recording, training, options, np.random.default_rng([options.seed, len(training)]), report)
         return localizer.locate(localizer.inputs(recording)[test]).places_mm
 
-    with one_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        running = {number: pool.submit(train, number) for number in reversed(range(len(steps)))}  # the longest first
-        try:
-            return [running[number].result() for number in range(len(steps))]
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
+    longest_first = reversed(range(len(steps)))
+    with one_torch_thread(), joint:
+        found = dict(run_tasks((number, partial(train, number)) for number in longest_first))
+    return [found[number] for number in range(len(steps))]
 
 
 def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:
@@ -186,7 +176,7 @@ def _advice(presses: int, error_mm: float, forecast: dict[str, Any]) -> str:
 
 
 def learning_curve_lines(document: dict[str, Any]) -> list[str]:
-    """A size curve for people."""
+    """A learning curve for people."""
     fit = document["fit"]
     return [
         f"error in mm on {document['test_presses']} presses never learnt from",

@@ -1,8 +1,9 @@
 """Recalibration: a localizer learnt long ago follows its pad by a few new presses, or stays as it was.
 
-A pad that drifted needs little: its network is adapted gently (`adaptation`). One that was re-made or re-mounted needs
-a `correction` first. Whether either is worth it is tried by cross-validation: presses left out of it in turn are found
-before and after. The document's errors are those of presses left out; what is kept in the end has seen them all.
+A pad that drifted needs little: its network is adapted gently (`fine_tuning`). One that was re-made or re-mounted needs
+an `affine_correction` first. Whether either is worth it is tried by cross-validation: presses left out of it in turn
+are found before and after. The document's errors are those of presses left out; what is kept in the end has seen them
+all.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +36,7 @@ SUBSETS = 16
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Found_by_loss = Mapping[tuple[int, ...], Found]
+FoundByLoss = Mapping[tuple[int, ...], Found]
 Change = Callable[[Localizer, Inputs, Array], Localizer]
 
 
@@ -69,13 +70,46 @@ def recalibrate(
     seed = whole("seed", seed, 0, 2**32 - 1)
     if len(known) < LEAST_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known place, expected at least {LEAST_PRESSES}")
-    rng = np.random.default_rng(seed)
-    rows = rng.permutation(known)
+    rows = np.random.default_rng(seed).permutation(known)
     raw, places_mm = localizer.raw_inputs(recording)[rows], recording.presses_mm[rows]
-    folds = np.array_split(np.arange(len(rows)), FOLDS)
-    levels = len(localizer.factors)
-    subsets = [subset for level in range(levels) for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
-    trial = _Trial(raw, places_mm, folds, subsets)
+    subsets = [
+        subset for level in range(len(localizer.factors)) for subset in lost_subsets(localizer.fibres, level, SUBSETS)
+    ]
+    validation = _CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets)
+    before = validation.found([localizer] * FOLDS)
+    now, after, changes = _changed(localizer, validation, before, seed, progress)
+    gain, error = validation.gain(before, after)
+    made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
+    made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance)}
+    widened = validation.widened(after)
+    document = {
+        "format": FORMAT,
+        "presses": len(rows),
+        "changes": changes,
+        "before": validation.summary(before),
+        "after": validation.summary(after),
+        "gain_mm": gain,
+        "standard_error_mm": error,
+        "widened": widened.tolist(),
+        "provenance": made_by,
+    }
+    now = replace(
+        now,
+        factors=np.minimum(now.factors * widened, 1e6),
+        recalibrated_by=(*localizer.recalibrated_by, recording.digest),
+        provenance=made_by,
+    )
+    return now, document
+
+
+def _changed(
+    localizer: Localizer,
+    validation: "_CrossValidation",
+    before: FoundByLoss,
+    seed: int,
+    progress: Callable[[int, int], None],
+) -> tuple[Localizer, FoundByLoss, list[str]]:
+    """The localizer with the changes that are worth it, what is found of presses left out, and the changes' names."""
     steps, total = 0, 2 + (FOLDS + 1 if localizer.method == "masked" else 0)
 
     def step() -> None:
@@ -83,14 +117,13 @@ def recalibrate(
         steps += 1
         progress(steps, total)
 
-    before = trial.found([localizer] * FOLDS)
     now, kept, after, changes = localizer, [localizer] * FOLDS, before, []
-    corrected = trial.changed(kept, fit_correction)
+    corrected = validation.changed(kept, fit_correction)
     step()
-    found = trial.found(corrected)
-    gain, error = trial.gain(after, found)
+    found = validation.found(corrected)
+    gain, error = validation.gain(after, found)
     if gain > CORRECT_FROM * error:
-        now, kept, after = fit_correction(now, raw, places_mm), corrected, found
+        now, kept, after = fit_correction(now, *validation.presses), corrected, found
         changes.append("corrected")
     step()
     if localizer.method == "masked":
@@ -100,34 +133,14 @@ def recalibrate(
             step()
             return changed
 
-        adapted = trial.changed(kept, adapt)
-        found = trial.found(adapted)
-        gain, error = trial.gain(after, found)
+        adapted = validation.changed(kept, adapt)
+        found = validation.found(adapted)
+        gain, error = validation.gain(after, found)
         if gain > ADAPT_FROM * error:
-            now, after = adapt(now, raw, places_mm), found
+            now, after = adapt(now, *validation.presses), found
             changes.append("adapted")
     progress(total, total)
-    gain, error = trial.gain(before, after)
-    made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
-    made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance)}
-    document = {
-        "format": FORMAT,
-        "presses": len(rows),
-        "changes": changes,
-        "before": trial.summary(before),
-        "after": trial.summary(after),
-        "gain_mm": gain,
-        "standard_error_mm": error,
-        "widened": trial.widened(after).tolist(),
-        "provenance": made_by,
-    }
-    now = replace(
-        now,
-        factors=np.minimum(now.factors * trial.widened(after), 1e6),
-        recalibrated_by=(*localizer.recalibrated_by, recording.digest),
-        provenance=made_by,
-    )
-    return now, document
+    return now, after, changes
 
 
 def _adapted(localizer: Localizer, raw: Inputs, places_mm: Array, rng: np.random.Generator) -> Localizer:
@@ -141,7 +154,7 @@ def _adapted(localizer: Localizer, raw: Inputs, places_mm: Array, rng: np.random
     )
 
 
-class _Trial:
+class _CrossValidation:
     """Cross-validation on the new presses.
 
     Args:
@@ -154,6 +167,11 @@ class _Trial:
     ) -> None:
         self._raw, self._places_mm, self._folds, self._subsets = raw, places_mm, folds, subsets
 
+    @property
+    def presses(self) -> tuple[Inputs, Array]:
+        """Inputs and places of them all."""
+        return self._raw, self._places_mm
+
     def changed(self, localizers: Sequence[Localizer], change: Change) -> list[Localizer]:
         """The localizers, one a fold, each changed by the presses that its fold does not hold."""
         out = []
@@ -162,7 +180,7 @@ class _Trial:
             out.append(change(localizer, self._raw[rest], self._places_mm[rest]))
         return out
 
-    def found(self, localizers: Sequence[Localizer]) -> Found_by_loss:
+    def found(self, localizers: Sequence[Localizer]) -> FoundByLoss:
         """Each press found by the localizer of the fold that holds it, with each set of lost fibres."""
         scaled = [
             each.normalization.inputs(self._raw[fold]) for each, fold in zip(localizers, self._folds, strict=True)
@@ -174,7 +192,7 @@ class _Trial:
             out[lost] = Found(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         return out
 
-    def gain(self, before: Found_by_loss, after: Found_by_loss) -> tuple[float, float]:
+    def gain(self, before: FoundByLoss, after: FoundByLoss) -> tuple[float, float]:
         """By how much the errors shrink, mm, the mean over numbers of lost fibres, and its standard error."""
         by_level = [
             np.mean([self._errors(before[lost]) - self._errors(after[lost]) for lost in level], axis=0)
@@ -183,11 +201,11 @@ class _Trial:
         shrunk = np.mean(by_level, axis=0)
         return float(shrunk.mean()), float(shrunk.std(ddof=1) / np.sqrt(len(shrunk)))
 
-    def summary(self, found: Found_by_loss) -> list[dict[str, Any]]:
+    def summary(self, found: FoundByLoss) -> list[dict[str, Any]]:
         """Rows as "errors" of `evaluate`."""
         return [error_row(len(level[0]), [found[lost] for lost in level], self._places_mm) for level in self._levels()]
 
-    def widened(self, found: Found_by_loss) -> Array:
+    def widened(self, found: FoundByLoss) -> Array:
         """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do."""
         return np.maximum([conformal([found[lost] for lost in sets], self._places_mm) for sets in self._levels()], 1.0)
 

@@ -1,17 +1,16 @@
-"""Training the network: with `classic`, the only place that needs torch.
+"""Training the network: with `fine_tuning` and `published_training`, the only place of the localizer that needs torch.
 
 The loss is the distance itself, not its square; beside it the network learns how far off it expects to be. Every step
 loses a random few fibres of every press and moves the press by a few millimetres, its readings following as the fitted
-`response` of the pad says. The rate follows one cycle; what is kept is a running average of the weights, the one that
-did best on presses held back for that, which also end the training where they have long gained nothing. Members are
-independent, each on a thread of its own.
+`response_model` of the pad says. The rate follows one cycle; what is kept is a running average of the weights, the one
+that did best on presses held back for that, which also end the training where they have long gained nothing. Members
+are independent, each on a thread of its own.
 """
 
 import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from threading import Event, Lock
 
 import numpy as np
@@ -21,16 +20,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from design.common import profiling
+from design.common.computing import one_torch_thread, run_tasks
 from sense import settings
+from sense.health.trained_model import average_in, one_cycle
 from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Floats, Weights
 
 MOST_STEPS = 11_000
 """Steps of training at most: with moved presses, the length of the recording does not matter beyond."""
-WARM_UP = 0.2
-"""Share of the steps in which the rate of learning rises."""
 WEIGHT_DECAY = 1e-2
-AVERAGE = 0.998
-"""Share of the running average of the weights that a step leaves as it was."""
 INPUT_NOISE = 0.02
 """Noise on the scaled inputs while training, their spread being about 1."""
 WHOLE = 0.25
@@ -59,7 +56,33 @@ class TrainingPresses:
 
 
 class StoppedError(Exception):
-    """Another member failed, or the user broke off."""
+    """Another training failed, or the user broke off."""
+
+
+class JointProgress:
+    """How far trainings beside each other are; those still at work when the body of `with` ends stop where they tell.
+
+    Args:
+        totals: steps of each. progress: called with (steps done, steps in all), of all together.
+    """
+
+    def __init__(self, totals: Sequence[int], progress: Callable[[int, int], None]) -> None:
+        self._done, self._total, self._progress = [0] * len(totals), sum(totals), progress
+        self._lock, self._over = Lock(), Event()
+
+    def tell(self, number: int, done: int) -> None:
+        """So many steps of one of the trainings are done."""
+        if self._over.is_set():
+            raise StoppedError
+        with self._lock:
+            self._done[number] = done
+            self._progress(sum(self._done), self._total)
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
 
 
 def train_members(
@@ -84,28 +107,15 @@ def train_members(
     """
     seeds = [int(seed) for seed in rng.integers(2**63, size=options.members)]
     steps = training_steps(len(learn.inputs), options)
-    lock, stop, done = Lock(), Event(), 0
+    joint = JointProgress([steps] * len(seeds), progress)
 
-    def step(count: int) -> None:
-        nonlocal done
-        if stop.is_set():
-            raise StoppedError
-        with lock:
-            done += count
-            progress(done, steps * options.members)
+    def train(number: int) -> Weights:
+        member = _Member(learn, check, table, options, seeds[number])
+        return member.train(steps, lambda done: joint.tell(number, done))
 
-    def member(seed: int) -> Weights:
-        torch.set_num_threads(1)  # counts for this thread: matrices this small gain little from a second one
-        return _Member(learn, check, table, options, seed).train(steps, step)
-
-    threads = torch.get_num_threads()
-    with ThreadPoolExecutor(max(1, min(options.members, os.cpu_count() or 1))) as pool:
-        try:
-            found = [future.result() for future in [pool.submit(member, seed) for seed in seeds]]
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
-            torch.set_num_threads(threads)
+    with one_torch_thread(), joint:
+        weights = dict(run_tasks((number, partial(train, number)) for number in range(len(seeds))))
+    found = [weights[number] for number in range(len(seeds))]
     axis = {name: 1 if name.startswith("hidden") else 0 for name in found[0]}
     return {name: np.concatenate([weights[name] for weights in found], axis=axis[name]) for name in found[0]}
 
@@ -143,7 +153,7 @@ class _Member:
         x, alive, y = (torch.from_numpy(array).to(self._device) for array in arrays)
         return x, alive, y
 
-    def train(self, steps: int, step: Callable[[int], None]) -> Weights:
+    def train(self, steps: int, tell: Callable[[int], None]) -> Weights:
         weights, rate = self._weights, self._options.rate
         average = {name: w.detach().clone() for name, w in weights.items()}
         optimizer = torch.optim.AdamW(weights.values(), lr=rate, weight_decay=WEIGHT_DECAY, fused=True)
@@ -155,20 +165,16 @@ class _Member:
             optimizer.zero_grad()
             self._loss().backward()
             optimizer.step()
-            # The average forgets the first steps sooner than the later ones, or it would start from the initial draw.
-            keep = min(AVERAGE, number / (number + 9))
-            with torch.no_grad():
-                for name, w in weights.items():
-                    average[name].lerp_(w, 1 - keep)
+            average_in(average.values(), weights.values(), number)
             if number % look == 0 or number == steps:
                 error = self._error(average, masks)
                 if error < least:
                     best, least, failures = {name: w.clone() for name, w in average.items()}, error, 0
                 else:
                     failures += 1
-                step(look if number % look == 0 else number % look)
+                tell(number)
                 if failures == PATIENCE:
-                    step(steps - number)
+                    tell(steps)
                     profiling.looked_at("training steps", number, steps)
                     break
         else:
@@ -212,13 +218,6 @@ def looked_up(table: Tensor, places: Tensor) -> Tensor:
     i, j = whole.T
     low = torch.lerp(table[i, j], table[i, j + 1], y)
     return torch.lerp(low, torch.lerp(table[i + 1, j], table[i + 1, j + 1], y), x)
-
-
-def one_cycle(share: float) -> float:
-    """Rate of learning after `share` of the steps: up along a line to 1, then down along a cosine to 0."""
-    if share < WARM_UP:
-        return share / WARM_UP
-    return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
 
 
 def initial(entries: int, options: settings.LocalizerSettings, generator: torch.Generator) -> dict[str, Tensor]:

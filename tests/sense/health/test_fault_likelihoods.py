@@ -4,18 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.stats import t as student
 
-from sense.health import alarm_thresholds
-from sense.health import fault_likelihoods as evidence
-from sense.health.alarm_thresholds import Tail
+from sense import Recording
+from sense.health import fault_likelihoods
 from sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, Evidence, noise_of
-from sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE
+from sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE, traces_of
+from sense.health.health_model import HealthModel
+from tests.sense.health.pads import LEARNT
 
 PRESSES, FIBRES = 5, 3
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
-
-
 _CONSTANT = math.lgamma(3) - math.lgamma(2.5) - math.log(5 * math.pi) / 2
 
 
@@ -43,7 +44,7 @@ def by_hand(seed: int) -> tuple[Evidence, np.ndarray, np.ndarray, np.ndarray, np
         noise_centre=rng.uniform(-0.2, 0.4, FIBRES),
         noise_spread=rng.uniform(0.2, 0.5, FIBRES),
         constant=rng.uniform(0.001, 0.2, FIBRES),
-        filters=rng.normal(0, 0.1, (FIBRES, len(evidence.STEPS), TRACE)),
+        filters=rng.normal(0, 0.1, (FIBRES, len(fault_likelihoods.STEPS), TRACE)),
         persistence=np.array([0.6]),
         innovation=np.array([0.7]),
     )
@@ -155,47 +156,46 @@ def test_step_filters_answer_a_step_of_healthy_noise_by_its_spread() -> None:
     """White noise: the filter answers 1 to the spread of what is healthy, or its far quantile that of Student's t."""
     rng = np.random.default_rng(2)
     traces = rng.standard_normal((4000, 1, TRACE))
-    (filters,) = evidence._step_filters(traces, np.array([0.01]))
+    (filters,) = fault_likelihoods._step_filters(traces, np.array([0.01]))
     answers = (traces - traces[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(answers.std(axis=0), 1, rtol=0.05)
-    for number, at in enumerate(evidence.STEPS):
+    for number, at in enumerate(fault_likelihoods.STEPS):
         step = (np.arange(TRACE) >= at).astype(float)
         step -= step[:REST].mean()
         assert np.argmax(np.abs(filters @ step) / 1) in range(max(number - 2, 0), number + 3)
     wild = traces * np.where(rng.random(4000) < 0.01, 30.0, 1.0)[:, None, None]
-    (filters,) = evidence._step_filters(wild, np.array([0.01]))
+    (filters,) = fault_likelihoods._step_filters(wild, np.array([0.01]))
     answers = (wild - wild[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(np.quantile(np.abs(answers), 0.999, axis=0), student.ppf(0.9995, 5), rtol=1e-3)
 
 
 def test_constants_of_students_t_are_its_quantiles() -> None:
-    assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == evidence._MEDIAN_T
-    assert pytest.approx(student.ppf(0.9995, 5), abs=1e-3) == evidence._FAR_T
+    assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == fault_likelihoods._MEDIAN_T
+    assert pytest.approx(student.ppf(0.9995, 5), abs=1e-3) == fault_likelihoods._FAR_T
 
 
-def test_peaks_are_the_greatest_heights_of_climbs() -> None:
-    assert alarm_thresholds._peaks(np.array([0.0, 1, 3, 2, 0, 0, 5, 0, 0.5])).tolist() == [3, 5, 0.5]
-    assert alarm_thresholds._peaks(np.array([2.0, 1, 0])).tolist() == [2]
-    assert alarm_thresholds._peaks(np.zeros(4)).tolist() == []
+@given(seed=st.integers(0, 2**32 - 1), size=st.floats(1e-3, 10))
+def test_noise_is_that_of_the_quiet_thirds_and_spikes_are_none(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    traces = size * rng.standard_normal((2, 3, TRACE))
+    found = noise_of(traces)
+    for index in np.ndindex(2, 3):
+        own = traces[index]
+        steps = sorted(abs(np.concatenate([np.diff(own[:10]), np.diff(own[20:30]), np.diff(own[40:])])))
+        assert found[index] == pytest.approx(np.mean(steps[:20]))
+    spiked = traces.copy()
+    spiked[:, :, 5] += 1000 * size
+    assert (noise_of(spiked) < 2 * found).all()
+    steep = traces.copy()
+    steep[:, :, 10:20] += 1000 * size * np.arange(10)
+    assert (noise_of(steep) == found).all()
 
 
-def test_a_tail_is_read_by_the_number_of_fibres_lost() -> None:
-    tail = Tail(level=np.array([[1.0, 2.0], [3.0, 4.0]]), slope=np.array([[1.0, 2.0], [2.0, 4.0]]))
-    heights = np.array([[5.0, 8.0]])
-    np.testing.assert_allclose(tail.rarity(heights, 0), [[4.0, 3.0]])
-    np.testing.assert_allclose(tail.rarity(heights, 1), [[1.0, 1.0]])
-    np.testing.assert_allclose(tail.rarity(heights, 7), [[1.0, 1.0]])
-
-
-def test_the_slope_of_a_tail_is_the_mean_excess_of_the_highest_tenth() -> None:
-    """400 climbs of one press each to known heights, of which the level makes the highest no rarer than once."""
-    heights = np.random.default_rng(0).permutation(np.linspace(0.1, 40, 400))
-    ratios = np.full((1000, 1, 1), -100.0)
-    ratios[: 2 * 400 : 2, 0, 0] = heights
-    tail = Tail.fit([(ratios, ratios)])
-    top = np.sort(heights)
-    slope = (top[-40:] - top[-41]).mean()
-    assert tail.slope[0, 0] == pytest.approx(slope)
-    levels = [top[-41] + slope * math.log(40 / 1000), top[-1] + slope * math.log(1 / 1000)]
-    assert tail.level[0, 0] == pytest.approx(max(levels))
-    assert Tail.fit([(-ratios * 0 - 1, -ratios * 0 - 1)]).slope[0, 0] == 1
+def test_a_step_is_found_with_its_sign_and_smooth_answers_are_none(model: HealthModel, pad: Recording) -> None:
+    traces = traces_of(pad.readings, pad.begun, pad.lifted)[LEARNT:]
+    healthy = np.abs(model.evidence.steps(traces))
+    for size in (0.1, -0.1):
+        stepped = traces + size * (np.arange(TRACE) >= 24)
+        found = model.evidence.steps(stepped)
+        assert (np.sign(found) == np.sign(size)).all()
+        assert np.abs(found).min() > np.quantile(healthy, 0.99)

@@ -1,10 +1,29 @@
-"""Traces become the numbers of the network, press by press, as the formulas say."""
+"""Traces become the numbers of the network, press by press, as the formulas say; fibres predict each other."""
 
 import math
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from sense.health.fibre_prediction import COMPONENTS, INPUTS, REST, TARGETS, TRACE, History, Shapes, shapes_of
+from sense import Recording
+from sense.health import fibre_prediction
+from sense.health.fibre_prediction import (
+    COMPONENTS,
+    INPUTS,
+    MEMBERS,
+    REST,
+    TARGETS,
+    TRACE,
+    History,
+    Shapes,
+    expected,
+    shapes_of,
+    traces_of,
+)
+from sense.health.health_model import HealthModel
+from tests.sense.health.pads import LEARNT, PRESSES
 
 FIBRES = 2
 
@@ -62,3 +81,67 @@ def test_shapes_are_principal_directions_and_sizes_keep_a_part_of_their_smallnes
         np.testing.assert_allclose(shapes.targets[fibre, :3], own[:3])
     assert inputs.shape == (400, FIBRES, INPUTS)
     np.testing.assert_allclose(np.sqrt((targets[:, :, :3] ** 2).mean(axis=0)), 1)
+
+
+def random_weights(fibres: int, rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
+    hidden, outputs = 7, 2 * TARGETS
+    shapes = {
+        "first.w": (MEMBERS, fibres, INPUTS, hidden),
+        "first.alive": (MEMBERS, fibres, hidden),
+        "first.b": (MEMBERS, hidden),
+        "hidden.w": (MEMBERS, hidden, hidden),
+        "hidden.b": (MEMBERS, hidden),
+        "last.w": (MEMBERS, fibres, hidden, outputs),
+        "last.b": (MEMBERS, fibres, outputs),
+    }
+    return {name: (0.5 * rng.standard_normal(shape)).astype(np.float32) for name, shape in shapes.items()}
+
+
+@given(seed=st.integers(0, 2**32 - 1), fibres=st.integers(1, 5))
+def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int, fibres: int) -> None:
+    rng = np.random.default_rng(seed)
+    weights = random_weights(fibres, rng)
+    inputs = rng.standard_normal((3, fibres, INPUTS)).astype(np.float32)
+    alive = rng.random((3, fibres)) < 0.7
+    mean, spread = expected(weights, inputs, alive)
+    for press in range(3):
+        for fibre in range(fibres):
+            others = [c for c in range(fibres) if c != fibre and alive[press, c]]
+            means, variances = [], []
+            for e in range(MEMBERS):
+                h = weights["first.b"][e].astype(float)
+                for c in others:
+                    h = h + inputs[press, c] @ weights["first.w"][e, c] + weights["first.alive"][e, c]
+                h = h / (1 + np.exp(-h))
+                h = h @ weights["hidden.w"][e] + weights["hidden.b"][e]
+                h = h / (1 + np.exp(-h))
+                out = h @ weights["last.w"][e, fibre] + weights["last.b"][e, fibre]
+                means.append(out[:TARGETS])
+                variances.append(np.exp(2 * np.clip(out[TARGETS:], *fibre_prediction.LOG_SPREAD)))
+            assert np.allclose(mean[press, fibre], np.mean(means, axis=0), atol=1e-4)
+            total = np.mean(variances, axis=0) + np.var(means, axis=0)
+            assert np.allclose(spread[press, fibre], np.sqrt(total), rtol=1e-3, atol=1e-4)
+
+
+def test_the_trace_of_a_press_keeps_to_it() -> None:
+    readings = np.arange(100.0)[:, None] * [1.0, 2.0]
+    whole = fibre_prediction.press_trace(readings, begun=30, lifted=55, low=0, high=100)
+    assert whole.shape == (2, TRACE)
+    assert whole[0].tolist() == [*range(20, 50), *range(55, 75)]
+    tight = fibre_prediction.press_trace(readings, begun=30, lifted=34, low=28, high=36)
+    assert tight[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
+
+
+def test_the_others_tell_what_a_fibre_answers(pad: Recording, model: HealthModel) -> None:
+    traces = traces_of(pad.readings, pad.begun, pad.lifted)
+    history = fibre_prediction.History.none(6)
+    rows = [model.shapes.advance(press, history) for press in traces]
+    inputs, targets = model.shapes.scaled(np.stack([a for a, _ in rows]), np.stack([b for _, b in rows]))
+    new = slice(LEARNT, None)
+    mean, spread = expected(model.weights, inputs[new], np.ones((PRESSES - LEARNT, 6), dtype=bool))
+    error = targets[new] - mean
+    # The first component is nearly all of an answer.
+    assert (error[:, :, 0] ** 2).mean() < 0.5 * (targets[new, :, 0] ** 2).mean()
+    inside = (np.abs(error) < 2 * spread * model.evidence.scale).mean()
+    # Two spreads of Student's t with 5 degrees of freedom hold 0.898.
+    assert 0.8 < inside < 0.96

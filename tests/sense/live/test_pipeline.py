@@ -84,7 +84,7 @@ def untrained(recording: Recording, localizer: Localizer) -> Callable[..., Local
             shapes |= {"hidden.w": (1, 1, hidden, hidden), "hidden.b": (1, 1, 1, hidden)}
         rng = np.random.default_rng(3)
         weights = {name: 0.3 * rng.standard_normal(shape).astype(np.float32) for name, shape in shapes.items()}
-        made = {"weights": weights, "scaling": scaling, "table": table, "method": method, "features": features}
+        made = {"weights": weights, "normalization": scaling, "table": table, "method": method, "features": features}
         return replace(localizer, **made, factors=np.ones((1, 3)), rate_hz=part.rate_hz)
 
     return make
@@ -260,8 +260,8 @@ def test_without_any_fibre_a_press_may_be_anywhere(
     localizer = untrained(part, "full")
     live, events = follow(monkeypatch, blind, [localizer])
     assert events[1].lost == (0, 1, 2, 3)
-    assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(localizer.scaling.middle_mm))
-    assert events[1].r90_mm > localizer.scaling.span_mm
+    assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(localizer.normalization.middle_mm))
+    assert events[1].r90_mm > localizer.normalization.span_mm
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
 
 
@@ -289,5 +289,5 @@ def test_what_does_not_fit_together_is_refused(recording: Recording, untrained) 
     localizer = untrained(cut(recording, 20), "full")
     with pytest.raises(InputError, match="readings are of 6 fibres, the localizer was learnt from 4"):
         Live([localizer], None, 6, localizer.rate_hz)
-    with pytest.raises(InputError, match=r"readings come 20 a second, allowed is 13\.\d, .* within 25%"):
+    with pytest.raises(InputError, match=r"there are 20 readings a second, allowed is 13\.\d, .* within 25%"):
         Live([localizer], None, 4, 20.0)

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from design.common.errors import InputError
 from sense import Localizer, Recording
 from sense import settings as sense_settings
+from sense.health.trained_model import one_cycle
 from sense.localizer import network
 from sense.localizer.calibration import training
-from sense.localizer.calibration.training import draw_alive, looked_up, one_cycle
+from sense.localizer.calibration.training import draw_alive, looked_up
 from sense.localizer.features import Inputs
 from sense.localizer.network import pooled
 from sense.localizer.normalization import Normalization, Scaled
@@ -152,7 +153,12 @@ def test_less_is_known_with_fibres_lost(localizer: Localizer, recording: Recordi
 
 
 @pytest.mark.parametrize(
-    ("lost", "message"), [([4], "lost fibre 4: no such fibre"), ([-1], "lost fibre -1"), ([0, 1, 2, 3], "all 4 fibres")]
+    ("lost", "message"),
+    [
+        ([4], "lost fibre at index 4: none, allowed are 0 to 3"),
+        ([-1], "lost fibre at index -1"),
+        ([0, 1, 2, 3], "all 4 fibres"),
+    ],
 )
 def test_masks_that_cannot_be_are_refused(
     localizer: Localizer, recording: Recording, lost: list[int], message: str
@@ -203,7 +209,7 @@ def test_recordings_that_do_not_suit_are_refused(localizer: Localizer, recording
     fewer = Recording(
         recording.readings[:, :3], recording.times_s, recording.presses_mm, recording.begun, recording.lifted
     )
-    with pytest.raises(InputError, match="3 fibres, the localizer was trained on 4"):
+    with pytest.raises(InputError, match="3 fibres, the localizer was learnt from 4"):
         localizer.inputs(fewer)
     faster = Recording(
         recording.readings, recording.times_s / 2, recording.presses_mm, recording.begun, recording.lifted
@@ -357,7 +363,7 @@ def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer,
 
 @pytest.mark.parametrize("lost", [[10**20], [0.5], [True], ["a"]])
 def test_a_mask_that_is_no_index_is_refused(localizer: Localizer, recording: Recording, lost: list) -> None:
-    with pytest.raises(InputError, match=r"lost fibre .*no such fibre, allowed are 0 to 3"):
+    with pytest.raises(InputError, match=r"lost fibre at index .*: none, allowed are 0 to 3"):
         localizer.locate(localizer.inputs(recording), lost)
 
 
@@ -365,7 +371,7 @@ def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localiz
     readings = 1000.0 * np.random.default_rng(0).choice([-1, 1], recording.readings.shape)
     spread = np.full_like(localizer.normalization.spread, 1e-40)
     still = replace(localizer.normalization, spread=spread, middle_mm=np.zeros(2), span_mm=1e5)
-    found = replace(localizer, scaling=still)
+    found = replace(localizer, normalization=still)
     places = found.locate(found.inputs(replace(recording, readings=readings)))
     assert np.isfinite(places.places_mm).all()
     assert np.isfinite(places.r90_mm).all()

@@ -3,11 +3,11 @@
 import numpy as np
 
 from sense import Recording
-from sense.processing.press_alignment import felt
+from sense.processing.press_alignment import as_detected
 
 
 def test_found_presses_are_near_the_commanded_ones(recording: Recording) -> None:
-    begun, lifted = felt(recording.readings, recording.times_s, recording.begun, recording.lifted)
+    begun, lifted = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
     for found, commanded in ((begun, recording.begun), (lifted, recording.lifted)):
         off = found - commanded
         assert np.abs(off).max() <= 6
@@ -20,12 +20,12 @@ def test_presses_that_are_not_felt_are_as_commanded(recording: Recording) -> Non
     silent = recording.readings.copy()
     first, last = int(recording.begun[10]) - 3, int(recording.begun[12]) - 10
     silent[first:last] = silent[first - 1]
-    begun, lifted = felt(silent, recording.times_s, recording.begun, recording.lifted)
+    begun, lifted = as_detected(silent, recording.times_s, recording.begun, recording.lifted)
     np.testing.assert_array_equal(begun[10:12], recording.begun[10:12])
     np.testing.assert_array_equal(lifted[10:11], recording.lifted[10:11])
     flat = np.ones_like(silent)
     for found, commanded in zip(
-        felt(flat, recording.times_s, recording.begun, recording.lifted),
+        as_detected(flat, recording.times_s, recording.begun, recording.lifted),
         (recording.begun, recording.lifted),
         strict=True,
     ):

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
-from sense import HealthModel, Localizer, Recording, calibrate
+from sense import HealthModel, Localizer, Recording, calibrate, fit_health_model
 from sense import settings as sense_settings
 from tests.stress.clock import LIMIT_S, ends_in_time
 
@@ -55,7 +55,7 @@ def watched() -> HealthModel:
     """The health of that pad, learnt in a moment."""
     one = recorded()
     with mock.patch("sense.health.fibre_prediction.STEPS", 30):
-        return HealthModel.fit(one.readings, one.times_s, one.begun, one.lifted, rng=np.random.default_rng(0))
+        return fit_health_model(one.readings, one.times_s, one.begun, one.lifted, rng=np.random.default_rng(0))
 
 
 @cache

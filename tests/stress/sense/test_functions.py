@@ -153,7 +153,7 @@ def _health(rng: np.random.Generator) -> None:
     one = recorded()
     given = {"readings": one.readings[:800], "times_s": one.times_s[:800]}
     given |= {"begun": one.begun[:20], "lifted": one.lifted[:20], "rng": np.random.default_rng(0), "false_alarms": 1e-5}
-    sense.HealthModel.fit(**_some(rng, given))
+    sense.fit_health_model(**_some(rng, given))
 
 
 def _examine(rng: np.random.Generator) -> None:

@@ -13,8 +13,8 @@ from design.common.errors import InputError
 from design.common.settings import validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import Localizer, Recording, RigSettings, calibrate, evaluate, import_mat, locate
-from sense.health.health_model import FELT, RECORDED, HealthModel
-from sense.health.learning import learn_health
+from sense.health import learning
+from sense.health.health_model import COMMANDED, DETECTED
 from sense.health.monitor import FibreFault
 from sense.localizer.calibration.calibration import split_presses
 from sense.settings import LocalizerSettings as Options
@@ -190,7 +190,7 @@ def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkey
     def diverged(*arguments: Any) -> Any:
         return {name: weight * np.float32(np.nan) for name, weight in train(*arguments).items()}
 
-    monkeypatch.setattr(sense.localizer.calibration.training, "train", diverged)
+    monkeypatch.setattr(sense.localizer.calibration.training, "train_members", diverged)
     with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate 0.004, try a lower one"):
         calibrate(recording, SHORT)
 
@@ -222,12 +222,14 @@ def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Loc
 def test_health_is_learnt_from_the_presses_that_were_not_held_back(
     localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(HealthModel, "fit", lambda readings, times_s, begun, lifted, **options: (begun, lifted))
+    monkeypatch.setattr(
+        learning, "fit_health_model", lambda readings, times_s, begun, lifted, **options: (begun, lifted)
+    )
     learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
-    edges: dict[str, Any] = {**learn_health(recording, localizer)}
+    edges: dict[str, Any] = {**learning.learn_health(recording, localizer.test, localizer.provenance)}
     assert 0 < len(localizer.test) < len(learnt)
-    np.testing.assert_array_equal(edges[RECORDED], (recording.begun[learnt], recording.lifted[learnt]))
-    assert len(edges[FELT][0]) == len(edges[FELT][1]) == len(learnt)
+    np.testing.assert_array_equal(edges[COMMANDED], (recording.begun[learnt], recording.lifted[learnt]))
+    assert len(edges[DETECTED][0]) == len(edges[DETECTED][1]) == len(learnt)
 
 
 @pytest.mark.parametrize("rate_hz", [1e-300, 0.0999, np.inf])

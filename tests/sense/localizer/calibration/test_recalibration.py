@@ -19,7 +19,7 @@ from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fine_tuning as adaptation
 from sense.localizer.calibration.affine_correction import _corrected, _parts, fit_correction
 from sense.localizer.calibration.fine_tuning import FAR_NOISE, _Presses, adapt
-from sense.localizer.calibration.recalibration import _Trial, recalibrate
+from sense.localizer.calibration.recalibration import _CrossValidation, recalibrate
 from sense.localizer.calibration.training import INPUT_NOISE, MOVED, TrainingPresses
 from sense.localizer.evaluation import distances
 from sense.localizer.localizer import Found
@@ -63,9 +63,9 @@ def off_by(*amounts: float, radius: float = 1.0) -> Found:
     return Found(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
 
 
-def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> _Trial:
+def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> _CrossValidation:
     places = np.zeros((4, 2))
-    return _Trial(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
+    return _CrossValidation(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
 
 
 def test_a_gain_counts_every_number_of_lost_fibres_alike() -> None:

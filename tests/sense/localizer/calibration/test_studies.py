@@ -106,7 +106,7 @@ def test_work_of_other_settings_is_not_gone_on_with(recording: Recording, tmp_pa
 
     with pytest.raises(KeyboardInterrupt):
         fibre_loss_study(recording, retrain=True, lost=0, keep_in=tmp_path / "k", progress=interrupted)
-    with pytest.raises(InputError, match="begun with robustness"):
+    with pytest.raises(InputError, match="begun with fibre-loss"):
         fibre_loss_study(recording, retrain=True, lost=0, options=Options(seed=1), keep_in=tmp_path / "k")
 
 

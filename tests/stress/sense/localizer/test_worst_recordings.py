@@ -165,7 +165,7 @@ def test_health_is_learnt_from_the_worst_or_refused(
     def work() -> None:
         one = recorded()
         readings = _faulty(rng, one.readings)
-        model = sense.HealthModel.fit(
+        model = sense.fit_health_model(
             readings, one.times_s, one.begun, one.lifted, rng=np.random.default_rng(0), false_alarms=1e-4
         )
         model.save(tmp_path_factory.getbasetemp())

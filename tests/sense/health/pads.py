@@ -1,0 +1,67 @@
+"""A simulated pad, health learnt of it in a moment, and the ways in which its fibres fail."""
+
+from collections.abc import Callable
+from unittest import mock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sense import Recording
+from sense.health import fibre_prediction, learning
+from sense.health.health_model import HealthModel
+from sense.health.learning import fit_health_model
+from sense.health.monitor import FibreFault, examine
+
+Array = NDArray[np.float64]
+LEARNT, PRESSES, BAD_FROM = 600, 900, 660
+
+
+def learn(readings: Array, pad: Recording, presses: int = LEARNT) -> HealthModel:
+    """Health by a quick training on the first presses, of which, on this pad, LEARNT suffice to call a fibre weak."""
+    end = pad.begun[presses]
+    with mock.patch.object(fibre_prediction, "STEPS", 400), mock.patch.object(learning, "WEAK_PRESSES", LEARNT):
+        return fit_health_model(
+            readings[:end], pad.times_s[:end], pad.begun[:presses], pad.lifted[:presses], rng=np.random.default_rng(0)
+        )
+
+
+def later(model: HealthModel, readings: Array, pad: Recording, first: int = LEARNT) -> list[FibreFault]:
+    """Findings on the presses that health was not learnt from; press 0 is the first of them."""
+    start = pad.lifted[first - 1]
+    return examine(model, readings[start:], pad.times_s[start:], pad.begun[first:] - start, pad.lifted[first:] - start)
+
+
+Fault = Callable[[Array, int, np.random.Generator], None]
+
+
+def stuck(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, 1] = readings[at, 1]
+
+
+def open_low(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, 1] = 0.0
+
+
+def floating(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, 1] = rng.uniform(0, 3.3, len(readings) - at)
+
+
+def swapped(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, [1, 4]] = readings[at:, [4, 1]]
+
+
+def noisy(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, 1] += 0.016 * rng.standard_normal(len(readings) - at)
+
+
+def offset(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, 1] += 0.1
+
+
+def drifting(readings: Array, at: int, rng: np.random.Generator) -> None:
+    readings[at:, 1] -= 5e-5 * np.arange(len(readings) - at)
+
+
+def weak(readings: Array, at: int, rng: np.random.Generator) -> None:
+    rest = np.median(readings[at - 400 : at, 1])
+    readings[at:, 1] = rest + 0.5 * (readings[at:, 1] - rest)
