@@ -149,6 +149,35 @@ def _inner(
                 out[x] += share * (2 * w_rate * moved * run + w * (run_t * rate[x, 0] + run_v * rate[x, 1]))
 
 
+@njit(cache=True, error_model="numpy")
+def _span(
+    t: Any,
+    v: Any,
+    d: Any,
+    j: int,
+    ct: float,
+    cv: float,
+    chains: Any,
+    radius: float,
+    tolerance: float,
+    weight: int,
+    length: int,
+    scratch: Any,
+    work: Any,
+    change: Any,
+) -> None:
+    """Set change (6,) to the derivatives of what span j of a fibre signals for a press at (ct, cv)."""
+    span, place, rate = work
+    s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
+    change[:] = 0.0
+    for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
+        a, b = scratch[4][i]
+        _inner(span, a, b, s0, d[j], d[j + 1], radius, weight, length, place, rate, scratch[3], change)
+        for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
+            if not is_knot:
+                _end(span, s, s0, sign, d[j], d[j + 1], chains, radius, weight, length, place, rate, change)
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def signals_gradient(
     travel: Any,
@@ -171,8 +200,8 @@ def signals_gradient(
     fibres, n = travel.shape
     grid = fibres // 2
     out = np.zeros((3, fibres, n))
-    span, change = np.empty(6), np.empty(6)
-    place, rate = np.empty((6, 2)), np.empty((6, 2))
+    change = np.empty(6)
+    work = np.empty(6), np.empty((6, 2)), np.empty((6, 2))
     scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     for q in range(len(presses)):
         for family in range(2):
@@ -186,30 +215,7 @@ def signals_gradient(
                 j = max(np.searchsorted(t, ct + reach[family, 0], side="right") - 1, 0)
                 while j < n - 1 and t[j] < ct + reach[family, 1]:
                     if min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:
-                        s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
-                        change[:] = 0.0
-                        for i in range(stretches_inside(span, -s0, 1 - s0, shape, radius, tolerance, scratch)):
-                            a, b = scratch[4][i]
-                            _inner(
-                                span, a, b, s0, d[j], d[j + 1], radius, weight, length, place, rate, scratch[3], change
-                            )
-                            for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
-                                if not is_knot:
-                                    _end(
-                                        span,
-                                        s,
-                                        s0,
-                                        sign,
-                                        d[j],
-                                        d[j + 1],
-                                        shape,
-                                        radius,
-                                        weight,
-                                        length,
-                                        place,
-                                        rate,
-                                        change,
-                                    )
+                        _span(t, v, d, j, ct, cv, shape, radius, tolerance, weight, length, scratch, work, change)
                         for x in range(6):
                             out[x // 2, f, j + x % 2] += upstream[q, f] * change[x]
                     j += 1
