@@ -41,7 +41,8 @@ def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
     """Two presses in three of those chosen lie in the half of the pad the localizer never saw."""
     time = Time()
     arm = FakeArm(time)
-    options = RIG.model_copy(update={"presses": 60, "plan": "adaptive"})
+    fast = {"readings_per_press": 24, "press_mm_s": 250, "clearance_mm": 5}
+    options = RIG.model_copy(update={"presses": 5 * EVERY // 2, "plan": "adaptive", **fast})
     plan = planned(PAD, options, np.random.default_rng(3))
     learnt = planned(PAD, options, np.random.default_rng(4))
     known = PressPlan(np.column_stack([-np.abs(learnt.places_mm[:, 0]), learnt.places_mm[:, 1]]), learnt.depths_mm)
