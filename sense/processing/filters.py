@@ -94,7 +94,7 @@ def total_variation(
 
     def denoise(stretch: Array) -> Array:
         low, high, out = np.empty((3, len(stretch)))
-        latest, _ = kernel.forward(stretch, float(lam), kernel.silent(), low, high, out if causal else NOBODY)
+        latest, _ = kernel.forward_sweep(stretch, float(lam), kernel.silent(), low, high, out if causal else NOBODY)
         if not causal:
             clips.clip_back(low, high, latest, out)
         return out

@@ -81,7 +81,7 @@ class _Channel:
             room = self._most_held - len(self._low)
             piece, readings = readings[:room], readings[room:]
             low, high = np.empty((2, len(piece)))
-            self.latest, self._message = self._kernel.forward(piece, self._lam, self._message, low, high, NOBODY)
+            self.latest, self._message = self._kernel.forward_sweep(piece, self._lam, self._message, low, high, NOBODY)
             self._low, self._high = np.concatenate([self._low, low]), np.concatenate([self._high, high])
             self.settle(ended=False)
 
