@@ -1,7 +1,6 @@
-"""The studies of force and shape, in small: what they find is better than guessing, and the same when resumed."""
+"""The study of force, in small: what it finds is better than guessing, and the same when resumed."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,30 +8,16 @@ import pytest
 
 from design import InputError, Morphology
 from design.pad.indentation import Indenter
-from sense.studies.indentation import shape
 from sense.studies.indentation.force import COUNTS, Learning, force_study, readings
-from sense.studies.indentation.shape import FOOTPRINTS, SETS, shape_study
 from sense.studies.study import Study, run, study_lines
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 
 
-def small_force() -> Study:
-    return force_study(PADS, noise_counts=(1.0, 30.0), learning=Learning(presses=300, test=120, hidden=12, epochs=25))
-
-
-def small_shape() -> Study:
-    return shape_study(PADS, presses=500, test=200, hidden=12, epochs=25)
-
-
 @pytest.fixture(scope="module")
 def force(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    return run(small_force(), tmp_path_factory.mktemp("force"))
-
-
-@pytest.fixture(scope="module")
-def shapes(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    return run(small_shape(), tmp_path_factory.mktemp("shape"))
+    learning = Learning(presses=300, test=120, hidden=12, epochs=25)
+    return run(force_study(PADS, noise_counts=(1.0, 30.0), learning=learning), tmp_path_factory.mktemp("force"))
 
 
 def test_depth_and_force_are_found_better_than_guessed(force: dict) -> None:
@@ -75,47 +60,24 @@ def test_readings_are_whole_counts_within_the_full_scale() -> None:
     assert noisy.std() == pytest.approx(4, rel=0.1)
 
 
-def test_shapes_are_named_better_than_by_chance(shapes: dict) -> None:
-    assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, of) for label in PADS for of in SETS]
-    assert len({tuple(row) for row in shapes["rows"]}) == 1
-    for row, each in zip(shapes["rows"], shapes["confusions"], strict=True):
-        counts = np.array(each["counts"])
-        assert counts.sum() == 200
-        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 200)
-        assert row["accuracy_percent"] > row["guessed_percent"] + 5
-        assert row["worst_percent"] == pytest.approx((100 * np.diag(counts) / counts.sum(axis=1)).min())
-        assert row["worst"] in SETS[row["shapes"]]
-        assert 0 < row["place_mm"] < 11.25 * 0.38
-        assert 0 < row["place_shape_known_mm"] < 11.25 * 0.38
+def test_a_resumed_study_gives_the_same(tmp_path: Path) -> None:
+    def least() -> Study:
+        return force_study(PADS, noise_counts=(1.0,), learning=Learning(presses=60, test=40, hidden=4, epochs=3))
 
-
-def test_footprints_of_a_size_have_one_area() -> None:
-    for sides in FOOTPRINTS.values():
-        radius = shape._circumradius(sides)
-        area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
-        assert area == pytest.approx(np.pi)
-
-
-@pytest.mark.parametrize(("make", "expected"), [(small_force, "force"), (small_shape, "shapes")])
-def test_a_resumed_study_gives_the_same(
-    make: Callable[[], Study], expected: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
     def broken_off(done: int, total: int, name: str) -> None:
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(make(), tmp_path, jobs=1, progress=broken_off)
+        run(least(), tmp_path / "broken", jobs=1, progress=broken_off)
     seen: list[int] = []
-    again = run(make(), tmp_path, resume=True, progress=lambda done, total, name: seen.append(done))
+    again = run(least(), tmp_path / "broken", resume=True, progress=lambda done, total, name: seen.append(done))
     assert seen[0] >= 2
-    assert again == request.getfixturevalue(expected)
+    assert again == run(least(), tmp_path / "whole")
 
 
-@pytest.mark.parametrize("name", ["force", "shapes"])
-def test_a_study_is_told_in_a_table_sentences_and_json(name: str, request: pytest.FixtureRequest) -> None:
-    document = request.getfixturevalue(name)
-    json.dumps(document, allow_nan=False)
-    text = "\n".join(study_lines(document))
-    for row in document["rows"]:
+def test_the_study_is_told_in_a_table_sentences_and_json(force: dict) -> None:
+    json.dumps(force, allow_nan=False)
+    text = "\n".join(study_lines(force))
+    for row in force["rows"]:
         assert row["pad"] in text

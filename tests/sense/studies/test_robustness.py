@@ -1,0 +1,134 @@
+"""The study of robustness, and what its files say; that it goes on where it was broken off."""
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import Contact, InputError, Morphology
+from design.evaluation.localisation_error import localisation_error
+from sense.studies.pads import load_pads
+from sense.studies.robustness import robustness_study
+from sense.studies.study import Study, run, study_lines
+
+PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
+
+
+def small(**options) -> Study:
+    return robustness_study(PADS, lost=2, hidden=10, presses=144, test=300, **options)
+
+
+def least(pads: Mapping[str, Morphology]) -> Study:
+    """As many tasks as `small`, of hardly any work."""
+    return robustness_study(pads, lost=2, hidden=4, presses=16, test=20)
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("robustness")
+    return folder, run(small(), folder)
+
+
+def rows_of(document: dict, **wanted) -> list[dict]:
+    return [row for row in document["rows"] if wanted.items() <= row.items()]
+
+
+def test_robustness_tells_the_errors_of_every_set_of_lost_fibres(studied: tuple[Path, dict]) -> None:
+    document = studied[1]
+    assert [(row["pad"], row["lost"], row["subsets"]) for row in document["rows"]] == [
+        (pad, lost, sets) for pad in PADS for lost, sets in ((0, 1), (1, 4), (2, 6))
+    ]
+    for pad in PADS:
+        none, one, two = rows_of(document, pad=pad)
+        assert none["mean"] < one["mean"] < two["mean"] <= two["max"]
+        assert none["mean_mm"] == pytest.approx(11.25 * none["mean"])
+        by_subset = [each for each in document["by_subset"] if each["pad"] == pad and len(each["lost"]) == 2]
+        assert two["mean"] == pytest.approx(np.mean([each["mean"] for each in by_subset]))
+        worst = max(by_subset, key=lambda each: each["mean"])
+        assert [each["lost"] for each in document["maps"] if each["pad"] == pad][2] == worst["lost"]
+    # A map of the square grid without both horizontal fibres: off by the height, which nothing tells any more.
+    assert rows_of(document, pad="square", lost=2)[0]["max"] > 0.2
+
+
+def test_robustness_agrees_with_evaluate(tmp_path: Path) -> None:
+    pads = {"random": PADS["random"]}
+    document = run(robustness_study(pads, lost=2, hidden=10, presses=144, test=300, rule="exact"), tmp_path)
+    found = localisation_error(PADS["random"], lost=(2,), hidden=10, presses=144, test=300)
+    (row,) = rows_of(document, pad="random", lost=2)
+    # Each of the six sets is trained three times here, and once there.
+    for key in ("mean", "std", "max"):
+        assert getattr(found[0], key) == pytest.approx(row[key], rel=0.25)
+
+
+def test_published_errors_are_reproduced(published: Path, tmp_path: Path) -> None:
+    """Mean errors with all fibres and with one lost, as measured by others with the same protocol."""
+    expected = {"square_grid_cir": (0.217, 0.216), "5para_dis": (0.065, 0.099), "20para": (0.056, 0.080)}
+    pads = load_pads(tuple(str(published / f"{name}.mat") for name in expected), 0)
+    document = run(robustness_study(pads, lost=1), tmp_path)
+    for name, errors in expected.items():
+        assert [row["mean"] for row in rows_of(document, pad=name)] == pytest.approx(errors, rel=0.15)
+
+
+def test_files_of_a_study_say_the_same(studied: tuple[Path, dict]) -> None:
+    folder, document = studied
+    assert json.loads((folder / "robustness.json").read_text()) == json.loads(json.dumps(document))
+    with (folder / "robustness.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["mean"]) for row in table] == [row["mean"] for row in document["rows"]]
+    text = (folder / "robustness.md").read_text()
+    assert all(paragraph in text for paragraph in document["text"])
+    assert f"{document['rows'][0]['mean']:.4g}" in text
+    assert (folder / "robustness.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"robustness.{end}" for end in ("csv", "json", "md", "png")
+    ]
+    assert len(study_lines(document)) == 1 + len(document["rows"]) + 1 + len(document["text"])
+
+
+def test_a_study_broken_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
+    def stop(done: int, total: int, name: str) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    whole = run(least(PADS), tmp_path / "whole", jobs=1)
+    with pytest.raises(KeyboardInterrupt):
+        run(least(PADS), tmp_path / "broken", jobs=1, progress=stop)
+    done = []
+    again = run(least(PADS), tmp_path / "broken", resume=True, progress=lambda done_, total, name: done.append(done_))
+    assert done[0] >= 3
+    assert again == whole
+    assert (tmp_path / "whole" / "robustness.png").read_bytes() == (tmp_path / "broken" / "robustness.png").read_bytes()
+
+
+def test_pads_in_another_order_are_another_study(tmp_path: Path) -> None:
+    def stop(done: int, total: int, name: str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(least(PADS), tmp_path, jobs=1, progress=stop)
+    turned = least(dict(reversed(PADS.items())))
+    with pytest.raises(InputError, match="begun with robustness tasks"):
+        run(turned, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("name", ["a$\\frac$", "_under", "pi|pe <b>", b"\xff".decode(errors="surrogateescape")])
+def test_any_name_of_a_file_will_do(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name / "morphology.json"
+    PADS["random"].save(path)
+    pads = load_pads((str(path),), 0)
+    document = run(robustness_study(pads, lost=0, hidden=5, presses=16, test=20), tmp_path / "out")
+    (label,) = pads
+    assert document["rows"][0]["pad"] == label
+    table = (tmp_path / "out" / "robustness.md").read_text().splitlines()[-1]
+    assert table.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
+    assert "<b>" not in table
+
+
+def test_a_pad_that_no_press_touches_is_studied_all_the_same(tmp_path: Path) -> None:
+    document = run(small(contact=Contact(radius=1e-6)), tmp_path)
+    # Nothing is told, so the middle of the pad is the best guess: half a grid unit off each way at most.
+    assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])

@@ -1,0 +1,50 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import InputError, Morphology, signals
+from sense.studies import scaling
+from sense.studies.scaling import around, scaling_study, shares, spread_presses
+from sense.studies.study import run
+
+
+def rows_of(document: dict, **wanted) -> list[dict]:
+    return [row for row in document["rows"] if wanted.items() <= row.items()]
+
+
+def test_one_network_for_all_tiles_keeps_its_error_as_the_surface_grows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("TEST", 600), ("HIDDEN", 30), ("EPOCHS", 30)):
+        monkeypatch.setattr(scaling, name, value)
+    document = run(scaling_study({"square": Morphology.straight(2)}, grids=(4, 16), side=32), tmp_path)
+    small_shared, large_shared = (rows_of(document, way="shared", grid=grid)[0] for grid in (4, 16))
+    assert large_shared["mean"] < 1.3 * small_shared["mean"] < 0.4
+    assert large_shared["percent_of_side"] == pytest.approx(100 * large_shared["mean"] / 16)
+    assert len(rows_of(document, way="published")) == len(rows_of(document, way="spread")) == 2
+
+
+def test_shares_of_a_family_add_up_and_silence_has_none() -> None:
+    given = np.array([[1.0, 3.0, 0.0, 0.0], [0.0, 2.0, 5.0, 5.0]])
+    np.testing.assert_allclose(shares(given), [[0.25, 0.75, 0, 0, 4, 0], [0, 1, 0.5, 0.5, 2, 10]])
+
+
+def test_what_is_around_a_press_is_the_same_in_every_tile() -> None:
+    pad = Morphology.random(2, 3, 1).tiled(6)
+    place = np.array([[5.2, 7.1]])
+    here, origin = around(signals(pad, place), 2)
+    there, moved = around(signals(pad, place + np.array([2.0, -4.0])), 2)
+    np.testing.assert_allclose(here, there, atol=1e-9)
+    np.testing.assert_array_equal(moved - origin, [[2.0, -4.0]])
+    assert here.shape == (1, 12)
+
+
+def test_presses_are_spread_over_all_cells() -> None:
+    places = spread_presses(9, 8, 0)
+    assert set(map(tuple, np.floor(places - 1).astype(int))) == {(x, y) for x in range(8) for y in range(8)}
+
+
+def test_a_grid_that_tiles_do_not_fill_is_refused() -> None:
+    with pytest.raises(InputError, match="grids has 6, expected multiples of 4"):
+        scaling_study({"square": Morphology.straight(4)}, grids=(4, 6))

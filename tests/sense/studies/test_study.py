@@ -1,0 +1,53 @@
+"""What every study shares: one at a time in a folder, all results or none."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from design import InputError
+from sense.studies.study import Findings, Study, Task, run
+
+
+def test_other_settings_are_no_help_to_a_study_broken_off(tmp_path: Path) -> None:
+    kept = {"begun": 0}
+
+    def task() -> dict:
+        kept["begun"] += 1
+        if kept["begun"] > 1:
+            raise KeyboardInterrupt
+        return {"a": np.ones(1)}
+
+    def made(seed: int) -> Study:
+        return Study(
+            "x", "X", {"seed": seed}, [Task("a", task)] * 2, lambda states: Findings([], []), lambda document: Figure()
+        )
+
+    with pytest.raises(KeyboardInterrupt):
+        run(made(0), tmp_path, jobs=1)
+    with pytest.raises(InputError, match="begun with x seed 0, now 1"):
+        run(made(1), tmp_path, resume=True)
+
+
+def test_a_folder_in_which_the_same_study_is_at_work_is_refused(tmp_path: Path) -> None:
+    def made(make: Callable[[], dict]) -> Study:
+        return Study("x", "X", {}, [Task("a", make)], lambda states: Findings([{"a": 1}], []), lambda _: Figure())
+
+    def meet() -> dict:
+        with pytest.raises(InputError, match="a x study is at work there"):
+            run(made(lambda: {}), tmp_path)
+        return {}
+
+    run(made(meet), tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
+
+
+def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> None:
+    def draw(document: object) -> Figure:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(Study("x", "X", {}, [], lambda states: Findings([{"a": 1}], []), draw), tmp_path)
+    assert not list(tmp_path.iterdir())
