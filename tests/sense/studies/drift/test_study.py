@@ -31,6 +31,19 @@ def recorded() -> Recording:
     return replace(recording, readings=readings, presses_mm=places, source={"kind": "test"})
 
 
+def begin(recording: Recording, presses: int) -> Recording:
+    """The first presses of a recording."""
+    end = int(recording.lifted[presses - 1])
+    return replace(
+        recording,
+        readings=recording.readings[:end],
+        times_s=recording.times_s[:end],
+        presses_mm=recording.presses_mm[:presses],
+        begun=recording.begun[:presses],
+        lifted=recording.lifted[:presses],
+    )
+
+
 def small(recorded: Recording) -> Study:
     pads = {"winding": PAD, "square": Morphology.straight(4)}
     return drift_study(pads, {"real": recorded}, rig=STRONG, presses=180, hidden=8, epochs=20)
@@ -145,8 +158,10 @@ def test_a_study_is_told_in_sentences_and_json(document: dict[str, Any]) -> None
 
 
 def test_a_resumed_study_gives_the_same(recorded: Recording, tmp_path: Path) -> None:
+    short = begin(recorded, 40)
+
     def least() -> Study:
-        return drift_study({"winding": PAD}, {"real": recorded}, rig=STRONG, presses=40, hidden=4, epochs=2)
+        return drift_study({"winding": PAD}, {"real": short}, rig=STRONG, presses=40, hidden=4, epochs=2)
 
     def broken_off(done: int, total: int, name: str) -> None:
         if done == 3:
@@ -177,15 +192,7 @@ def test_what_cannot_be_studied_is_refused(recorded: Recording) -> None:
 
 def test_the_published_pad_and_recording(published: Path, tmp_path: Path) -> None:
     pad = Morphology.load(published / "5para_dis.mat")
-    whole = open_recording(published / "para5_long_first4500.mat")
-    first = replace(
-        whole,
-        readings=whole.readings[:24_000],
-        times_s=whole.times_s[:24_000],
-        presses_mm=whole.presses_mm[:600],
-        begun=whole.begun[:600],
-        lifted=whole.lifted[:600],
-    )
+    first = begin(open_recording(published / "para5_long_first4500.mat"), 300)
     document = run(drift_study({"N=5": pad}, {"built": first}, presses=60, hidden=8, epochs=15), tmp_path)
     assert document["idle"][0]["idle_percent"] == pytest.approx(58, abs=1)
     assert max(errors(document, "built", "rest taken off")) < min(errors(document, "built", "none"))
