@@ -211,9 +211,9 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     from fabricate import FabricationSettings, build
     from fabricate.cli import mould_lines
     from sense.cli.calibration import run_calibration
+    from sense.recordings.recorder import refuse_replacing
     from sense.report.calibration_results import calibration_lines
     from sense.rig.operation import record_simulated
-    from sense.recordings.recorder import refuse_replacing
 
     seeds = {"seed": seed}
     _, found = run_search(spec, out, seeds)
@@ -242,7 +242,7 @@ def write_report(folder: Path) -> Path:
     """
     from design.common.files import read_json, write_text
     from design.common.page.elements import PageSection, page
-    from design.report.sections import design_sections, origin, provenance_section
+    from design.report.sections import design_sections, provenance_row, provenance_section
     from fabricate.report.sections import fabrication_sections
     from sense.report import sections as sensed
 
@@ -260,12 +260,12 @@ def write_report(folder: Path) -> Path:
             document = read_json(path, f"padforge-{name}/1")
             with _as_written(path):
                 sections += made_of(folder, document)
-                origins.append(origin(folder, name, document))
+                origins.append(provenance_row(folder, name, document))
     studies: list[str] = []
     for path, document in sensed.find_studies(folder):
         with _as_written(path):
             studies += sensed.study_pieces(path, document)
-            origins.append(origin(folder, f"study {path.stem}", document))
+            origins.append(provenance_row(folder, f"study {path.stem}", document))
     if not origins:
         raise InputError(f"{folder}: no design.json, fabrication.json, calibration.json or study to report on")
     if studies:

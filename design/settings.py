@@ -112,7 +112,7 @@ MaxCrossings = Annotated[
 
 
 class RulesSettings(Settings):
-    """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`rules.check` has the formulas).
+    """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`check_rules` has the formulas).
 
     Attributes:
         max_crossings: greatest number of crossings of a horizontal with a vertical fibre, or None for any number

@@ -8,7 +8,7 @@ from typing import Any
 from design.common.errors import InputError
 from design.common.files import read_json
 
-from .harness import Key
+from .harness import TrialKey
 from .table import FORMAT, SUMMARY_FORMAT
 
 SLOWER, LESS_ACCURATE, LOOKS_AT_MORE = "slower", "less accurate", "looks at more"
@@ -25,7 +25,7 @@ ROUNDING = 1e-15
 
 
 @dataclass(frozen=True)
-class Change:
+class Worsening:
     """A measurement that has become worse.
 
     Attributes:
@@ -36,7 +36,7 @@ class Change:
     """
 
     bench: str
-    key: Key
+    key: TrialKey
     what: str
     before: float
     now: float
@@ -62,13 +62,13 @@ def read_earlier(path: Path) -> dict[str, Mapping[str, Any]]:
         raise InputError(f"{path}: not as padforge bench writes it ({error!r})") from error
     try:
         for document in documents:
-            worse(document, document)
+            worsenings(document, document)
         return {document["bench"]: document for document in documents}
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"{path}: not as padforge bench writes it ({error!r})") from error
 
 
-def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
+def worsenings(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Worsening]:
     """Changes for the worse of the package's own ways, in trials that both runs of a benchmark have, worst first."""
     earlier, pace = _rows(before), before["pace_s"] / now["pace_s"]
     changes = []
@@ -83,7 +83,7 @@ def worse(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
         for what, (then, since, ratio) in ratios.items():
             limit = ALARM_LONG if what == SLOWER and then > LONG_S else ALARM[what]
             if not ratio <= limit:  # so is NaN
-                changes.append(Change(now["bench"], key, what, then, since, ratio))
+                changes.append(Worsening(now["bench"], key, what, then, since, ratio))
     slower = [change.key[1] for change in changes if change.what == SLOWER]  # ways
     alone = [c for c in changes if c.what == SLOWER and c.before < TINY_S and slower.count(c.key[1]) == 1]
     return sorted((change for change in changes if change not in alone), key=lambda change: -change.ratio)
@@ -97,7 +97,7 @@ def _slower(old: Mapping[str, Any], row: Mapping[str, Any], pace: float) -> floa
     return min(plain, PACE_SLACK * pace * plain)
 
 
-def _rows(document: Mapping[str, Any]) -> dict[Key, Mapping[str, Any]]:
+def _rows(document: Mapping[str, Any]) -> dict[TrialKey, Mapping[str, Any]]:
     return {(row["case"], row["way"], row["size"], row["repetition"]): row for row in document["rows"]}
 
 
@@ -110,7 +110,7 @@ def compared(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[
     )
 
 
-def comparison_lines(changes: Sequence[Change], trials: int) -> list[str]:
+def comparison_lines(changes: Sequence[Worsening], trials: int) -> list[str]:
     """A comparison for people."""
     if not changes:
         return [f"{trials} trials compared: none slower, less accurate or looking at more"]

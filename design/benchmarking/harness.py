@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-Report = Callable[[str], None]
+BenchListener = Callable[[str], None]
 """Hears what is being measured."""
-Key = tuple[str, str, float, int]
+TrialKey = tuple[str, str, float, int]
 """Case, way, size and repetition."""
 
 BUDGET_S = 0.2
@@ -52,7 +52,7 @@ class BenchTrial:
     repetition: int = 0
 
     @property
-    def key(self) -> Key:
+    def key(self) -> TrialKey:
         """What the trial is known by in every round and every run."""
         return self.case, self.way, self.size, self.repetition
 
@@ -81,7 +81,7 @@ class Bench:
 
 
 @dataclass
-class Measured:
+class BenchRounds:
     """What the rounds of a benchmark have given so far.
 
     Attributes:
@@ -91,18 +91,18 @@ class Measured:
         pace_s: least time of the fixed piece of work, seconds.
     """
 
-    found: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
-    times: dict[Key, list[float]] = field(default_factory=dict)
-    paces: dict[Key, list[float]] = field(default_factory=dict)
+    found: dict[TrialKey, Mapping[str, Any]] = field(default_factory=dict)
+    times: dict[TrialKey, list[float]] = field(default_factory=dict)
+    paces: dict[TrialKey, list[float]] = field(default_factory=dict)
     pace_s: float = np.inf
 
-    def settled(self, key: Key) -> bool:
+    def settled(self, key: TrialKey) -> bool:
         """Whether another round would hardly tell more of a trial's time."""
         best, *rest = sorted(self.times[key])
         return bool(rest) and rest[0] < AGREE * best
 
 
-def measure(bench: Bench, so_far: Measured, report: Report, again: Callable[[Key], bool]) -> int:
+def measure_round(bench: Bench, so_far: BenchRounds, report: BenchListener, again: Callable[[TrialKey], bool]) -> int:
     """Add one round to `so_far`: trials that are new to it are timed and judged, others timed where `again` says so.
 
     Slow plain ways are never timed again. Returns how many trials the round had.

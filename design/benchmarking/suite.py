@@ -7,8 +7,8 @@ from typing import Any
 
 from design.common.files import refuse_unwritable, write_json
 
-from .comparison import SLOWER, Change, worse
-from .harness import Bench, Key, Measured, Report, measure
+from .comparison import SLOWER, Worsening, worsenings
+from .harness import Bench, BenchListener, BenchRounds, TrialKey, measure_round
 from .table import SUMMARY_FORMAT, summary_rows, write_bench, write_csv
 
 ROUNDS = 2, 5
@@ -20,8 +20,8 @@ RECHECKS = 5
 
 
 def run_benches(
-    benches: Sequence[Bench], out: Path, report: Report, before: Mapping[str, Mapping[str, Any]]
-) -> tuple[dict[str, Any], list[Change]]:
+    benches: Sequence[Bench], out: Path, report: BenchListener, before: Mapping[str, Mapping[str, Any]]
+) -> tuple[dict[str, Any], list[Worsening]]:
     """Take benchmarks; write each one's files, and `bench.json` and `bench.csv` with their summary, to `out`.
 
     Args:
@@ -35,14 +35,14 @@ def run_benches(
         InputError: `out` cannot be written, told before anything is measured.
     """
     refuse_unwritable(out)
-    measured = {bench.name: Measured() for bench in benches}
+    measured = {bench.name: BenchRounds() for bench in benches}
     documents: dict[str, dict[str, Any]] = {}
 
     def pace_s() -> float:
         return min(each.pace_s for each in measured.values())
 
-    def take(bench: Bench, what: str, again: Callable[[Key], bool]) -> None:
-        if measure(bench, measured[bench.name], lambda step: report(f"{bench.name}, {what}, {step}"), again):
+    def take(bench: Bench, what: str, again: Callable[[TrialKey], bool]) -> None:
+        if measure_round(bench, measured[bench.name], lambda step: report(f"{bench.name}, {what}, {step}"), again):
             measured[bench.name].pace_s = pace_s()
             documents[bench.name] = write_bench(bench, measured[bench.name], out)
 
@@ -68,9 +68,9 @@ def run_benches(
     return summary, _worse(before, documents)
 
 
-def _worse(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]) -> list[Change]:
-    return [change for name in now if name in before for change in worse(before[name], now[name])]
+def _worse(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]) -> list[Worsening]:
+    return [change for name in now if name in before for change in worsenings(before[name], now[name])]
 
 
-def _slower(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]) -> set[Key]:
+def _slower(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]) -> set[TrialKey]:
     return {change.key for change in _worse(before, now) if change.what == SLOWER}

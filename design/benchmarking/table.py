@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from design.common.figures import CURVES, FAINT, INK, save_figure
 from design.common.files import provenance, write_json, write_text
 
-from .harness import Bench, Measured
+from .harness import Bench, BenchRounds
 
 FORMAT = "padforge-bench/1"
 SUMMARY_FORMAT = "padforge-benches/1"
@@ -25,7 +25,7 @@ Row = dict[str, Any]
 """One line of a benchmark: "case", "way", "size", "repetition", "error", "seconds", "paces", "visited" and more."""
 
 
-def write_bench(bench: Bench, measured: Measured, out: Path) -> dict[str, Any]:
+def write_bench(bench: Bench, measured: BenchRounds, out: Path) -> dict[str, Any]:
     """Write `NAME.json`, `NAME.csv` and `NAME.png` to `out`; each row gets its speed relative to the reference."""
     rows = [
         dict(zip(("case", "way", "size", "repetition"), key, strict=True))

@@ -112,7 +112,7 @@ def looked_at(name: str, done: int, of: int) -> None:
         _active.add(name, done, of)
 
 
-def asked() -> bool:
+def is_profiling() -> bool:
     """Whether a profile is being taken, for notes that take work themselves."""
     return _active is not None
 

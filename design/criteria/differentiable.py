@@ -18,7 +18,7 @@ from design.settings import Contact
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
     """PCHIP slopes (..., n) of values v at ascending t, both (..., n); differentiable almost everywhere.
 
-    The same rule as `kernels.pchip.pchip_slopes`, to rounding.
+    The same rule as `pchip_slopes` of the kernels, to rounding.
     """
     h = t.diff(dim=-1)
     m = v.diff(dim=-1) / h
@@ -88,7 +88,7 @@ class ExactSignals(torch.autograd.Function):
         out = np.zeros(len(presses) * len(t))
         begin, end = 0, len(presses)
         visited = exact_signals(t[None], v[None], d[None], strays, presses, *shape, begin, end, none, none, out)
-        if profiling.asked():
+        if profiling.is_profiling():
             note_reach(t[None], strays, presses, shape[1], visited)
         return torch.from_numpy(out.reshape(-1, len(t)).T)
 

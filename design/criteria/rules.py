@@ -1,6 +1,6 @@
 """Rules that make a pad buildable, checked exactly on the finished curves, each finding with place and amount.
 
-The search has a differentiable penalty for some of them (`descent`); what counts is the check here.
+The search has a differentiable penalty for some of them (`penalties`); what counts is the check here.
 """
 
 from dataclasses import dataclass

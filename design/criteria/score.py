@@ -58,7 +58,7 @@ def score(
     (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
     far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
-    (`objective`).
+    (`published_objective`).
 
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.

@@ -12,7 +12,7 @@ from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
 
-from .levenberg_marquardt import LEARN, VALIDATE, Network, Scale, first_weights
+from .levenberg_marquardt import LEARN, VALIDATE, ColumnScale, Network, first_weights
 from .localisation_error import Loss, PressSets
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def _learn_plain(trial: PressSets, losses: Sequence[Loss]) -> list[Network]:
 
 def fit_plain(inputs: Array, targets: Array, rng: np.random.Generator) -> Network:
     """`levenberg_marquardt.fit` as textbooks have it: whole Jacobian, all weights at once, damping in tens."""
-    into, onto = Scale.of(inputs), Scale.of(targets)
+    into, onto = ColumnScale.of(inputs), ColumnScale.of(targets)
     order = rng.permutation(len(inputs))
     learnt = round(LEARN * len(inputs))
     learn, held = order[:learnt], order[learnt : learnt + round(VALIDATE * len(inputs))]

@@ -30,7 +30,7 @@ LEARN, VALIDATE = 0.7, 0.15  # shares of the samples; the rest is the test set o
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColumnScale:
     """Columns to [-1, 1] and back; a column that never varied becomes 0, which no weight can act on.
 
     Attributes:
@@ -41,7 +41,7 @@ class Scale:
     half: Array
 
     @classmethod
-    def of(cls, values: Array) -> "Scale":
+    def of(cls, values: Array) -> "ColumnScale":
         """The scale on which `values` (Q, D) fill [-1, 1]."""
         low, high = values.min(axis=0), values.max(axis=0)
         return cls((low + high) / 2, (high - low) / 2)
@@ -68,8 +68,8 @@ class Network:
 
     hidden: Array
     output: Array
-    inputs: Scale
-    targets: Scale
+    inputs: ColumnScale
+    targets: ColumnScale
     epochs: int
 
     def __call__(self, inputs: ArrayLike) -> Array:
@@ -128,7 +128,7 @@ def fit_many(
 
     inputs = _require_samples(inputs, targets, len(rngs), hidden)
     right = targets[None] if also is None else np.concatenate([targets[None], also])
-    into, onto = [Scale.of(own) for own in inputs], Scale.of(right.reshape(-1, targets.shape[1]))
+    into, onto = [ColumnScale.of(own) for own in inputs], ColumnScale.of(right.reshape(-1, targets.shape[1]))
     samples = inputs.shape[1]
     learnt = round(LEARN * samples) if check is None else samples
     held = max(1, round(VALIDATE * samples))

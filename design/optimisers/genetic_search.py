@@ -19,7 +19,7 @@ from design.pad.curves import refine
 from design.pad.knots import MARGIN, assemble
 from design.pad.morphology import Morphology
 
-from .problem import Problem
+from .problem import SearchProblem
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ AROUND_LEVEL, AROUND_ORIGIN = 1.0, 0.3
 """Standard deviations of the first knots about a fibre's own level, and about those of a given pad; grid units."""
 
 
-class Breeding:
+class GeneticSearch:
     """Minimises the published objective, a generation of `search.population` pads at a time.
 
     The same problem gives the same pads, whether or not the breeding was broken off and taken up from its state. An
@@ -38,7 +38,7 @@ class Breeding:
         step: generations done. objective: the best so far. done: whether all generations are.
     """
 
-    def __init__(self, problem: Problem, state: State | None = None) -> None:
+    def __init__(self, problem: SearchProblem, state: State | None = None) -> None:
         search, origin = problem.search, problem.origin
         self.step, self.objective = 0, math.inf
         self._history: list[tuple[int, float]] = []
@@ -107,7 +107,7 @@ class Breeding:
 class _PublishedProblem(PymooProblem):
     """4 M N free coordinates within the pad, one objective, evaluated a whole generation at a time."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: SearchProblem) -> None:
         grid = problem.pad.grid
         self.shape = (2 * grid, problem.search.knots, 2)
         self.limits = MARGIN, grid + 1 - MARGIN

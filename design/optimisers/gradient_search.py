@@ -1,7 +1,7 @@
 """Gradient search on the localisation ambiguity under noise and fibre loss, within the rules.
 
-One start is a `Descent`: it advances by any number of steps, tells its state as plain arrays and goes on from them to
-the same bits, so that it can run in slices on any thread or machine and survive being killed.
+One start is a `GradientSearch`: it advances by any number of steps, tells its state as plain arrays and goes on from
+them to the same bits, so that it can run in slices on any thread or machine and survive being killed.
 """
 
 import json
@@ -23,7 +23,7 @@ from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
 
 from .parametrization import Fibres, border_of, first_course
-from .problem import Problem
+from .problem import SearchProblem
 
 SIDE = 14  # presses per row and column of the stratified sample a step looks at
 SCALE_SIDE = 24  # presses per row and column by which full scale is known
@@ -38,7 +38,7 @@ REPAIR_MARGIN = 0.01  # added to the margin at each check that does not pass
 REPAIR_RATE, REPAIR_FASTER, REPAIR_FASTEST = 0.002, 1.15, 0.01  # gentle at first, and faster with each such check
 
 
-class Descent:
+class GradientSearch:
     """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of what is broken.
 
     The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
@@ -48,7 +48,7 @@ class Descent:
         scale: full scale of the signals, grid units.
     """
 
-    def __init__(self, problem: Problem, start: int, state: State | None = None) -> None:
+    def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
         self.problem = problem
         self.rng = np.random.default_rng([problem.search.seed, start])
         self.step, self.objective, self.done = 0, math.inf, False

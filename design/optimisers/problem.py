@@ -8,7 +8,7 @@ from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 
 @dataclass(frozen=True)
-class Problem:
+class SearchProblem:
     """A pad that serves all of `contacts` within `rules`, to be found as `search` says, from an origin or afresh."""
 
     pad: PadSettings

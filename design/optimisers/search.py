@@ -31,10 +31,10 @@ from design.criteria.score import ambiguities, score
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-from .problem import Problem
-from .start import Slice, advance_start, finish
+from .problem import SearchProblem
+from .start import StartSlice, advance_start, finish
 
-Report = Callable[[str, int, int, float], None]
+SearchListener = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
 
 MOST_SECONDS = 1e9
@@ -55,7 +55,7 @@ class SearchRun:
         executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None.
     """
 
-    report: Report = lambda run, done, total, objective: None
+    report: SearchListener = lambda run, done, total, objective: None
     keep_in: Path | None = None
     resume: bool = False
     time_budget: float | None = None
@@ -142,7 +142,7 @@ def search(
 
 def _problem(
     pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None
-) -> Problem:
+) -> SearchProblem:
     if settings.device == "cuda":
         import torch
 
@@ -169,7 +169,7 @@ def _problem(
             raise InputError(
                 f"knots is {settings.knots}, allowed is at least the {knots} of the morphology to start from"
             )
-    return Problem(pad, (contact, *settings.contacts), settings, rules, origin)
+    return SearchProblem(pad, (contact, *settings.contacts), settings, rules, origin)
 
 
 class _Stop:
@@ -207,16 +207,16 @@ def _stopped_by_interrupt(stop: _Stop) -> Iterator[None]:
 
 
 def _advance(
-    problem: Problem, states: dict[int, State], stop: _Stop, run: SearchRun, checkpoints: Checkpoints | None
+    problem: SearchProblem, states: dict[int, State], stop: _Stop, run: SearchRun, checkpoints: Checkpoints | None
 ) -> None:
     """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
 
-    def first_slices() -> Iterator[tuple[int, Callable[[], Slice]]]:
+    def first_slices() -> Iterator[tuple[int, Callable[[], StartSlice]]]:
         for start in problem.starts:
             if not stop and (start not in states or not states[start]["done"]):
                 yield start, partial(advance_start, problem, start, states.get(start))
 
-    def next_slice(start: int, reached: Slice) -> Callable[[], Slice] | None:
+    def next_slice(start: int, reached: StartSlice) -> Callable[[], StartSlice] | None:
         return None if reached.done or stop else partial(advance_start, problem, start, reached.state)
 
     for start, reached in run_tasks(first_slices(), run.executor, then=next_slice):
@@ -226,7 +226,7 @@ def _advance(
         run.report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
 
 
-def _candidates(problem: Problem, states: dict[int, State], stop: _Stop) -> list[Morphology]:
+def _candidates(problem: SearchProblem, states: dict[int, State], stop: _Stop) -> list[Morphology]:
     """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
     if not states:
         return [finish(problem, 0, None)]
@@ -238,7 +238,7 @@ def _candidates(problem: Problem, states: dict[int, State], stop: _Stop) -> list
     return [finish(problem, best, states[best], stop.mend_until())]
 
 
-def _choose(found: list[Morphology], problem: Problem) -> tuple[Morphology, list[Violation]]:
+def _choose(found: list[Morphology], problem: SearchProblem) -> tuple[Morphology, list[Violation]]:
     """The pad with fewest broken rules, then least mean ambiguity, and what it breaks."""
     search, enforce = problem.search, problem.rules.enforce
 
@@ -251,11 +251,11 @@ def _choose(found: list[Morphology], problem: Problem) -> tuple[Morphology, list
     return best, broken[id(best)]
 
 
-def _name(problem: Problem, start: int) -> str:
+def _name(problem: SearchProblem, start: int) -> str:
     return "genetic" if problem.search.method == "genetic" else f"start {start + 1}"
 
 
-def _history(problem: Problem, states: dict[int, State]) -> list[dict[str, Any]]:
+def _history(problem: SearchProblem, states: dict[int, State]) -> list[dict[str, Any]]:
     return [
         {"run": _name(problem, start), "step": int(step), "objective": value}
         for start, state in sorted(states.items())

@@ -15,7 +15,7 @@ from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.kernels.pchip import pchip_sample
 from design.settings import Contact
 
-from .contact import exact, quantized, signals_sparse
+from .contact import quantized_and_samples, signals_and_spans, signals_sparse
 from .morphology import Morphology
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def plain_signals(pad: Morphology, presses: Array, contact: Contact, samples: in
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")  # not kept: it calls a kernel of another folder, whose changes would go unseen
 def scanned_signals(knots: Any, presses: Any, radius: float, sides: int, samples: int) -> Any:
     """The published rule compiled as it stands: a full scan, a circle test, then every edge of the polygon."""
     fibres = len(knots)
@@ -84,7 +84,7 @@ def trials() -> Iterator[BenchTrial]:
         pad, presses = Morphology.straight(grid), rng.uniform(1, grid, (2000, 2))
 
         def judge(result: object, pad: Morphology = pad, presses: Array = presses) -> Mapping[str, float]:
-            return {"visited": exact(pad, presses[:100], contact)[1] / (100 * len(pad.knots))}
+            return {"visited": signals_and_spans(pad, presses[:100], contact)[1] / (100 * len(pad.knots))}
 
         work = partial(signals_sparse, pad, presses, contact)
         yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, judge, items=len(presses))
@@ -97,7 +97,7 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTr
 
     @cache
     def true() -> Array:
-        return exact(pad, presses, contact)[0]
+        return signals_and_spans(pad, presses, contact)[0]
 
     def error(found: Array, true: Array) -> float:
         return float(np.sqrt(((found - true) ** 2).mean() / (true**2).mean()))
@@ -105,7 +105,7 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTr
     for samples in SAMPLES:
         plain = partial(plain_signals, pad, presses, contact, samples)
         scan = partial(scanned_signals, pad.knots, presses, contact.radius, contact.sides or 0, samples)
-        cull = partial(quantized, pad, presses, contact, samples)
+        cull = partial(quantized_and_samples, pad, presses, contact, samples)
 
         def scanned(found: Array) -> Mapping[str, float]:
             return {"error": error(found, true()), "visited": 1.0}
@@ -121,7 +121,7 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTr
         spans = pairs * (pad.knots.shape[1] - 1)
         return {"error": error(found[0], _oracle(pad, presses, contact)), "visited": found[1] / spans}
 
-    yield BenchTrial(case, "exact", 0, partial(exact, pad, presses, contact), exactly)
+    yield BenchTrial(case, "exact", 0, partial(signals_and_spans, pad, presses, contact), exactly)
 
 
 def _oracle(pad: Morphology, presses: Array, contact: Contact) -> Array:

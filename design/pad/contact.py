@@ -61,10 +61,10 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     Raises:
         InputError: presses of the wrong shape or not finite.
     """
-    return exact(pad, presses, or_default("contact", contact, Contact))[0]
+    return signals_and_spans(pad, presses, or_default("contact", contact, Contact))[0]
 
 
-def exact(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
+def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
     """`signals`, and the number of spans that were looked at for them."""
     travel, cross, batch = fibre_axes(pad)
     flat, places = as_presses(presses, several=True)
@@ -127,7 +127,7 @@ def _run_exact(
         return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, signal)
 
     visited = sum(in_chunks(work, len(travel) * len(places), grain=2000))
-    if profiling.asked():
+    if profiling.is_profiling():
         note_reach(travel, strays, places, shape[1], visited)
     return visited
 
@@ -179,10 +179,12 @@ def signals_quantized(
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
-    return quantized(pad, presses, or_default("contact", contact, Contact), samples)[0]
+    return quantized_and_samples(pad, presses, or_default("contact", contact, Contact), samples)[0]
 
 
-def quantized(pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int) -> tuple[Array, int]:
+def quantized_and_samples(
+    pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int
+) -> tuple[Array, int]:
     """`signals_quantized`, and the number of samples that were looked at for them."""
     shape = press_shape(contact)
     travel, cross, batch = fibre_axes(pad)

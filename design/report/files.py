@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from design.common.settings import Spec
-    from design.optimisers.search import Report
+    from design.optimisers.search import SearchListener
 
 
 def run_search(
@@ -92,7 +92,7 @@ def search_lines(result: SearchResult, out: Path) -> list[str]:
     ]
 
 
-def _shown_on(bar: "Progress") -> "Report":
+def _shown_on(bar: "Progress") -> "SearchListener":
     tasks: dict[str, TaskID] = {}
     best: list[float] = []
 

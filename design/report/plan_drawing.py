@@ -21,7 +21,7 @@ def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation]
     """
     pad, contact = instance("pad", pad, Morphology), instance("contact", contact, Contact)
     if not isinstance(violations, Sequence) or not all(isinstance(found, Violation) for found in violations):
-        raise InputError(f"violations is {shown(violations)}, expected what rules.check found")
+        raise InputError(f"violations is {shown(violations)}, expected what check_rules found")
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     half = pad.size_mm / 2

@@ -69,7 +69,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     return [fibres]
 
 
-def origin(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
+def provenance_row(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
     """Where the result of a stage came from: a row for `provenance_section`.
 
     Args:

@@ -1,8 +1,8 @@
 """How much a rigid indenter lengthens the fibres: integrals along PCHIP spans of the surface it deflects.
 
-A span is the cubic of `exact`, t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 from the press centre. The slope of the
-surface has a root or a pole in r - a at the edge of the contact; spans are cut there, and the pieces outside run in u
-with s - s_edge ~ u^2, in which both are smooth. Spans are monotone, so their ends box them: pieces are halved until
+A span is the cubic of `exact_signals`, t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 from the press centre. The slope of
+the surface has a root or a pole in r - a at the edge of the contact; spans are cut there, and the pieces outside run in
+u with s - s_edge ~ u^2, in which both are smooth. Spans are monotone, so their ends box them: pieces are halved until
 none is long for its distance, and then by the error that Gauss-Kronrod estimates.
 """
 

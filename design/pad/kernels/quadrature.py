@@ -1,6 +1,7 @@
 """Weighted length of a stretch of a span: a closed form where there is one, else adaptive Gauss-Kronrod.
 
-A span is the (6,) array r, h, e0..e3 of `exact`: t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 from the press centre.
+A span is the (6,) array r, h, e0..e3 of `exact_signals`: t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 from the centre
+of the press.
 """
 
 import math

@@ -125,7 +125,7 @@ def fibre_quantized(
     travel axis, then by bisection across it.
 
     Args:
-        t, v: (n,) knots. curve: samples of the fibre at 0, step, ... shape: its chains, see `exact`.
+        t, v: (n,) knots. curve: samples of the fibre at 0, step, ... shape: its chains, see `press`.
         reach: (5,) of the shape: least and greatest t, least and greatest v, radius of the circle inside.
     """
     n, segments = len(t), len(curve) - 1
@@ -182,7 +182,7 @@ def quantized_signals(
     """The published rule: sum over sampled segments that start inside the press.
 
     Args:
-        travel, cross: (P, 2M, n) knots. presses: (Q, 2) x and y. chains, reach: the shape, see `exact`.
+        travel, cross: (P, 2M, n) knots. presses: (Q, 2) x and y. chains, reach: the shape, see `press`.
         samples: points per fibre, uniform along its travel axis.
         begin, end: range of fibres to do, counted through the population, 0..2M P.
         out: (P, Q, 2M) to fill.

@@ -28,8 +28,8 @@ def _small(monkeypatch):
 
 
 def taken(bench):
-    measured = harness.Measured()
-    harness.measure(bench, measured, lambda step: None, lambda key: False)
+    measured = harness.BenchRounds()
+    harness.measure_round(bench, measured, lambda step: None, lambda key: False)
     return measured.found
 
 
@@ -62,13 +62,13 @@ def test_objectives_come_nearer_to_the_exact_one():
 def test_the_search_bench_has_every_way_budget_and_seed(monkeypatch):
     asked = []
 
-    def searched(pad, contact, settings, rules, executor):
+    def searched(pad, contact, settings, rules, run):
         asked.append((settings.method, settings.generations + settings.steps, settings.seed, rules.enforce))
         return SearchResult(Pad.straight(pad.grid), {}, [])
 
     levels = [LossError(k, 1, mean, 0, mean) for k, mean in enumerate([0.1, 0.2, 0.3, 0.8])]
     monkeypatch.setattr(search, "search", searched)
-    monkeypatch.setattr(search, "evaluate", lambda *_, **__: levels)
+    monkeypatch.setattr(search, "localisation_error", lambda *_, **__: levels)
     found = taken(search.BENCH)
 
     ways = [("genetic", 1), ("descent", 1), ("with rules", 1), ("descent", 2), ("with rules", 2)]

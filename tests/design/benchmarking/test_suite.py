@@ -7,8 +7,8 @@ import time
 import pytest
 
 from design.benchmarking import harness, suite
-from design.benchmarking.comparison import compared, comparison_lines, read_earlier, worse
-from design.benchmarking.harness import Bench, BenchTrial, Measured, measure
+from design.benchmarking.comparison import compared, comparison_lines, read_earlier, worsenings
+from design.benchmarking.harness import Bench, BenchRounds, BenchTrial, measure_round
 from design.benchmarking.suite import run_benches
 from design.benchmarking.table import bench_lines, summary_rows, write_bench
 from design.common.errors import InputError
@@ -39,23 +39,23 @@ def test_a_later_round_times_what_it_is_told_to_and_judges_once():
     judged = []
     trial = BenchTrial("a", "ours", 3, lambda: 42, lambda found: judged.append(found) or {"error": 1.0})
     one = Bench("x", lambda: iter([trial]), "error", ("ours", 3), ("ours", 3), plain=())
-    so_far = Measured()
-    assert measure(one, so_far, lambda step: None, lambda key: False) == 1
-    assert measure(one, so_far, lambda step: None, lambda key: False) == 0
-    assert measure(one, so_far, lambda step: None, lambda key: key == trial.key) == 1
+    so_far = BenchRounds()
+    assert measure_round(one, so_far, lambda step: None, lambda key: False) == 1
+    assert measure_round(one, so_far, lambda step: None, lambda key: False) == 0
+    assert measure_round(one, so_far, lambda step: None, lambda key: key == trial.key) == 1
     assert judged == [42]
     assert len(so_far.times[trial.key]) == 2
 
 
 def test_slow_plain_ways_are_timed_once(monkeypatch):
     monkeypatch.setattr(harness, "PLAIN_S", -1)
-    so_far = Measured()
-    measure(bench(), so_far, lambda step: None, lambda key: True)
-    assert measure(bench(), so_far, lambda step: None, lambda key: True) == 2  # ours of both cases
+    so_far = BenchRounds()
+    measure_round(bench(), so_far, lambda step: None, lambda key: True)
+    assert measure_round(bench(), so_far, lambda step: None, lambda key: True) == 2  # ours of both cases
 
 
 def test_a_trial_is_settled_when_its_two_best_rounds_agree():
-    so_far = Measured(times={("a", "ours", 0, 0): [1.0], ("b", "ours", 0, 0): [2.0, 1.0, 1.01]})
+    so_far = BenchRounds(times={("a", "ours", 0, 0): [1.0], ("b", "ours", 0, 0): [2.0, 1.0, 1.01]})
     assert not so_far.settled(("a", "ours", 0, 0))
     assert so_far.settled(("b", "ours", 0, 0))
     so_far.times["b", "ours", 0, 0] = [2.0, 1.0, 1.5]
@@ -69,8 +69,10 @@ def test_time_is_an_items_and_waits_for_a_core_do_not_count(monkeypatch):
     now = iter([0.0, 0.01] * 1000)
     monkeypatch.setattr(harness.time, "perf_counter", lambda: next(now))
     trial = BenchTrial("a", "ours", 0, lambda: None, items=2)
-    so_far = Measured()
-    measure(Bench("x", lambda: iter([trial]), "", ("ours", 0), ("ours", 0), ()), so_far, lambda s: None, lambda k: True)
+    so_far = BenchRounds()
+    measure_round(
+        Bench("x", lambda: iter([trial]), "", ("ours", 0), ("ours", 0), ()), so_far, lambda s: None, lambda k: True
+    )
     assert so_far.times[trial.key] == [pytest.approx(0.002)]
     assert so_far.paces[trial.key] == [pytest.approx(0.002 / 0.75)]
     assert so_far.pace_s == 0.5
@@ -99,7 +101,7 @@ def test_files_hold_what_was_measured(tmp_path):
 
 
 def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
-    so_far = Measured(pace_s=1e-3)
+    so_far = BenchRounds(pace_s=1e-3)
     for number, (error, seconds) in enumerate(((0.1, 2.0), (0.3, 9.0), (0.2, 4.0))):
         so_far.found["a", "slow", 1, number] = {"error": error}
         so_far.times["a", "slow", 1, number] = so_far.paces["a", "slow", 1, number] = [seconds + 1, seconds]
@@ -132,13 +134,13 @@ def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
 )
 def test_what_has_become_worse_is_found(now, what):
     before = document(way=now["rows"][0]["way"] if now["rows"][0]["way"] != "new" else "ours")
-    assert [change.what for change in worse(before, now)] == what
+    assert [change.what for change in worsenings(before, now)] == what
 
 
 def test_quick_work_is_slower_from_a_smaller_ratio_on():
-    assert [change.what for change in worse(document(seconds=0.01), document(seconds=0.0121))] == ["slower"]
-    assert not worse(document(seconds=0.01), document(seconds=0.0119))
-    assert not worse(document(seconds=0.01), document(seconds=0.013, pace=1.3e-3))  # the machine is slower
+    assert [change.what for change in worsenings(document(seconds=0.01), document(seconds=0.0121))] == ["slower"]
+    assert not worsenings(document(seconds=0.01), document(seconds=0.0119))
+    assert not worsenings(document(seconds=0.01), document(seconds=0.013, pace=1.3e-3))  # the machine is slower
 
 
 def test_tiny_work_is_slower_in_company_only():
@@ -148,23 +150,23 @@ def test_tiny_work_is_slower_in_company_only():
         return made
 
     before = two(1e-4, 2e-4)
-    assert not worse(before, two(1.4e-4, 2e-4))
-    assert {change.key[0] for change in worse(before, two(1.4e-4, 2.8e-4))} == {"a", "b"}
+    assert not worsenings(before, two(1.4e-4, 2e-4))
+    assert {change.key[0] for change in worsenings(before, two(1.4e-4, 2.8e-4))} == {"a", "b"}
 
 
 def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
     now = document(seconds=1.5)
     now["rows"][0]["paces"] = 1.05e3
-    assert not worse(document(), now)
+    assert not worsenings(document(), now)
 
 
 def test_errors_of_rounding_are_all_alike():
-    assert not worse(document(error=1e-17), document(error=9e-16))
-    assert [change.ratio for change in worse(document(error=0.0), document(error=1e-14))] == [pytest.approx(10)]
+    assert not worsenings(document(error=1e-17), document(error=9e-16))
+    assert [change.ratio for change in worsenings(document(error=0.0), document(error=1e-14))] == [pytest.approx(10)]
 
 
 def test_a_change_is_told_in_one_line():
-    (change,) = worse(document(), document(seconds=1.5))
+    (change,) = worsenings(document(), document(seconds=1.5))
     assert str(change) == "x, a, ours: slower, 1.50x (1 before, 1.5 now)"
     assert comparison_lines([change], 3) == ["3 trials compared; worse than before:", f"  {change}"]
     assert comparison_lines([], 3) == ["3 trials compared: none slower, less accurate or looking at more"]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from design.common.errors import InputError
-from design.evaluation.levenberg_marquardt import Network, Scale, first_weights, fit, fit_many
+from design.evaluation.levenberg_marquardt import ColumnScale, Network, first_weights, fit, fit_many
 from design.evaluation.variable_projection import (
     RIDGE,
     Fit,
@@ -209,7 +209,7 @@ def test_first_neurons_are_spread_as_nguyen_and_widrow_have_it(varying, hidden):
 
 def test_a_scale_fills_minus_one_to_one_and_comes_back():
     values = np.array([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0], [2.0, 5.0, 4.0]])
-    scale = Scale.of(values)
+    scale = ColumnScale.of(values)
     np.testing.assert_allclose(scale.there(values), [[-1, 0, -1], [1, 0, 1 / 3], [0, 0, 1]])
     np.testing.assert_allclose(scale.back(scale.there(values)), values)
     np.testing.assert_allclose(scale.back(np.array([[0.5, 9.0, -2.0]])), [[2.5, 5.0, -5.0]])
@@ -217,7 +217,7 @@ def test_a_scale_fills_minus_one_to_one_and_comes_back():
 
 def test_a_network_is_its_formula():
     rng = np.random.default_rng(1)
-    inputs, targets = (Scale(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
+    inputs, targets = (ColumnScale(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
     hidden, output = rng.normal(size=(4, 4)), rng.normal(size=(2, 5))
     x = rng.normal(size=(6, 3))
     neurons = np.tanh((x - inputs.middle) / inputs.half @ hidden[:, :3].T + hidden[:, 3])

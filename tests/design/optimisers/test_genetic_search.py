@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from design.criteria.published_objective import published_objective
-from design.optimisers.genetic_search import Breeding
-from design.optimisers.problem import Problem
+from design.optimisers.genetic_search import GeneticSearch
+from design.optimisers.problem import SearchProblem
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 PAD, CONTACT = PadSettings(grid=3), Contact()
@@ -13,7 +13,7 @@ SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
 
 
 def bred(generations, search=SMALL, origin=None, state=None):
-    breeding = Breeding(Problem(PAD, (CONTACT,), search, RulesSettings(), origin), state)
+    breeding = GeneticSearch(SearchProblem(PAD, (CONTACT,), search, RulesSettings(), origin), state)
     objectives = []
     for _ in range(generations):
         breeding.advance(1)
@@ -75,7 +75,7 @@ def test_a_given_origin_is_never_lost():
 @pytest.mark.parametrize("grid", [1, 2])
 def test_the_smallest_pads_with_the_smallest_populations_are_bred_too(grid):
     search = SearchSettings(method="genetic", knots=1, population=4, generations=4)
-    breeding = Breeding(Problem(PadSettings(grid=grid, pitch_mm=20), (CONTACT,), search, RulesSettings()))
+    breeding = GeneticSearch(SearchProblem(PadSettings(grid=grid, pitch_mm=20), (CONTACT,), search, RulesSettings()))
     breeding.advance(4)
     found = breeding.morphology()
     assert found.grid == grid
@@ -84,8 +84,8 @@ def test_the_smallest_pads_with_the_smallest_populations_are_bred_too(grid):
 
 @pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), (20, 0.1040)])
 def test_a_whole_search_reaches_the_published_objective(knots, bar):
-    breeding = Breeding(
-        Problem(PadSettings(), (CONTACT,), SearchSettings(method="genetic", knots=knots), RulesSettings())
+    breeding = GeneticSearch(
+        SearchProblem(PadSettings(), (CONTACT,), SearchSettings(method="genetic", knots=knots), RulesSettings())
     )
     breeding.advance(50)
     assert breeding.done

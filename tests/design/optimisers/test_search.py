@@ -10,7 +10,7 @@ import pytest
 from design import Contact, InputError, Morphology
 from design.common.checkpoints import Checkpoints
 from design.criteria.score import score
-from design.optimisers.problem import Problem
+from design.optimisers.problem import SearchProblem
 from design.optimisers.search import SearchRun, search
 from design.optimisers.start import advance_start
 from design.settings import PadSettings, RulesSettings, SearchSettings
@@ -111,7 +111,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
 
 
 def test_resuming_with_other_settings_is_refused_and_names_what_differs(tmp_path):
-    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     other = SMALL.model_copy(update={"seed": 5})
     with pytest.raises(InputError, match="begun with search seed 0, now 5"):
@@ -119,7 +119,7 @@ def test_resuming_with_other_settings_is_refused_and_names_what_differs(tmp_path
 
 
 def test_a_damaged_state_is_named(tmp_path):
-    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     path = tmp_path / "search" / "start_0000.npz"
     path.write_bytes(path.read_bytes()[:-40])
@@ -128,7 +128,7 @@ def test_a_damaged_state_is_named(tmp_path):
 
 
 def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
-    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
     path = tmp_path / "search" / "start_0000.npz"
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     with np.load(path) as arrays:
@@ -139,7 +139,7 @@ def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
 
 
 def test_a_state_of_another_start_is_refused(tmp_path):
-    problem = Problem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     (tmp_path / "search" / "start_0000.npz").rename(tmp_path / "search" / "start_0001.npz")
     with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
@@ -170,7 +170,7 @@ def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatc
     settings = SMALL.model_copy(update={"method": method, "steps": 30, "generations": 4, "starts": 1})
     whole = search(settings=settings)
     monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    assert advance_start(Problem(PadSettings(), (Contact(),), settings, RulesSettings(), None), 0, None).step == 1
+    assert advance_start(SearchProblem(PadSettings(), (Contact(),), settings, RulesSettings(), None), 0, None).step == 1
     assert search(settings=settings).morphology == whole.morphology
 
 

@@ -10,8 +10,8 @@ def test_every_way_stays_within_the_tolerance(monkeypatch):
     monkeypatch.setattr(bench, "TOLERANCES_MM", (0.05, 0.01))
     monkeypatch.setattr(bench, "FUSED_UP_TO", 1)
     monkeypatch.setattr(harness, "BUDGET_S", 0)
-    measured = harness.Measured()
-    harness.measure(bench.BENCH, measured, lambda step: None, lambda key: False)
+    measured = harness.BenchRounds()
+    harness.measure_round(bench.BENCH, measured, lambda step: None, lambda key: False)
     rows: list[dict[str, Any]] = [
         {"case": case, "way": way, "size": size, **row} for (case, way, size, _), row in measured.found.items()
     ]

@@ -29,8 +29,8 @@ def test_the_published_filter_is_at_the_minimum_and_iterations_come_near(monkeyp
     for name, value in {"READINGS": 600, "LONG": (700,), "STEPS": (10, 1000)}.items():
         monkeypatch.setattr(bench_filter, name, value)
     monkeypatch.setattr(harness, "BUDGET_S", 0)
-    measured = harness.Measured()
-    harness.measure(bench_filter.BENCH, measured, lambda step: None, lambda key: False)
+    measured = harness.BenchRounds()
+    harness.measure_round(bench_filter.BENCH, measured, lambda step: None, lambda key: False)
     first = {key[1:3]: row for key, row in measured.found.items() if key[0] == "600 readings"}
     assert abs(first["robust", 4]["excess"]) < 1e-9
     assert abs(first["LP (HiGHS)", 4]["excess"]) < 1e-9

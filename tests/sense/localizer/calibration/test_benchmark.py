@@ -13,8 +13,8 @@ def test_every_way_learns_and_is_tested(monkeypatch: pytest.MonkeyPatch) -> None
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     bench._recording.cache_clear()
-    measured = harness.Measured()
-    harness.measure(bench.BENCH, measured, lambda step: None, lambda key: False)
+    measured = harness.BenchRounds()
+    harness.measure_round(bench.BENCH, measured, lambda step: None, lambda key: False)
     bench._recording.cache_clear()
     rest = [("L-BFGS", 3), ("L-BFGS", 40), ("Adam", 1), ("masked", 3)]
     assert [key[:3] for key in measured.found] == [
