@@ -11,7 +11,7 @@ import pytest
 from sense.rig.emulators.ur import UrEmulator
 from sense.rig.emulators.ur_controller import Series
 from sense.rig.ur5.driver import UR5
-from tests.sense.rig.arms import HOST, Robots
+from tests.sense.rig.ur5.arms import HOST, Robots
 
 WAIT_S = 180.0
 

@@ -1,12 +1,10 @@
 """The converter through a real pseudo-terminal and real pyserial, against the emulated board and its faults."""
 
 import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,17 +12,14 @@ import pytest
 
 from design.common.errors import InputError
 from sense.rig.arduino import driver as module
-from sense.rig.arduino.driver import Arduino, Assembler
-from sense.rig.arduino.framing import Block, BoardSettings, Decoder, Status, encode
-from sense.rig.arduino.serial_link import BoardPort, find_ports, refusal
+from sense.rig.arduino.driver import Arduino
 from sense.rig.devices import ConverterSamples, RigFault
-from sense.rig.emulators.board import MAX_PERIOD_NS, MIN_NS_PER_CONVERSION, EmulatedBoard, judge_settings
+from sense.rig.emulators.board import EmulatedBoard
 
-serial = pytest.importorskip("serial")
+pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
 STEP_V = 3.3 / 4095
-SETTINGS = BoardSettings(1_000_000, 0xFF, 1)
 
 
 @pytest.fixture(autouse=True)
@@ -123,21 +118,6 @@ def test_a_sample_is_complete_a_period_after_the_one_before() -> None:
         assert (block.first, block.time_us, len(block.counts)) == (32, 36 * 2000, 4)
 
 
-@pytest.mark.parametrize(
-    ("settings", "status"),
-    [
-        (BoardSettings(8 * MIN_NS_PER_CONVERSION, 0xFF, 1), Status.OK),
-        (BoardSettings(8 * MIN_NS_PER_CONVERSION - 1, 0xFF, 1), Status.TOO_FAST),
-        (BoardSettings(12 * 16 * MIN_NS_PER_CONVERSION, 0xFFF, 16), Status.OK),
-        (BoardSettings(12 * 16 * MIN_NS_PER_CONVERSION - 1, 0xFFF, 16), Status.TOO_FAST),
-        (BoardSettings(MAX_PERIOD_NS, 1, 1), Status.OK),
-        (BoardSettings(MAX_PERIOD_NS + 1, 1, 1), Status.BAD_SETTINGS),
-    ],
-)
-def test_a_period_is_at_least_that_of_its_conversions(settings: BoardSettings, status: Status) -> None:
-    assert judge_settings(settings) == status
-
-
 def test_garbled_bytes_cost_samples_that_are_counted_and_never_give_a_wrong_one() -> None:
     board = EmulatedBoard(waves, seed=3)
     with connected(board) as converter:
@@ -226,89 +206,7 @@ def test_a_port_in_use_is_refused_and_free_again_after_close() -> None:
     assert not any(thread.name == f"reader of {board.port}" for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize(
-    ("error", "match"),
-    [
-        (serial.SerialException(13, "Permission denied"), "no permission.*dialout"),
-        (serial.SerialException("could not open port 'COM7': PermissionError(13, 'Access is denied.')"), "another"),
-        (serial.SerialException("could not open port 'COM7': FileNotFoundError(2, '...')"), "no such port"),
-        (serial.SerialException("a device attached to the system is not functioning"), "not functioning.*native"),
-    ],
-)
-def test_every_way_to_be_refused_comes_with_advice(error: Exception, match: str) -> None:
-    with pytest.raises(RigFault, match=match):
-        raise refusal("COM7", error)
-
-
-def test_without_pyserial_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (Arduino("/dev/ttyACM0", 1000).connect, find_ports):
-        fault_of(action, "refused", r"pip install 'padforge\[rig\]'")
-
-
-def test_ports_of_a_due_are_found_native_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    ports = [
-        SimpleNamespace(device="/dev/ttyACM1", vid=0x2341, pid=0x003D, serial_number="7"),
-        SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None),
-        SimpleNamespace(device="/dev/ttyACM0", vid=0x2341, pid=0x003E, serial_number=None),
-        SimpleNamespace(device="/dev/ttyACM2", vid=0x2341, pid=0x0043, serial_number="uno"),
-    ]
-    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
-    assert find_ports() == [
-        BoardPort("/dev/ttyACM0", "native", ""),
-        BoardPort("/dev/ttyACM1", "programming", "7"),
-    ]
-
-
 @pytest.mark.parametrize("values", [{"rate_hz": 9}, {"rate_hz": 10_001}, {"channels": 13}, {"averaging": 0}])
 def test_settings_out_of_range_are_named(values: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"{next(iter(values))} is .*expected"):
         Arduino("port", **{"rate_hz": 1000, **values})
-
-
-def block(first: int, time_us: int | None = None, samples: int = 16) -> Block:
-    counts = np.full((samples, 8), first % 4096, np.uint16)
-    time_us = (first + samples) * 1000 if time_us is None else time_us
-    return Block(counts, 1, 0xFF, first // 16 % 2**16, first % 2**32, time_us % 2**32, 0)
-
-
-def test_a_million_samples_with_all_numbers_wrapping_take_no_more_memory_than_a_few() -> None:
-    start = 2**32 - 500_000 // 16 * 16
-    decoder, assembler, held, before = Decoder(), Assembler(SETTINGS, 3.3), [], -np.inf
-    for first in range(start, start + 1_000_000, 1600):
-        sent = [encode(block(index)) for index in range(first, first + 1600, 16)]
-        frames = [frame for frame in decoder.feed(b"".join(sent)) if isinstance(frame, Block)]
-        samples = assembler.samples(((first + 16 * i) * 1e-3, frame) for i, frame in enumerate(frames))
-        assert samples.times_s[0] > before
-        before = samples.times_s[-1]
-        assert samples.volts[0, 0] == pytest.approx(first % 4096 * STEP_V)
-        held.append(sys.getallocatedblocks())
-    assert assembler.missing == start  # none but those before the first block
-    assert assembler.blocks == 62_500
-    assert max(held[-100:]) < max(held[100:200]) + 1000
-
-
-@pytest.mark.parametrize(
-    "second",
-    [block(0), block(64, 17_000), block(16, 90_000), block(2**31)],
-    ids=["again", "too early", "too late", "far away"],
-)
-def test_a_block_that_cannot_follow_is_a_fault(second: Block) -> None:
-    assembler = Assembler(SETTINGS, 3.3)
-    assembler.samples([(1.0, block(0))])
-    with pytest.raises(RigFault, match="off its time") as caught:
-        assembler.samples([(1.1, second)])
-    assert caught.value.cause == "data"
-
-
-def test_blocks_of_other_channels_are_a_fault() -> None:
-    with pytest.raises(RigFault, match="other channels"):
-        Assembler(BoardSettings(1_000_000, 0x0F, 1), 3.3).samples([(1.0, block(0))])
-
-
-def test_nothing_new_is_an_empty_reading_of_the_right_shape() -> None:
-    samples = Assembler(SETTINGS, 3.3).samples([])
-    assert samples.times_s.shape == (0,)
-    assert samples.volts.shape == (0, 8)
-    assert samples.missing.shape == (0,)
-    assert samples.missing.dtype == np.int64

@@ -12,7 +12,7 @@ from sense.rig.emulators.ur import HOME, UrEmulator
 from sense.rig.safety import wait_until_still
 from sense.rig.ur5 import driver as ur5
 from sense.rig.ur5.driver import UR5
-from tests.sense.rig.arms import (
+from tests.sense.rig.ur5.arms import (
     HOST,
     LIMITS,
     LONGEST_CALL_S,

@@ -14,7 +14,19 @@ from sense.rig.emulators.ur import HOME, UrEmulator
 from sense.rig.safety import wait_until_still
 from sense.rig.ur5 import link as ur5_link
 from sense.rig.ur5.driver import UR5
-from tests.sense.rig.arms import HOST, LIMITS, LONGEST_CALL_S, LOW, REST_S, begin, fault_of, go, rested_s, stop, within
+from tests.sense.rig.ur5.arms import (
+    HOST,
+    LIMITS,
+    LONGEST_CALL_S,
+    LOW,
+    REST_S,
+    begin,
+    fault_of,
+    go,
+    rested_s,
+    stop,
+    within,
+)
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here"),
