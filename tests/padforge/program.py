@@ -1,9 +1,18 @@
-"""The program as people call it, in a process of its own."""
+"""The program as people call it: in a process of its own, or in this one, which spares its imports."""
 
 import subprocess
 import sys
+from contextlib import chdir
+
+from tests.stress.door import Ended, call
 
 
 def padforge(*arguments, cwd):
     command = [sys.executable, "-m", "padforge", *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def called(*arguments, cwd) -> Ended:
+    """What a command that refuses ends with, in this process."""
+    with chdir(cwd):
+        return call(*arguments, limit_s=60)

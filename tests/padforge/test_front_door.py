@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.padforge.program import padforge
+from tests.padforge.program import called, padforge
 
 
 def loaded_by(code):
@@ -31,28 +31,28 @@ def test_a_recording_of_a_real_pad_is_never_replaced(tmp_path):
     recording = tmp_path / "out" / "pad" / "recording"
     recording.mkdir(parents=True)
     (recording / "start.json").write_text('{"format": "padforge-recording/1", "source": {"kind": "published"}}')
-    result = padforge("run", cwd=tmp_path)
-    assert result.returncode == 2
-    assert "choose another --out" in result.stderr
+    result = called("run", cwd=tmp_path)
+    assert result.code == 2
+    assert "choose another --out" in result.err
     assert (recording / "start.json").exists()
 
 
 def test_what_would_fail_late_is_refused_before_anything_is_done(tmp_path):
     (tmp_path / "pad.toml").write_text("[rig]\npresses = 3\n")
-    result = padforge("run", cwd=tmp_path)
-    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
-    assert "3 presses" in result.stderr
+    result = called("run", cwd=tmp_path)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "3 presses" in result.err
     (tmp_path / "pad.toml").write_text("[pad]\npitch_mm = 0.3\n")
-    assert "ridge_width_mm" in padforge("run", cwd=tmp_path).stderr
+    assert "ridge_width_mm" in called("run", cwd=tmp_path).err
     assert [path.name for path in tmp_path.iterdir()] == ["pad.toml"]
 
 
 @pytest.mark.parametrize("content", ['{"format": "padforge-design/1"}', '{"format": "padforge-design/1", "terms": 3}'])
 def test_a_report_on_damaged_files_names_them(tmp_path, content):
     (tmp_path / "design.json").write_text(content)
-    result = padforge("report", ".", cwd=tmp_path)
-    assert result.returncode == 2
-    assert "design.json: not as padforge writes it" in result.stderr
+    result = called("report", ".", cwd=tmp_path)
+    assert result.code == 2
+    assert "design.json: not as padforge writes it" in result.err
 
 
 def test_what_is_no_part_of_a_recording_is_never_removed(tmp_path):
@@ -60,9 +60,9 @@ def test_what_is_no_part_of_a_recording_is_never_removed(tmp_path):
     recording.mkdir(parents=True)
     (recording / "start.json").write_text('{"format": "padforge-recording/1", "source": {"kind": "simulated"}}')
     (recording / "notes.txt").write_text("of the day")
-    result = padforge("run", cwd=tmp_path)
-    assert result.returncode == 2
-    assert "holds notes.txt, which is no part of a recording" in result.stderr
+    result = called("run", cwd=tmp_path)
+    assert result.code == 2
+    assert "holds notes.txt, which is no part of a recording" in result.err
     assert (recording / "notes.txt").read_text() == "of the day"
 
 
@@ -74,17 +74,17 @@ def test_a_bare_command_shows_its_help(tmp_path):
 
 
 def test_init_writes_settings_that_every_command_reads(tmp_path):
-    assert padforge("init", cwd=tmp_path).returncode == 0
+    assert called("init", cwd=tmp_path).code == 0
     text = (tmp_path / "pad.toml").read_text()
     for section in ("pad", "contact", "search", "rules", "mould", "printer", "rig", "localizer"):
         assert f"[{section}]" in text
-    again = padforge("init", cwd=tmp_path)
-    assert again.returncode == 2
-    assert "exists already" in again.stderr
+    again = called("init", cwd=tmp_path)
+    assert again.code == 2
+    assert "exists already" in again.err
     (tmp_path / "pad.toml").write_text(text.replace("steps = 1000", "steps = 0"))
-    result = padforge("run", cwd=tmp_path)
-    assert result.returncode == 2
-    assert "pad.toml: [search] steps: got 0" in result.stderr
+    result = called("run", cwd=tmp_path)
+    assert result.code == 2
+    assert "pad.toml: [search] steps: got 0" in result.err
 
 
 @pytest.mark.parametrize(
@@ -104,11 +104,11 @@ def test_init_writes_settings_that_every_command_reads(tmp_path):
     ],
 )
 def test_mistakes_end_in_one_line_and_exit_2(tmp_path, arguments):
-    result = padforge(*arguments, cwd=tmp_path)
-    assert result.returncode == 2
-    assert result.stderr.startswith("padforge: ")
-    assert result.stderr.count("\n") == 1
-    assert result.stdout == ""
+    result = called(*arguments, cwd=tmp_path)
+    assert result.code == 2
+    assert result.err.startswith("padforge: ")
+    assert result.err.count("\n") == 1
+    assert result.out == ""
     assert list(tmp_path.iterdir()) == []
 
 

@@ -22,7 +22,7 @@ grid = 2
 [search]
 knots = 2
 starts = 1
-steps = 60
+steps = 10
 lost = 1
 [rig]
 presses = 80
@@ -86,9 +86,11 @@ def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain):
     folder, _ = chain
     recording = folder / "out" / "pad" / "recording" / "readings.bin"
     before = recording.read_bytes()
-    (folder / "long.toml").write_text(SMALL.replace("steps = 60", "steps = 1000000"))
+    (folder / "long.toml").write_text(SMALL.replace("steps = 10", "steps = 1000000"))
     process = subprocess.Popen([sys.executable, "-m", "padforge", "run", "--spec", "long.toml"], cwd=folder)
-    time.sleep(12)
+    begun = time.monotonic()
+    while not any((folder / "out" / "pad" / "search").glob("start_*")) and time.monotonic() < begun + 60:
+        time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130
     assert recording.read_bytes() == before
