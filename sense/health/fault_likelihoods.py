@@ -58,7 +58,7 @@ _FAR_T = 6.869
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FaultLikelihoods:
     """What healthy presses look like, beside what the network predicts.
 
     Attributes:
@@ -88,7 +88,7 @@ class Evidence:
     @classmethod
     def fit(
         cls, traces: Array, targets: Array, mean: Array, spread: Array, size: Array, rng: np.random.Generator
-    ) -> "Evidence":
+    ) -> "FaultLikelihoods":
         """From (Q, C, TRACE) healthy traces, their targets and predictions (Q, C, T) by members that did not learn
         from them, and `size` (C, T), V, of a target of 1."""
         scale, extra = _calibrated(targets - mean, spread)

@@ -17,7 +17,7 @@ from design.common.settings import validated
 from sense.processing.limits import as_numbers, stream_of
 
 from .alarm_thresholds import Tail
-from .fault_likelihoods import HYPOTHESES, Evidence
+from .fault_likelihoods import HYPOTHESES, FaultLikelihoods
 from .fibre_prediction import Shapes, Weights
 from .schema import FORMAT, HealthDocument, refuse_unsound
 from .trained_model import files_of, refuse_other_pad
@@ -48,7 +48,7 @@ class HealthModel:
 
     shapes: Shapes
     weights: Weights
-    evidence: Evidence
+    evidence: FaultLikelihoods
     tail: Tail
     rests: Array
     fibres: int
@@ -113,7 +113,7 @@ class HealthModel:
         return cls(
             shapes=Shapes(**parts["shapes"]),
             weights=parts["weights"],
-            evidence=Evidence(**parts["evidence"]),
+            evidence=FaultLikelihoods(**parts["evidence"]),
             tail=Tail(**parts["tail"]),
             rests=arrays["rests"],
             fibres=document.fibres,

@@ -12,7 +12,7 @@ from sense.processing.limits import LEAST_SPREAD_V
 from sense.recordings.recording import Recording
 
 from .alarm_thresholds import Tail
-from .fault_likelihoods import Evidence
+from .fault_likelihoods import FaultLikelihoods
 from .fibre_prediction import MEMBERS, REST, Weights, expected, member, shapes_of, traces_of, train_predictors
 from .health_model import (
     COMMANDED,
@@ -97,7 +97,7 @@ def fit_health_model(
     shapes, inputs, targets = shapes_of(traces)
     held_out = _HeldOut.train(inputs, targets, rng)
     measured = traces[held_out.settled], targets[held_out.settled]
-    evidence = Evidence.fit(*measured, *held_out.without(np.array([], dtype=np.int64)), shapes.targets, rng)
+    evidence = FaultLikelihoods.fit(*measured, *held_out.without(np.array([], dtype=np.int64)), shapes.targets, rng)
     tail = _tail(evidence, measured, held_out, rng)
     rests = traces[:, :, :REST].mean(axis=2)
     return HealthModel(
@@ -170,7 +170,9 @@ class _HeldOut:
         return mean[self.settled], spread[self.settled]
 
 
-def _tail(evidence: Evidence, measured: tuple[Array, Array], held_out: _HeldOut, rng: np.random.Generator) -> Tail:
+def _tail(
+    evidence: FaultLikelihoods, measured: tuple[Array, Array], held_out: _HeldOut, rng: np.random.Generator
+) -> Tail:
     """What is chance, learnt for each number of fibres left out; of those left out none has a say."""
     fibres, ratios = measured[0].shape[1], []
     for lost in range(min(MOST_LOST, fibres - 1) + 1):

@@ -3,7 +3,7 @@
 Inputs are (Q, C, F): F numbers of each fibre, made of that fibre's readings alone, so that a lost fibre can be masked
 and takes nothing of the others with it. Readings are counted from the one at which the probe was sent down or up; a
 window that would reach into a neighbouring press is filled with the nearest reading that does not. What the fibre gave
-before the press, its history, is kept apart (`response` says what of it still shows).
+before the press, its history, is kept apart (`response_model` says what of it still shows).
 
 Readings may be missing (NaN): short gaps are bridged, and a fibre that lacks too much of a press counts as lost in it.
 """

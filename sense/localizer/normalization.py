@@ -61,7 +61,7 @@ class Normalization:
         some of their smallness, and so of their noise. What never varied is left as large as it is.
 
         Returns:
-            The scaling, and the scaled inputs by place (S, S, C, F), see `Response.table`.
+            The scaling, and the scaled inputs by place (S, S, C, F), see `ResponseModel.table`.
         """
         low, high = places_mm.min(axis=0), places_mm.max(axis=0)
         middle, span = (low + high) / 2, float((high - low).max() / 2) or 1.0

@@ -82,7 +82,7 @@ def _moments(places: Array, past: Array, answer: Array) -> tuple[Array, Array]:
 
 
 def settled(windows: Array, history: Array, memory: Array, usual: Array) -> Array:
-    """(Q, C, F) windows as they would be after the usual history, see `Response`."""
+    """(Q, C, F) windows as they would be after the usual history, see `ResponseModel`."""
     return windows - np.einsum("qcj,cjf->qcf", history - usual, memory)
 
 

@@ -33,7 +33,7 @@ Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
 
 
 class ScalingTable(Settings):
-    """`scaling` of `localizer.json`, see `localizer.Scaling`."""
+    """`scaling` of `localizer.json`, see `normalization.Normalization`."""
 
     centre_v: list[list[Volts]]
     spread_v: list[list[Spread]]
@@ -44,7 +44,7 @@ class ScalingTable(Settings):
 
 
 class ErrorRow(Settings):
-    """A row of `errors`, see `calibration.evaluate`."""
+    """A row of `errors`, see `evaluation.evaluate`."""
 
     lost: int = Field(ge=0)
     subsets: int = Field(ge=1)

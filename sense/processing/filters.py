@@ -1,10 +1,10 @@
-"""Filters of readings: total-variation denoising, exact, and the running median (`filter_streams` has both of streams).
+"""Filters of readings: total-variation denoising, exact, and the running median (`stream_filters` has both of streams).
 
 Total-variation denoising keeps the steps that presses make and flattens what lies between. A missing reading is NaN:
 it counts for nothing and is bridged at its neighbours' level. Channels are filtered each by itself.
 
 References: the published filter is the robust one with lam = 4, or a median of 15 (T. G. Thuruthel, J. Hughes, F. Iida,
-IEEE Sensors J. 2020); the algorithms are those of `kernels.robust_variation` and `kernels.square_variation`.
+IEEE Sensors J. 2020); the algorithms are those of `kernels.total_variation_l1` and `kernels.total_variation_l2`.
 """
 
 from collections.abc import Callable
@@ -16,18 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from design.common.computing import in_chunks
 from design.common.errors import InputError, instance, real, shown, whole
-from sense.processing.kernels import clipping as clips
-from sense.processing.kernels import running_median as median
-from sense.processing.kernels import total_variation_l1 as robust_variation
-from sense.processing.kernels import total_variation_l2 as square_variation
 
+from .kernels import clipping, total_variation_l1, total_variation_l2
+from .kernels import running_median as median_kernel
 from .limits import MAX_S, as_numbers, refuse_beyond
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Fidelity = Literal["robust", "squares"]
 
-KERNELS = {"robust": robust_variation, "squares": square_variation}
+KERNELS = {"robust": total_variation_l1, "squares": total_variation_l2}
 GREATEST = 1e100
 """Greatest amount of a reading and of lam: beyond, sums may overflow."""
 WIDEST = 2**31 - 1
@@ -96,7 +94,7 @@ def total_variation(
         low, high, out = np.empty((3, len(stretch)))
         latest, _ = kernel.forward_sweep(stretch, float(lam), kernel.silent(), low, high, out if causal else NOBODY)
         if not causal:
-            clips.clip_back(low, high, latest, out)
+            clipping.clip_back(low, high, latest, out)
         return out
 
     return _by_channel(readings, starts, denoise)
@@ -125,7 +123,7 @@ def running_median(readings: ArrayLike, width: int, starts: ArrayLike = (), caus
 def median_of(stretch: Array, before: int, after: int) -> Array:
     """(R,) medians of the readings i - before .. i + after that there are in a stretch (R,)."""
     out = np.empty(len(stretch))
-    median.running_median(stretch, min(before, len(stretch)), min(after, len(stretch)), out)
+    median_kernel.running_median(stretch, min(before, len(stretch)), min(after, len(stretch)), out)
     return out
 
 

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from design.common.errors import InputError, whole
-from sense.processing.kernels.pad_state import unknown
-from sense.processing.kernels.press_detection import find
 
+from .kernels.pad_state import unknown
+from .kernels.press_detection import find
 from .limits import MAX_FIBRES, stream_of
 
 DOUBT, SURE = 1e-3, 1e-9
@@ -56,8 +56,8 @@ class Presses(NamedTuple):
 class Finder:
     """Finds presses as readings come.
 
-    A touch is told a look or two after its first reading (see `kernels.levels`), a tap or a touch of a rare kind only
-    as it is released. Touches and releases take turns, and their readings ascend.
+    A touch is told a look or two after its first reading (see `kernels.level_tracking`), a tap or a touch of a rare
+    kind only as it is released. Touches and releases take turns, and their readings ascend.
 
     Args:
         fibres: C, the number of fibres read.

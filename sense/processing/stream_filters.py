@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, whole
-from sense.processing.kernels import clipping as clips
 
 from .filters import KERNELS, NOBODY, Array, Fidelity, check_variation, checked_readings, median_of, window_reach
+from .kernels import clipping
 from .limits import MAX_FIBRES
 
 MOST_HELD = 100_000
@@ -88,7 +88,7 @@ class _Channel:
     def settle(self, ended: bool) -> None:
         """Decide what no later reading can change: all, if the stretch has ended or no more may be held."""
         values = np.empty(len(self._low))
-        count = clips.clip_back(self._low, self._high, self.latest, values)
+        count = clipping.clip_back(self._low, self._high, self.latest, values)
         if ended or (count == 0 and len(values) == self._most_held):
             count, self._message = len(values), self._kernel.silent()
         self._low, self._high = self._low[count:].copy(), self._high[count:].copy()

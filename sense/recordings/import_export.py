@@ -4,7 +4,7 @@ The CSV form has a header and one line a reading: `time_s`, one column of volts 
 a missing reading), then `x_mm` and `y_mm`. The last two hold the place of the press while the probe is sent down, `?`
 where it is not known, and are empty on every other line; so the first line of a run of equal places is where a press
 begins, and the first line after it where it ends. Where no line has a place, or the two columns are not there, presses
-are found in the readings (`touch`).
+are found in the readings (`press_detection`).
 """
 
 import csv

@@ -1,7 +1,7 @@
 """The run directory that keeps a recording, written so that nothing finished is ever lost.
 
 It holds `start.json` (what was recorded, with what), `readings.bin` and, of a real or emulated arm, `states.bin`
-(streams, see `stream`), and `journal.ndjson`: one line as a press begins, with its place and the index of its first
+(see `block_file`), and `journal.ndjson`: one line as a press begins, with its place and the index of its first
 reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done, so
 after a kill every press the journal calls done can be used, and the others are repeated.
 """

@@ -1,7 +1,7 @@
 """The published localizer as a preset: 50 tanh neurons trained by Levenberg-Marquardt.
 
-It knows no lost fibres; the published way is to train another network for every set of them (`robustness`). Set torch
-to one thread: see `design.evaluation.levenberg_marquardt`.
+It knows no lost fibres; the published way is to train another network for every set of them (`fibre_loss_study`). Set
+torch to one thread: see `design.evaluation.levenberg_marquardt`.
 """
 
 import numpy as np

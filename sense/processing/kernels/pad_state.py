@@ -48,16 +48,16 @@ PAD = np.dtype(
         ("run_first", "i8"),  # first reading of the first,
         ("run_s", "f8"),  # and its time
         ("changing", "?"),  # whether a change is under way,
-        ("told", "i8"),  # what it was told to be, see `touches`,
+        ("told", "i8"),  # what it was told to be, see `press_detection`,
         ("farthest", "f8"),  # its size at its farthest,
         ("farthest_s", "f8"),  # when that was,
         ("after_farthest", "i8"),  # and the first reading after it; -1 before
-        ("state", "i8"),  # see `touches`
+        ("state", "i8"),  # see `press_detection`
         ("released_s", "f8"),  # when a press was last let go
         ("odd_first", "i8"),  # where a change began that is not yet understood
         ("presses", "i8"),  # learnt from
         ("typical_v", "f8"),  # step that a press makes, all fibres together, V
-        ("typical_size", "f8"),  # the same as a counted size, see `touches`
+        ("typical_size", "f8"),  # the same as a counted size, see `press_detection`
         ("agreement", "f8"),  # how far touches go the same way, -1 to 1
         ("rest_spread", "f8"),  # mean counted size of the way from one rest to the next,
         ("held_spread", "f8"),  # and from one level under a press to the next

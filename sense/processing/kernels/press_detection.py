@@ -4,8 +4,8 @@ A release takes back the step that its touch made, and goes against the way of t
 drive their dividers all one way. Where a change fits neither, the next one decides. A pad whose rests differ from
 press to press, as only levels under presses do, has been taken the wrong way round and is set right.
 
-Steps are compared fibre by fibre in spreads (see `levels`). The size of a step is the sum of their squares; counted,
-no fibre enters it with more than `STRONGEST`.
+Steps are compared fibre by fibre in spreads (see `level_tracking`). The size of a step is the sum of their squares;
+counted, no fibre enters it with more than `STRONGEST`.
 """
 
 import math
@@ -253,7 +253,7 @@ def find(fibres: Any, pad: Any, times_s: Any, readings: Any, doubt: Any, sure: A
     """Take (n,) times and (n, C) readings in V, NaN where missing, going on from those before.
 
     Args:
-        fibres, pad: what is known, see `levels.unknown`; overwritten. doubt, sure: as in `levels.changes`.
+        fibres, pad: what is known, see `pad_state`; overwritten. doubt, sure: as in `level_tracking.changes`.
         events: (2 n, 2) overwritten with whether the pad was touched (1) or let go (0), and the reading from which on.
 
     Returns:

@@ -67,7 +67,7 @@ def _minimum(lam: float, knots: Any, first: int, last: int) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def forward_sweep(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
-    """Carry a message on over readings (R,): as `robust_variation.forward`; `ends` costs O(knots) a reading."""
+    """Carry a message on over readings (R,): as `total_variation_l1.forward_sweep`; `ends` costs O(knots) a reading."""
     origin, kept = message[0][0], message[1]
     room = len(readings)
     knots = np.empty((4, kept.shape[1] + 2 * room))

@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from sense import Recording
 from sense.health import fault_likelihoods
-from sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, Evidence, noise_of
+from sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, FaultLikelihoods, noise_of
 from sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE, traces_of
 from sense.health.health_model import HealthModel
 from tests.sense.health.pads import LEARNT
@@ -31,10 +31,10 @@ def shift_ratio(value: float, shift: float) -> float:
     return log_density(value, shift) - log_density(value)
 
 
-def by_hand(seed: int) -> tuple[Evidence, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def by_hand(seed: int) -> tuple[FaultLikelihoods, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Evidence of drawn numbers, and traces, targets, means and spreads of some presses."""
     rng = np.random.default_rng(seed)
-    model = Evidence(
+    model = FaultLikelihoods(
         scale=rng.uniform(0.8, 1.5, (FIBRES, TARGETS)),
         extra=rng.uniform(0.0, 0.3, (FIBRES, TARGETS)),
         floor=rng.uniform(0.05, 0.2, (FIBRES, COMPONENTS)),
@@ -134,7 +134,7 @@ def test_evidence_is_learnt_from_healthy_presses() -> None:
     parts = healthy(rng, 1500)
     parts["traces"][:3, 1] = 0.5
     size = np.full((FIBRES, TARGETS), 2.0)
-    model = Evidence.fit(**parts, size=size, rng=rng)
+    model = FaultLikelihoods.fit(**parts, size=size, rng=rng)
     honest = np.hypot(0.1 * model.scale, model.extra)
     np.testing.assert_allclose(honest[:, :COMPONENTS], 0.2, rtol=0.15)
     assert model.persistence == pytest.approx([0.5], abs=0.1)

@@ -1,10 +1,14 @@
 """What is learnt of a healthy pad, also where some of its fibres are dead, and from what nothing is learnt."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from design.common.errors import InputError
-from sense import Recording
+from sense import Localizer, Recording
+from sense.health import learning
+from sense.health.health_model import COMMANDED, DETECTED
 from sense.health.learning import dead_fibres, fit_health_model
 from sense.health.monitor import Monitor, examine
 from sense.health.schema import LEAST_PRESSES
@@ -62,3 +66,16 @@ def test_health_learnt_from_few_presses_calls_no_fibre_weak(pad: Recording) -> N
     readings = pad.readings.copy()
     weak(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
     assert "weak" not in {finding.kind for finding in later(model, readings, pad, 500)}
+
+
+def test_health_is_learnt_from_the_presses_that_were_not_held_back(
+    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        learning, "fit_health_model", lambda readings, times_s, begun, lifted, **options: (begun, lifted)
+    )
+    learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
+    edges: dict[str, Any] = {**learning.learn_health(recording, localizer.test, localizer.provenance)}
+    assert 0 < len(localizer.test) < len(learnt)
+    np.testing.assert_array_equal(edges[COMMANDED], (recording.begun[learnt], recording.lifted[learnt]))
+    assert len(edges[DETECTED][0]) == len(edges[DETECTED][1]) == len(learnt)

@@ -1,7 +1,11 @@
 """Inputs become numbers of about 1, and numbers become mm, as the formulas say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sense.localizer.features import Inputs
 from sense.localizer.normalization import MAX_INPUT, Normalization
@@ -65,3 +69,40 @@ def test_bumps_are_gaussians_on_a_grid_over_the_pad() -> None:
             np.exp(-((place[0] - x) ** 2 + (place[1] - y) ** 2) / (2 * (0.1 * WIDTH) ** 2)) for x in line for y in line
         ]
         assert found == pytest.approx(np.array(away))
+
+
+def raw(windows: np.ndarray, history: np.ndarray | None = None) -> Inputs:
+    past = np.zeros((*windows.shape[:2], 0)) if history is None else history
+    return Inputs(windows, past, np.ones(windows.shape[:2], dtype=bool))
+
+
+@settings(max_examples=6)  # each fits the whole pad twice
+@given(seed=st.integers(0, 999), gain=st.floats(1e-3, 1e3))
+def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None:
+    rng = np.random.default_rng(seed)
+    inputs, places = rng.standard_normal((30, 3, 4)), rng.uniform(-9, 9, (30, 2))
+    (plain, table), (scaled, same) = (Normalization.fit(raw(factor * inputs), places) for factor in (1, gain))
+    assert np.allclose(plain.inputs(raw(inputs)).inputs, scaled.inputs(raw(gain * inputs)).inputs, atol=1e-4)
+    assert np.allclose(table, same, atol=1e-3)
+    assert np.abs(plain.targets(places)).max() <= 1 + 1e-6
+    assert np.allclose(plain.places_mm(plain.targets(places)), places, atol=1e-5)
+
+
+def test_a_dead_fibre_is_scaled_to_finite_numbers() -> None:
+    inputs = np.zeros((10, 2, 3))
+    inputs[:, 0] = np.random.default_rng(0).standard_normal((10, 3))
+    assert np.isfinite(Normalization.fit(raw(inputs), np.zeros((10, 2)))[0].inputs(raw(inputs)).inputs).all()
+
+
+def test_a_fibre_that_was_never_there_is_scaled_to_finite_numbers() -> None:
+    rng = np.random.default_rng(0)
+    inputs = replace(raw(rng.standard_normal((10, 2, 3))), alive=np.tile([True, False], (10, 1)))
+    scaling, table = Normalization.fit(inputs, rng.uniform(-9, 9, (10, 2)))
+    assert np.isfinite(scaling.inputs(inputs).inputs).all()
+    assert np.isfinite(table).all()
+
+
+def test_a_fibre_that_varies_by_rounding_only_is_not_blown_up() -> None:
+    inputs = 3.3 + 1e-15 * np.random.default_rng(0).standard_normal((10, 2, 3))
+    scaling, _ = Normalization.fit(raw(inputs), np.zeros((10, 2)))
+    assert (scaling.spread == 1).all()

@@ -1,7 +1,5 @@
 """Filters of whole recordings against optimality conditions, exhaustive search, numpy, and on hostile readings."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,9 +10,6 @@ from design.common.errors import InputError
 from sense import open_recording
 from sense.processing.benchmark import fibre, linear_program, objective
 from sense.processing.filters import running_median, stretches, total_variation
-from sense.processing.kernels import clipping as clips
-from sense.processing.kernels import interval_heap
-from sense.processing.kernels import total_variation_l1 as robust_variation
 from sense.processing.stream_filters import TotalVariation
 
 STEP_V = 3.3 / 1023
@@ -236,38 +231,6 @@ def test_stretches_begin_after_long_intervals():
     np.testing.assert_array_equal(total_variation(y, 4, starts=stretches(times, 1)), y)
 
 
-@given(
-    st.lists(st.integers(-9, 9).map(float), max_size=60),
-    st.lists(st.one_of(st.integers(-9, 9).map(float), st.sampled_from(["smallest", "greatest"])), max_size=60),
-)
-def test_the_interval_heap_gives_what_a_sorted_list_gives(there, orders):
-    keys, values = np.empty(121), np.empty(121)
-    listed: list[tuple[float, float]] = []
-    for number, order in enumerate([*there, *orders]):
-        if isinstance(order, float):
-            interval_heap.push(keys, values, len(listed), order, number)
-            listed.append((order, number))
-        elif listed:
-            end = interval_heap.HIGH if order == "greatest" else interval_heap.LOW
-            slot = interval_heap.end_slot(len(listed), end)
-            key, value = keys[slot], values[slot]
-            assert key == (max if order == "greatest" else min)(listed)[0]
-            interval_heap.pop(keys, values, len(listed), end)
-            listed.remove((key, value))
-        assert sorted(zip(keys[: len(listed)], values[: len(listed)], strict=True)) == sorted(listed)
-
-
-def test_the_staircase_keeps_its_height_exactly():
-    """Stairs are cut 100 000 times; what is left of them still sums to 2 lam, to the last digit."""
-    y = np.random.default_rng(4).normal(size=100_000)
-    low, high = np.empty((2, len(y)))
-    for lam in (0.6, 4.3, np.pi, 1000 / 7):
-        _, (_, below, above) = robust_variation.forward_sweep(y, lam, robust_variation.silent(), low, high, np.empty(0))
-        snapped = round(lam * robust_variation.GRAIN) / robust_variation.GRAIN
-        assert math.fsum([*below[1], *above[1]]) == 2 * snapped
-        assert below.shape[1] + above.shape[1] <= 2 * lam + 1
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -310,14 +273,3 @@ def test_the_real_recording(published):
     blocks = [stream.feed(block) for block in np.array_split(y, 180)]
     assert len(y) - sum(map(len, blocks)) < 40  # readings held back: less than a press
     np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), x)
-
-
-def test_a_chain_of_clips_goes_back_and_is_decided_where_its_bounds_have_met():
-    low = np.array([0.0, -1.0, 2.0, -np.inf, 1.0])
-    high = np.array([5.0, 1.0, 3.0, np.inf, 4.0])
-    for last, expected in ((9.0, [1, 1, 3, 4, 4]), (-9.0, [1, 1, 2, 1, 1]), (2.5, [1, 1, 2.5, 2.5, 2.5])):
-        out = np.empty(5)
-        assert clips.clip_back(low, high, last, out) == 2  # 1 from the second on back, whatever follows
-        assert out.tolist() == expected
-    assert clips.clip_back(low[2:], high[2:], 9.0, np.empty(3)) == 0
-    assert clips.clip_back(np.append(low, 7.0), np.append(high, 7.0), 9.0, np.empty(6)) == 6

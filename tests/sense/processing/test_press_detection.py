@@ -11,10 +11,22 @@ from hypothesis import strategies as st
 from design import Morphology
 from design.common.errors import InputError
 from sense import Recording, RigSettings, import_mat, simulate
-from sense.processing.kernels import level_tracking as levels
-from sense.processing.kernels import pad_state
+from sense.processing.kernels import level_tracking
 from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder, Presses, as_commanded, find_presses
 from sense.recordings.pad_model import Divider
+from tests.sense.processing.spoiled_readings import (
+    breaking,
+    dead,
+    growing_noisy,
+    holed,
+    jumping,
+    missing,
+    noisy,
+    saturating,
+    spiky,
+    swapped,
+    torn,
+)
 
 RATE_HZ = 14.0
 EARLY = 3
@@ -121,7 +133,7 @@ def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> No
     times, readings = recorded(spans, rate_hz=rate_hz, ramp_s=ramp_s)
     touched, released = find_presses(readings, times)
     assert abs(len(touched) - len(spans)) <= 0.05 * len(spans)
-    allowed_s = ramp_s + 2.5 / rate_hz + 2 * levels.LOOK_S
+    allowed_s = ramp_s + 2.5 / rate_hz + 2 * level_tracking.LOOK_S
     for told, true in zip((times[touched], np.append(times, np.inf)[released]), zip(*spans, strict=True), strict=True):
         off = np.abs(told[:, None] - np.array(true)).min(axis=0)
         assert np.mean(off < allowed_s) >= 0.95
@@ -160,51 +172,6 @@ def test_noise_is_no_press(fibres: int, sd: float, step: float, rate_hz: float, 
 @pytest.mark.parametrize("readings", [np.full((300, 3), 2.0), np.full((300, 3), np.nan), np.zeros((1, 3))])
 def test_where_nothing_happens_nothing_is_found(readings: np.ndarray) -> None:
     assert len(find_presses(readings, np.arange(len(readings)) / RATE_HZ).touched) == 0
-
-
-def dead(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[:, 1] = 1.5
-
-
-def missing(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[:, 1] = np.nan
-
-
-def saturating(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[len(readings) // 2 :, 1] = 3.3
-
-
-def breaking(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[len(readings) // 2 :, 1] = 0.0
-
-
-def jumping(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[len(readings) // 2 :, 1] += 0.2
-
-
-def noisy(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[:, 1] += 0.1 * rng.standard_normal(len(readings))
-
-
-def growing_noisy(readings: np.ndarray, rng: np.random.Generator) -> None:
-    half = len(readings) // 2
-    readings[half:, 1] += 0.1 * rng.standard_normal(len(readings) - half)
-
-
-def swapped(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[:, [0, 1]] = readings[:, [1, 0]]
-
-
-def spiky(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[rng.random(readings.shape) < 2e-3] += 0.5
-
-
-def holed(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[rng.random(readings.shape) < 0.05] = np.nan
-
-
-def torn(readings: np.ndarray, rng: np.random.Generator) -> None:
-    readings[rng.random(len(readings)) < 0.1] = np.nan
 
 
 @pytest.mark.parametrize(
@@ -293,37 +260,6 @@ def test_presses_found_make_a_recording(gaps: list[int], after: int, rate_hz: fl
     waited = begun == np.concatenate([[0], lifted[:-1]]) + 1
     assert (waited | (times[presses.touched] - times[begun] <= SENT_DOWN_S)).all()
     assert ((lifted == presses.touched + 1) | (times[presses.released] - times[lifted] <= SENT_UP_S)).all()
-
-
-def test_levels_are_followed_as_a_kalman_filter_does() -> None:
-    rng = np.random.default_rng(0)
-    times = np.cumsum(rng.uniform(0.05, 0.2, 300))
-    looks = 2 + 0.005 * np.sin(times / 3) + 0.002 * rng.standard_normal(300)
-    fibres, pad = pad_state.unknown(1)
-    mean, covariance = np.zeros(2), np.zeros((2, 2))
-    for at, time_s in enumerate(times.tolist()):
-        levels.advance(fibres, pad, time_s)
-        if at > 0:
-            dt = time_s - times[at - 1]
-            fade = np.exp(-dt / levels.FADE_S)
-            move = np.array([[1, levels.FADE_S * (1 - fade)], [0, fade]])
-            mean = move @ mean
-            covariance = move @ covariance @ move.T + np.diag([0, dt**2 / levels.MEMORY_S**4])
-            assert fibres["level"][0] == pytest.approx(mean[0], abs=1e-12)
-            gain = covariance[:, 0] / (covariance[0, 0] + 1)
-            limit = levels.OUTLIER * fibres["spread"][0] * np.sqrt(covariance[0, 0] + 1)
-            off = looks[at] - mean[0]
-            mean = mean + gain * (np.clip(off, -limit, limit) if pad["looks"] >= levels.FIRST_LOOKS else off)
-            covariance = covariance - np.outer(gain, covariance[0])
-        else:
-            mean, covariance = np.array([looks[0], 0.0]), np.eye(2)
-        fibres["look"] = looks[at]
-        levels.follow(fibres, pad, time_s)
-        pad["look_s"] = time_s
-        assert fibres["level"][0] == pytest.approx(mean[0], abs=1e-12)
-        assert fibres["slope"][0] == pytest.approx(mean[1], abs=1e-12)
-        assert fibres["slope_var"][0] == pytest.approx(covariance[1, 1])
-    assert fibres["noise"][0] == pytest.approx(0.002, rel=0.25)
 
 
 @pytest.mark.parametrize(

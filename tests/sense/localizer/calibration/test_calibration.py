@@ -13,8 +13,6 @@ from design.common.errors import InputError
 from design.common.settings import validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import Localizer, Recording, RigSettings, calibrate, evaluate, import_mat, locate
-from sense.health import learning
-from sense.health.health_model import COMMANDED, DETECTED
 from sense.health.monitor import FibreFault
 from sense.localizer.calibration.calibration import split_presses
 from sense.settings import LocalizerSettings as Options
@@ -217,19 +215,6 @@ def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Loc
     assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
     np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)
     np.testing.assert_allclose(found[5:], without[5:], atol=1e-4)
-
-
-def test_health_is_learnt_from_the_presses_that_were_not_held_back(
-    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        learning, "fit_health_model", lambda readings, times_s, begun, lifted, **options: (begun, lifted)
-    )
-    learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
-    edges: dict[str, Any] = {**learning.learn_health(recording, localizer.test, localizer.provenance)}
-    assert 0 < len(localizer.test) < len(learnt)
-    np.testing.assert_array_equal(edges[COMMANDED], (recording.begun[learnt], recording.lifted[learnt]))
-    assert len(edges[DETECTED][0]) == len(edges[DETECTED][1]) == len(learnt)
 
 
 @pytest.mark.parametrize("rate_hz", [1e-300, 0.0999, np.inf])

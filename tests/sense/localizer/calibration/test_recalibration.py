@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import padforge
 from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
-from sense.localizer.calibration import fine_tuning as adaptation
+from sense.localizer.calibration import fine_tuning
 from sense.localizer.calibration.affine_correction import _corrected, _parts, fit_correction
 from sense.localizer.calibration.fine_tuning import FAR_NOISE, _Presses, adapt
 from sense.localizer.calibration.recalibration import _CrossValidation, recalibrate
@@ -52,7 +52,7 @@ NEW, LATER = slice(0, 60), slice(60, 300)
 def short() -> Iterator[None]:
     """Few steps of adapting, which are slow."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(adaptation, "STEPS", 15)
+        patched.setattr(fine_tuning, "STEPS", 15)
         yield
 
 
@@ -228,10 +228,10 @@ def test_the_more_was_learnt_before_the_less_new_presses_count(
     """Of what was learnt before nothing is kept where it counts nothing, and all where it alone counts."""
     presses = localizer.inputs(recording)[NEW]
     samples = TrainingPresses(presses.inputs, presses.alive, localizer.normalization.targets(recording.presses_mm[NEW]))
-    monkeypatch.setattr(adaptation, "OLD_PRESSES", old)
+    monkeypatch.setattr(fine_tuning, "OLD_PRESSES", old)
 
     def adapted(slope: float) -> np.ndarray:
-        monkeypatch.setattr(adaptation, "_change", lambda found, before: slope * found.sum())
+        monkeypatch.setattr(fine_tuning, "_change", lambda found, before: slope * found.sum())
         rng = np.random.default_rng(0)
         return adapt(localizer.weights, samples, localizer.table, 2, rng)["last.b"]
 

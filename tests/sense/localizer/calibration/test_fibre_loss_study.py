@@ -1,4 +1,4 @@
-"""Robustness and size curve: one test for all ways, resumed work is the same work, and forecasts that follow."""
+"""Lost fibres: one test for both ways, and resumed work is the same work."""
 
 import json
 import sys
@@ -7,18 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import padforge
 from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fibre_loss_study as loss_study
 from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
-from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
 from sense.settings import LocalizerSettings as Options
-
-QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
 
 
 @pytest.fixture(autouse=True)
@@ -115,43 +110,6 @@ def test_no_way_is_one_line(recording: Recording) -> None:
         fibre_loss_study(recording)
 
 
-@given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
-def test_a_power_law_is_found_again(floor: float, factor: float, exponent: float) -> None:
-    presses = np.array([50.0, 100, 200, 400, 800])
-    errors = power_law(presses, (floor, factor, exponent))
-    found = fit_power_law(presses, errors)
-    ahead = np.array([1600.0])
-    np.testing.assert_allclose(power_law(ahead, found), power_law(ahead, (floor, factor, exponent)), rtol=1e-3)
-
-
-@given(errors=st.lists(st.floats(0.1, 10), min_size=5, max_size=5))
-def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
-    presses = np.array([50.0, 100, 200, 400, 800])
-    fit = fit_power_law(presses, np.array(errors))
-    along = power_law(np.geomspace(50, 3200, 9), fit)
-    assert (np.diff(along) <= 1e-9).all()
-    assert min(fit) >= 0
-
-
-def test_a_size_curve_says_what_more_would_bring(recording: Recording) -> None:
-    document = learning_curve(recording, QUICK)
-    assert document == learning_curve(recording, QUICK)
-    assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
-    ahead = document["forecast"]
-    assert ahead["presses"] == 510
-    assert 0 < ahead["low_mm"] <= ahead["mean_mm"] <= ahead["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
-    assert "255 more presses" in document["advice"]
-    assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
-    json.dumps(document, allow_nan=False)
-
-
-def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
-    places = recording.presses_mm.copy()
-    places[100:] = np.nan
-    with pytest.raises(InputError, match="85 presses to learn from, expected at least 160"):
-        learning_curve(replace(recording, presses_mm=places), QUICK)
-
-
 def test_the_commands_write_documents_and_figures(
     localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
@@ -178,15 +136,3 @@ def test_the_commands_write_documents_and_figures(
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "neither --model nor --retrain" in err
     assert not Path("other").exists()
-
-
-def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
-    long, heard = QUICK.model_copy(update={"epochs": 100_000}), []
-
-    def interrupted(done: int, total: int) -> None:
-        heard.append(done / total)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        learning_curve(recording, long, progress=interrupted)
-    assert max(heard) < 0.5

@@ -1,0 +1,65 @@
+"""Learning curves: the power law is found again, forecasts follow, and broken off it ends at once."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.common.errors import InputError
+from sense import Recording
+from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
+from sense.settings import LocalizerSettings as Options
+
+QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
+
+
+@given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
+def test_a_power_law_is_found_again(floor: float, factor: float, exponent: float) -> None:
+    presses = np.array([50.0, 100, 200, 400, 800])
+    errors = power_law(presses, (floor, factor, exponent))
+    found = fit_power_law(presses, errors)
+    ahead = np.array([1600.0])
+    np.testing.assert_allclose(power_law(ahead, found), power_law(ahead, (floor, factor, exponent)), rtol=1e-3)
+
+
+@given(errors=st.lists(st.floats(0.1, 10), min_size=5, max_size=5))
+def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
+    presses = np.array([50.0, 100, 200, 400, 800])
+    fit = fit_power_law(presses, np.array(errors))
+    along = power_law(np.geomspace(50, 3200, 9), fit)
+    assert (np.diff(along) <= 1e-9).all()
+    assert min(fit) >= 0
+
+
+def test_what_more_presses_would_bring_is_said(recording: Recording) -> None:
+    document = learning_curve(recording, QUICK)
+    assert document == learning_curve(recording, QUICK)
+    assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
+    ahead = document["forecast"]
+    assert ahead["presses"] == 510
+    assert 0 < ahead["low_mm"] <= ahead["mean_mm"] <= ahead["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
+    assert "255 more presses" in document["advice"]
+    assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
+    json.dumps(document, allow_nan=False)
+
+
+def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
+    places = recording.presses_mm.copy()
+    places[100:] = np.nan
+    with pytest.raises(InputError, match="85 presses to learn from, expected at least 160"):
+        learning_curve(replace(recording, presses_mm=places), QUICK)
+
+
+def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
+    long, heard = QUICK.model_copy(update={"epochs": 100_000}), []
+
+    def interrupted(done: int, total: int) -> None:
+        heard.append(done / total)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        learning_curve(recording, long, progress=interrupted)
+    assert max(heard) < 0.5

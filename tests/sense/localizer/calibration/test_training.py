@@ -1,0 +1,51 @@
+"""Training: masks lose no more than they may, and presses are moved as the fitted table says."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sense import settings as sense_settings
+from sense.localizer.calibration import training
+from sense.localizer.calibration.training import draw_alive, looked_up
+
+
+@given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
+def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed: int) -> None:
+    lost = min(lost, fibres - 1)
+    alive = draw_alive(800, fibres, lost, torch.Generator().manual_seed(seed))
+    gone = (~alive).sum(dim=1)
+    assert gone.max() <= lost
+    assert set(gone.unique().tolist()) == set(range(lost + 1))
+
+
+@given(seed=st.integers(0, 999), x=st.floats(-1, 1), y=st.floats(-1, 1))
+def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float) -> None:
+    """Against a bilinear function, which linear interpolation gives exactly."""
+    a, b, c, d = np.random.default_rng(seed).standard_normal(4)
+    grid = np.linspace(-1, 1, 9)
+    u, v = np.meshgrid(grid, grid, indexing="ij")
+    table = torch.from_numpy((a + b * u + c * v + d * u * v)[:, :, None])
+    found = looked_up(table, torch.tensor([[x, y]], dtype=torch.float64))
+    assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
+
+
+def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of presses at the corners of the known places, half of a normal distribution remains on either axis."""
+    corners = np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32)
+    samples = training.TrainingPresses(np.zeros((4, 1, 1), np.float32), np.ones((4, 1), bool), corners)
+    seen: list[torch.Tensor] = []
+
+    def spy(table: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+        seen.append(places)
+        return looked_up(table, places)
+
+    monkeypatch.setattr(training, "looked_up", spy)
+    options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0)
+    member = training._Member(samples, samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
+    for _ in range(500):
+        member._loss()
+    inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
+    assert inwards.min() >= -1e-6
+    assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([training.MOVED] * 2, rel=0.06)
