@@ -254,7 +254,7 @@ def test_rules_at_their_extremes(tables: dict[str, dict[str, Any]], grid: int, k
     assert all(1 <= fibre <= 2 * grid for violation in found for fibre in violation.fibres)
 
 
-@few(15)
+@few(10)
 @given(extremes(("pad", "rules", "mould", "printer")), st.integers(1, 3), st.integers(0, 3), st.integers(0, 2**32 - 1))
 def test_a_mould_at_the_extremes(tables: dict[str, dict[str, Any]], grid: int, knots: int, seed: int):
     spec = Spec(tables)

@@ -108,7 +108,7 @@ def sampled(pad: Morphology, fibre: int, contact: Contact, press: Array, count: 
     return float(run[inside].sum())
 
 
-@settings(few(25), suppress_health_check=LAX)
+@settings(few(12), suppress_health_check=LAX)
 @given(st.data())
 def test_signals_are_those_of_a_plain_way(data):
     pad = data.draw(pads((1, 3), (0, 6)))

@@ -50,7 +50,7 @@ def rewritten(rng: np.random.Generator, files: dict[str, bytes], name: str) -> N
     files |= {f"{name}.safetensors": content, f"{name}.json": dumped(document)}
 
 
-@few(60)
+@few(40)
 @given(seed=seeds)
 def test_a_model_that_loads_finds_places_and_faults(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng, folder = np.random.default_rng(seed), tmp_path_factory.getbasetemp() / "spoiled"

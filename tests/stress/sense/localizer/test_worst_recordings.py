@@ -104,7 +104,7 @@ def _numbers(document: Any) -> list[float]:
     return [float(document)] if isinstance(document, int | float) else []
 
 
-@few(60)
+@few(40)
 @given(seed=seeds)
 def test_the_worst_recordings_are_located_examined_and_evaluated(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -213,7 +213,7 @@ def test_readings_as_they_come_give_finite_places_in_any_portions(seed: int) -> 
 
 
 @pytest.mark.parametrize("features", FEATURES)
-@few(15)
+@few(6)
 @given(seed=seeds)
 def test_inputs_of_presses_scale_with_volts_and_keep_fibres_apart(features: str, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -56,7 +56,7 @@ def test_plans_of_any_kind(tmp_path_factory: pytest.TempPathFactory, seed: int) 
 
 
 @pytest.mark.parametrize("name", ["plain.mat", "packed.mat"])
-@few(60)
+@few(40)
 @given(seed=seeds)
 def test_a_mat_with_bytes_changed(tmp_path_factory: pytest.TempPathFactory, name: str, seed: int) -> None:
     rng, tmp = np.random.default_rng(seed), tmp_path_factory.getbasetemp()
