@@ -9,7 +9,9 @@ def test_the_model_given_is_never_written_over_unasked(few) -> None:
     assert (code, out) == (2, "")
     assert err == "padforge: model: holds the old model; name a folder for the new one with --out\n"
     assert {path.name: path.read_bytes() for path in Path("model").iterdir() if path.is_file()} == before
-    assert few("recalibrate", "--model", "model", "rec")[0] == 0
-    assert Path("recalibration.json").exists()
-    assert Path("localizer.json").read_bytes() != before["localizer.json"]
+    Path("later").mkdir()
+    Path("model/later").rename("later/recording")
+    assert few("recalibrate", "--model", "model", "later/recording")[0] == 0
+    assert Path("later/recalibration.json").exists()
+    assert Path("later/localizer.json").read_bytes() != before["localizer.json"]
     assert {path.name: path.read_bytes() for path in Path("model").iterdir() if path.is_file()} == before
