@@ -15,7 +15,7 @@ from design.common.settings import validated
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.recording import Recording
 from sense.rig.devices import Converter
-from sense.rig.emulators.live_pad import DemoConverter
+from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.rig.session.averaging import Averager
 from sense.settings import RigSettings
 
@@ -80,7 +80,7 @@ def replayed(recording: Recording, speed: float) -> Source:
     return Source(recording.fibres, recording.rate_hz, blocks())
 
 
-def simulated(model: Path) -> DemoConverter:
+def simulated(model: Path) -> SimulatedConverter:
     """The pad that the model in this folder was learnt from, where that was a simulated one.
 
     Raises:
@@ -97,6 +97,6 @@ def simulated(model: Path) -> DemoConverter:
         contact, rig = dict(source["contact"]), dict(source["rig"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
-    return DemoConverter(
+    return SimulatedConverter(
         pad, validated(RigSettings, rig, f"{path}: rig"), validated(Contact, contact, f"{path}: contact")
     )

@@ -1,5 +1,7 @@
 """A simulated recording and a quickly trained localizer, shared by the tests of sense."""
 
+from pathlib import Path
+
 import pytest
 
 from design import Morphology
@@ -24,3 +26,12 @@ def calibrated(recording: Recording) -> tuple[Localizer, dict]:
 @pytest.fixture(scope="session")
 def localizer(calibrated: tuple[Localizer, dict]) -> Localizer:
     return calibrated[0]
+
+
+@pytest.fixture(scope="session")
+def model(recording: Recording, localizer: Localizer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as `padforge run` leaves it."""
+    folder = tmp_path_factory.mktemp("pad")
+    localizer.save(folder)
+    recording.save(folder / "recording", {})
+    return folder

@@ -17,7 +17,7 @@ from sense.settings import RigSettings
 Array = NDArray[np.float64]
 
 
-class DemoConverter:
+class SimulatedConverter:
     """The converter of the simulated rig, `rate_hz` of which is its own; implements `Converter`.
 
     The pad is the one that `simulate` records with the same arguments, down to the rests of its fibres. Presses come

@@ -1,25 +1,22 @@
-"""Where live readings come from, and `padforge sense live` from the outside."""
+"""Where live readings come from."""
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import padforge
 import sense.live.sources
 from design import Morphology
 from design.common.errors import InputError
-from sense import Localizer, Recording
-from sense.live.page_server import LivePage
+from sense import Recording
 from sense.live.sources import connected, replayed, simulated
 from sense.recordings.simulation import simulate
 from sense.rig.arduino.driver import Arduino
 from sense.rig.devices import ConverterSamples, RigFault
 from sense.rig.emulators.board import EmulatedBoard
-from sense.rig.emulators.live_pad import DemoConverter
+from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.settings import RigSettings
 
 
@@ -81,19 +78,19 @@ def test_samples_are_averaged_to_the_rate_of_the_localizer(still: Time) -> None:
     np.testing.assert_allclose(readings, np.stack([times_s, -times_s], axis=1))
 
 
-def test_the_demo_presses_the_pad_that_was_recorded() -> None:
+def test_the_simulated_rig_presses_the_pad_that_was_recorded() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
     rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
     recorded = simulate(pad, rig)
     time = Time()
-    demo = DemoConverter(pad, rig, sense.live.sources.Contact(), time)
+    converter = SimulatedConverter(pad, rig, sense.live.sources.Contact(), time)
     with pytest.raises(RigFault, match="not connected"):
-        demo.read()
-    assert demo.connect() == {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}
+        converter.read()
+    assert converter.connect() == {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}
     samples = []
     for pause_s in [0.0, 0.3, 0.01, 5.0] + 30 * [1.0]:
         time.sleep(pause_s)
-        samples.append(demo.read())
+        samples.append(converter.read())
     volts = np.concatenate([each.volts for each in samples])
     times_s = np.concatenate([each.times_s for each in samples])
     np.testing.assert_allclose(np.diff(times_s), 1 / rig.rate_hz)
@@ -121,15 +118,6 @@ def test_a_board_is_followed_and_its_loss_told() -> None:
             converter.close()
 
 
-@pytest.fixture(scope="module")
-def model(recording: Recording, localizer: Localizer, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as `padforge run` leaves it."""
-    folder = tmp_path_factory.mktemp("pad")
-    localizer.save(folder)
-    recording.save(folder / "recording", {})
-    return folder
-
-
 def test_the_simulated_pad_is_that_of_the_model(model: Path, tmp_path: Path) -> None:
     assert simulated(model).connect()["channels"] == 4
     with pytest.raises(InputError, match=r"start\.json: not there"):
@@ -145,91 +133,6 @@ def test_the_simulated_pad_is_that_of_the_model(model: Path, tmp_path: Path) -> 
         (tmp_path / "recording" / "start.json").write_text(json.dumps(start | {"source": source}))
         with pytest.raises(InputError, match=message):
             simulated(tmp_path)
-
-
-@pytest.fixture
-def live(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], model: Path) -> Callable[..., tuple]:
-    """Run `padforge sense live`; gives exit code, stdout and stderr."""
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(
-            sys, "argv", ["padforge", "sense", "live", "--port", "0", "--model", str(model), *arguments]
-        )
-        with pytest.raises(SystemExit) as caught:
-            padforge.main()
-        out, err = capsys.readouterr()
-        return caught.value.code or 0, out, err  # type: ignore[return-value]
-
-    return run
-
-
-def test_a_recording_is_shown(live, recording: Recording, tmp_path: Path) -> None:
-    end = int(recording.begun[40])
-    names = ("presses_mm", "begun", "lifted")
-    presses = {name: getattr(recording, name)[:40] for name in names}
-    Recording(recording.readings[:end], recording.times_s[:end], **presses).save(tmp_path / "short", {})
-    replay = ("--replay", str(tmp_path / "short"), "--speed", "1e6")
-    code, out, err = live(*replay, "--json")
-    assert code == 0
-    assert "http://127.0.0.1:" in err
-    told = [json.loads(line) for line in out.splitlines()]
-    assert {each["event"] for each in told} == {"estimate"}
-    assert [each["press"] for each in told] == list(range(len(told)))
-    assert 38 <= len(told) <= 40
-    code, plain, _ = live(*replay)
-    assert code == 0
-    first = told[0]
-    assert plain.splitlines()[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
-    assert len(plain.splitlines()) == len(told)
-
-
-def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sense.rig.arduino.serial_link
-
-    monkeypatch.setattr(sense.rig.arduino.serial_link, "find_ports", list)
-    other = simulate(Morphology.straight(3), RigSettings(presses=3))
-    other.save(tmp_path / "other", {})
-    with LivePage(0) as page:
-        port = page.url.rstrip("/").rsplit(":", 1)[1]
-        for arguments, message in (
-            (("--port", port), f"port {port} of 127.0.0.1: another program uses it"),
-            (("--model", str(tmp_path)), "localizer.json: cannot be read"),
-            (("--replay", str(tmp_path / "absent")), "no recording"),
-            (("--replay", str(tmp_path / "other")), "readings are of 6 fibres, the localizer was learnt from 4"),
-            (("--rig", "ur5"), "no board is found"),
-            (("--speed", "0"), "--speed"),
-        ):
-            code, out, err = live(*arguments)
-            assert (code, out) == (2, "")
-            assert message in err.splitlines()[-1]
-
-
-def test_the_end_comes_when_it_is_asked_for(live, monkeypatch: pytest.MonkeyPatch) -> None:
-    closed = []
-
-    class Interrupted(DemoConverter):
-        def read(self) -> ConverterSamples:
-            raise KeyboardInterrupt
-
-        def close(self) -> None:
-            closed.append(True)
-
-    monkeypatch.setattr(sense.live.sources, "DemoConverter", Interrupted)
-    code, _, err = live()
-    assert code == 130
-    assert "interrupted" in err.splitlines()[-1]
-    assert closed == [True]
-
-
-def test_a_fault_of_the_rig_ends_it(live, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Stale(DemoConverter):
-        def read(self) -> ConverterSamples:
-            raise RigFault("stale", "the board does not send", "reset it")
-
-    monkeypatch.setattr(sense.live.sources, "DemoConverter", Stale)
-    code, out, err = live("--json")
-    assert (code, out) == (1, "")
-    assert err.splitlines()[-1] == "padforge: the board does not send; reset it"
 
 
 @pytest.mark.parametrize("speed", [float("nan"), 0.0, -1.0])

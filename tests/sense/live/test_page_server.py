@@ -151,6 +151,7 @@ def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     assert "2.0, -2.0 mm" in shown
     assert "press 8: within 1.5 mm at 50 %, 3.0 mm at 90 %, to be refined" in shown
     assert shown.count(HOSTILE) == 3
+    assert ("fibre 1" in shown, "fibre 3" in shown, "fibre 0" in shown) == (True, True, False)
     assert browser.ask("document.images.length") == 0
     count = "document.querySelectorAll('{}').length"
     assert [browser.ask(count.format(f"#pad .{name}")) for name in ("trail", "r50", "r90", "early")] == [1, 1, 1, 1]

@@ -1,0 +1,111 @@
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import padforge
+import sense.live.sources
+from design import Morphology
+from sense import Recording
+from sense.cli.live import view_lines
+from sense.live.page_server import LivePage
+from sense.recordings.simulation import simulate
+from sense.rig.devices import ConverterSamples, RigFault
+from sense.rig.emulators.live_pad import SimulatedConverter
+from sense.settings import RigSettings
+
+
+@pytest.fixture
+def live(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], model: Path) -> Callable[..., tuple]:
+    """Run `padforge sense live`; gives exit code, stdout and stderr."""
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(
+            sys, "argv", ["padforge", "sense", "live", "--port", "0", "--model", str(model), *arguments]
+        )
+        with pytest.raises(SystemExit) as caught:
+            padforge.main()
+        out, err = capsys.readouterr()
+        return caught.value.code or 0, out, err  # type: ignore[return-value]
+
+    return run
+
+
+def test_a_recording_is_shown(live, recording: Recording, tmp_path: Path) -> None:
+    end = int(recording.begun[40])
+    names = ("presses_mm", "begun", "lifted")
+    presses = {name: getattr(recording, name)[:40] for name in names}
+    Recording(recording.readings[:end], recording.times_s[:end], **presses).save(tmp_path / "short", {})
+    replay = ("--replay", str(tmp_path / "short"), "--speed", "1e6")
+    code, out, err = live(*replay, "--json")
+    assert code == 0
+    assert "http://127.0.0.1:" in err
+    told = [json.loads(line) for line in out.splitlines()]
+    assert {each["event"] for each in told} == {"estimate"}
+    assert [each["press"] for each in told] == list(range(len(told)))
+    assert 38 <= len(told) <= 40
+    code, plain, _ = live(*replay)
+    assert code == 0
+    first = told[0]
+    assert plain.splitlines()[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
+    assert len(plain.splitlines()) == len(told)
+
+
+def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sense.rig.arduino.serial_link
+
+    monkeypatch.setattr(sense.rig.arduino.serial_link, "find_ports", list)
+    other = simulate(Morphology.straight(3), RigSettings(presses=3))
+    other.save(tmp_path / "other", {})
+    with LivePage(0) as page:
+        port = page.url.rstrip("/").rsplit(":", 1)[1]
+        for arguments, message in (
+            (("--port", port), f"port {port} of 127.0.0.1: another program uses it"),
+            (("--model", str(tmp_path)), "localizer.json: cannot be read"),
+            (("--replay", str(tmp_path / "absent")), "no recording"),
+            (("--replay", str(tmp_path / "other")), "readings are of 6 fibres, the localizer was learnt from 4"),
+            (("--rig", "ur5"), "no board is found"),
+            (("--speed", "0"), "--speed"),
+        ):
+            code, out, err = live(*arguments)
+            assert (code, out) == (2, "")
+            assert message in err.splitlines()[-1]
+
+
+def test_the_end_comes_when_it_is_asked_for(live, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+
+    class Interrupted(SimulatedConverter):
+        def read(self) -> ConverterSamples:
+            raise KeyboardInterrupt
+
+        def close(self) -> None:
+            closed.append(True)
+
+    monkeypatch.setattr(sense.live.sources, "SimulatedConverter", Interrupted)
+    code, _, err = live()
+    assert code == 130
+    assert "interrupted" in err.splitlines()[-1]
+    assert closed == [True]
+
+
+def test_a_fault_of_the_rig_ends_it(live, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stale(SimulatedConverter):
+        def read(self) -> ConverterSamples:
+            raise RigFault("stale", "the board does not send", "reset it")
+
+    monkeypatch.setattr(sense.live.sources, "SimulatedConverter", Stale)
+    code, out, err = live("--json")
+    assert (code, out) == (1, "")
+    assert err.splitlines()[-1] == "padforge: the board does not send; reset it"
+
+
+def test_a_terminal_shows_fibres_by_their_numbers() -> None:
+    """From 1, as the page does, and faults are told."""
+    fibres = [{"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (None, "dead"))]
+    lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "findings": ["fibre 2 was dead"]})
+    assert lines[:2] == ["waiting for a press", "no press yet"]
+    assert [line.split()[:2] for line in lines[2:4]] == [["fibre", "1"], ["fibre", "2"]]
+    assert lines[4] == "fibre 2 was dead"
