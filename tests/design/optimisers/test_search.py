@@ -15,26 +15,25 @@ from design.optimisers.search import SearchRun, search
 from design.optimisers.start import advance_start
 from design.settings import PadSettings, RulesSettings, SearchSettings
 
-SMALL = SearchSettings(knots=3, starts=2, steps=60, population=20, generations=6, lost=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=30, population=20, generations=6, lost=1)
 QUICK = RulesSettings(min_bend_radius_mm=0.5)
 
 
+@pytest.fixture(scope="module")
+def small():
+    """What a small search finds."""
+    return search(settings=SMALL)
+
+
 @pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_the_same_seed_gives_the_same_fibres_and_another_seed_others(method):
+def test_the_same_seed_gives_the_same_fibres_and_another_seed_others(method, small):
     settings = SMALL.model_copy(update={"method": method})
-    first, second = search(settings=settings), search(settings=settings)
+    first = small if method == "descent" else search(settings=settings)
+    second = search(settings=settings)
     other = search(settings=settings.model_copy(update={"seed": 1}))
     assert first.morphology == second.morphology
     assert first.history == second.history
     assert first.morphology != other.morphology
-
-
-def test_descent_beats_the_square_grid_within_the_rules():
-    found = search(settings=SearchSettings(starts=1, steps=120, lost=1))
-    pad, grid = (score(m, Contact(), lost=1, noise=0.02) for m in (found.morphology, Morphology.straight(4)))
-    assert found.violations == []
-    assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
-    assert pad["ambiguity_lost_1"] < 0.5 * grid["ambiguity_lost_1"]
 
 
 def test_genetic_search_improves_generation_by_generation():
@@ -43,20 +42,6 @@ def test_genetic_search_improves_generation_by_generation():
     assert best == sorted(best, reverse=True)
     assert found.terms["published_objective"] == pytest.approx(best[-1])
     assert found.violations == []
-
-
-def test_rules_that_cannot_hold_are_named():
-    found = search(settings=SMALL, rules=RulesSettings(max_length_mm=20))
-    assert {v.rule for v in found.violations} == {"max_length_mm"}
-    assert len(found.violations) == 8
-
-
-def test_small_and_odd_pads_are_searched_too():
-    for grid, pitch in ((1, 20.0), (2, 5.0), (3, 20.0)):
-        found = search(PadSettings(grid=grid, pitch_mm=pitch), settings=SMALL)
-        assert found.morphology.grid == grid
-        assert found.morphology.pitch_mm == pitch
-        assert found.violations == []
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
@@ -69,12 +54,6 @@ def test_ctrl_c_keeps_the_best_so_far(method):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
-    """Of 2M = 32 fibres taken 8 at a time there are ten million losses: a sample stands for them."""
-    terms = score(Morphology.straight(16), Contact(), lost=8)
-    assert 0 < terms["ambiguity_lost_0"] <= terms["ambiguity_lost_8"]
-
-
 class KilledError(Exception):
     """Stands for a kill in mid-search."""
 
@@ -82,8 +61,9 @@ class KilledError(Exception):
 @pytest.mark.parametrize("method", ["descent", "genetic"])
 def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
-    settings = SMALL.model_copy(update={"method": method, "generations": 6, "steps": 75})
-    whole, kills = search(settings=settings), 0
+    pad = PadSettings(grid=2)
+    settings = SMALL.model_copy(update={"method": method, "generations": 6, "steps": 60})
+    whole, kills = search(pad, settings=settings), 0
 
     def attempt():
         heard = []
@@ -93,7 +73,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
             if len(heard) == 2:
                 raise KilledError
 
-        return search(settings=settings, run=SearchRun(report, tmp_path / "search", resume=True))
+        return search(pad, settings=settings, run=SearchRun(report, tmp_path / "search", resume=True))
 
     while kills < 100:
         try:
@@ -152,9 +132,9 @@ def test_a_generation_that_fits_no_memory_is_refused():
         search(settings=settings)
 
 
-def test_the_executor_does_not_matter():
+def test_the_executor_does_not_matter(small):
     with ThreadPoolExecutor(1) as one:
-        assert search(settings=SMALL, run=SearchRun(executor=one)).morphology == search(settings=SMALL).morphology
+        assert search(settings=SMALL, run=SearchRun(executor=one)).morphology == small.morphology
 
 
 def test_a_time_budget_ends_it_with_the_best_so_far():
@@ -163,15 +143,6 @@ def test_a_time_budget_ends_it_with_the_best_so_far():
     assert found.stopped == "out of time"
     assert found.violations == []
     assert found.seconds < 30
-
-
-@pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatch):
-    settings = SMALL.model_copy(update={"method": method, "steps": 30, "generations": 4, "starts": 1})
-    whole = search(settings=settings)
-    monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    assert advance_start(SearchProblem(PadSettings(), (Contact(),), settings, RulesSettings(), None), 0, None).step == 1
-    assert search(settings=settings).morphology == whole.morphology
 
 
 def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch):
@@ -183,21 +154,22 @@ def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch)
 
 
 def test_a_search_from_a_pad_improves_on_it():
-    origin = search(settings=SearchSettings(knots=5, starts=1, steps=60, lost=1, seed=3)).morphology
+    pad = PadSettings(grid=3)
+    origin = search(pad, settings=SearchSettings(knots=3, starts=1, steps=40, lost=1, seed=3)).morphology
     before = score(origin, Contact(), lost=1)
-    after = search(settings=SearchSettings(knots=8, starts=1, steps=150, lost=1), origin=origin)
-    assert after.morphology.knots.shape == (8, 10, 2)
+    after = search(pad, settings=SearchSettings(knots=5, starts=1, steps=80, lost=1), origin=origin)
+    assert after.morphology.knots.shape == (6, 7, 2)
     assert after.terms["ambiguity_lost_0"] + after.terms["ambiguity_lost_1"] < (
         before["ambiguity_lost_0"] + before["ambiguity_lost_1"]
     )
 
 
 def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
-    free = RulesSettings(enforce=False)
-    origin = search(settings=SMALL, rules=free).morphology
+    free, quick = RulesSettings(enforce=False), SMALL.model_copy(update={"steps": 10, "starts": 1})
+    origin = search(settings=quick, rules=free).morphology
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [Morphology.straight(4)])
-    assert search(settings=SMALL, rules=free, origin=origin).morphology == origin
-    assert search(settings=SMALL, rules=free).morphology == Morphology.straight(4)
+    assert search(settings=quick, rules=free, origin=origin).morphology == origin
+    assert search(settings=quick, rules=free).morphology == Morphology.straight(4)
 
 
 def test_an_origin_that_does_not_fit_is_refused():
@@ -207,15 +179,6 @@ def test_an_origin_that_does_not_fit_is_refused():
         search(settings=SMALL, origin=Morphology.random(4, 7))
 
 
-def test_several_contacts_serve_both_better_than_one_alone():
-    one = SearchSettings(starts=1, steps=200, lost=0, knots=9)
-    large = Contact(radius=1.2)
-    both = one.model_copy(update={"contacts": (large,)})
-    for_one, for_both = search(settings=one), search(settings=both)
-    alone, together = (score(found.morphology, large, lost=0)["ambiguity_lost_0"] for found in (for_one, for_both))
-    assert together < alone
-
-
 def test_a_device_that_is_not_there_is_refused():
     import torch
 
@@ -223,30 +186,6 @@ def test_a_device_that_is_not_there_is_refused():
         pytest.skip("there is one here")
     with pytest.raises(InputError, match="device is 'cuda'"):
         search(settings=SMALL.model_copy(update={"device": "cuda"}))
-
-
-@pytest.mark.parametrize(
-    ("rules", "resists"),
-    [
-        ({"min_gap_mm": 30.0}, "min_gap_mm"),
-        ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, "border_mm"),
-        ({"max_crossings": 3}, "max_crossings"),
-        ({"border_mm": 500.0}, "border_mm"),
-    ],
-)
-def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists):
-    found = search(settings=SMALL.model_copy(update={"starts": 1}), rules=RulesSettings(**rules))
-    assert resists in {violation.rule for violation in found.violations}
-    assert all(np.isfinite(violation.measured) for violation in found.violations)
-
-
-@pytest.mark.parametrize(
-    "rules",
-    [{"max_crossings": 24}, {"min_crossing_angle_deg": 50.0}, {"min_gap_mm": 4.0}, {"max_length_mm": 65.0}],
-)
-def test_each_further_rule_is_kept(rules):
-    found = search(settings=SearchSettings(starts=1, steps=150, lost=1, knots=9), rules=RulesSettings(**rules))
-    assert found.violations == []
 
 
 def test_a_loss_of_every_fibre_is_refused():

@@ -1,0 +1,20 @@
+"""A start in slices: shorter ones, where steps are slow, lead to the same fibres."""
+
+import pytest
+
+from design import Contact
+from design.optimisers.problem import SearchProblem
+from design.optimisers.search import search
+from design.optimisers.start import advance_start
+from design.settings import PadSettings, RulesSettings, SearchSettings
+
+SMALL = SearchSettings(knots=3, starts=1, steps=30, population=20, generations=4, lost=1)
+
+
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatch):
+    settings = SMALL.model_copy(update={"method": method})
+    whole = search(settings=settings)
+    monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
+    assert advance_start(SearchProblem(PadSettings(), (Contact(),), settings, RulesSettings(), None), 0, None).step == 1
+    assert search(settings=settings).morphology == whole.morphology
