@@ -35,7 +35,7 @@ def test_a_single_fibre_still_tells_what_its_own_readings_do(pad: Recording) -> 
     assert [finding.kind for finding in later(model, readings, pad)] == ["stuck"]
 
 
-def test_fibres_that_read_one_value_or_stand_at_the_end_of_their_range_aredead_fibres() -> None:
+def test_fibres_that_read_one_value_or_stand_at_the_end_of_their_range_are_dead() -> None:
     """At the end for more than half of the time, which most fibres are not."""
     rng = np.random.default_rng(0)
     readings = 1.5 + 0.01 * rng.standard_normal((1000, 9))

@@ -142,6 +142,6 @@ def test_on_the_published_recording_faults_are_named_and_health_is_not(published
     for fault, within in ((stuck, 20), (swapped, 20), (offset, 20), (weak, 60)):
         readings = short.readings.copy()
         fault(readings, int(short.begun[1300]), np.random.default_rng(0))
-        found = later(model, readings, short, first=1000)[0]
+        found = later(model, readings, short, first=1240)[0]
         assert set(found.fibres) <= ({1, 4} if fault is swapped else {1})
-        assert 300 <= found.press <= 300 + within
+        assert 60 <= found.press <= 60 + within

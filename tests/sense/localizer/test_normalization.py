@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sense.localizer.features import Inputs
 from sense.localizer.normalization import MAX_INPUT, Normalization
 from sense.localizer.response_model import BUMPS, WIDTH, bumps
+from tests.stress.clock import few
 
 PRESSES, FIBRES, WINDOWS = 300, 3, 4
 
@@ -76,7 +77,7 @@ def raw(windows: np.ndarray, history: np.ndarray | None = None) -> Inputs:
     return Inputs(windows, past, np.ones(windows.shape[:2], dtype=bool))
 
 
-@settings(max_examples=6)  # each fits the whole pad twice
+@few(2)  # each fits the whole pad twice
 @given(seed=st.integers(0, 999), gain=st.floats(1e-3, 1e3))
 def test_scaled_inputs_do_not_depend_on_the_gain(seed: int, gain: float) -> None:
     rng = np.random.default_rng(seed)

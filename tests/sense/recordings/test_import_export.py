@@ -14,6 +14,7 @@ from design.common.errors import InputError
 from sense import Recording, export_csv, import_csv, import_mat, open_recording
 from sense.cli.main import sense
 from sense.recordings.import_export import export_file
+from tests.stress.clock import few
 
 MAT = "para5_long_first4500.mat"
 
@@ -188,6 +189,7 @@ def test_files_of_another_kind_are_one_line_and_no_recording(tmp_path: Path, end
         assert not (tmp_path / "out").exists()
 
 
+@few(40)
 @given(content=st.binary(max_size=300))
 def test_bytes_at_random_are_an_input_error_and_nothing_else(tmp_path_factory, content: bytes) -> None:
     folder = tmp_path_factory.mktemp("noise")

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
@@ -12,6 +12,7 @@ from sense.recordings.block_file import block_dtype
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import JOURNAL, READINGS, STATES, Recorder
 from sense.recordings.recording import Recording
+from tests.stress.clock import few
 
 FIBRES = 3
 
@@ -46,7 +47,7 @@ def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
     assert {name: (path / name).read_bytes() for name in before} == before
 
 
-@settings(max_examples=60, deadline=None)
+@few(20)
 @given(st.data())
 def test_a_kill_at_any_byte_loses_no_finished_press(tmp_path_factory, data):
     """Files grow in the order readings, states, journal; a kill leaves any prefix of what came after the last sync."""

@@ -34,7 +34,8 @@ def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
     assert min(fit) >= 0
 
 
-def test_what_more_presses_would_bring_is_said(recording: Recording) -> None:
+def test_what_more_presses_would_bring_is_said(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sense.localizer.calibration.learning_curve.DRAWS", 40)
     document = learning_curve(recording, QUICK)
     assert document == learning_curve(recording, QUICK)
     assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]

@@ -33,8 +33,8 @@ def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float)
 
 def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of presses at the corners of the known places, half of a normal distribution remains on either axis."""
-    corners = np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32)
-    samples = training.TrainingPresses(np.zeros((4, 1, 1), np.float32), np.ones((4, 1), bool), corners)
+    corners = np.tile(np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32), (64, 1))
+    samples = training.TrainingPresses(np.zeros((256, 1, 1), np.float32), np.ones((256, 1), bool), corners)
     seen: list[torch.Tensor] = []
 
     def spy(table: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
@@ -42,9 +42,9 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
         return looked_up(table, places)
 
     monkeypatch.setattr(training, "looked_up", spy)
-    options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0)
+    options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0, batch=256)
     member = training._Member(samples, samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
-    for _ in range(500):
+    for _ in range(8):
         member._loss()
     inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
     assert inwards.min() >= -1e-6
