@@ -116,6 +116,8 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
 
     Ports, versions, rates, latency, and every channel's rest and noise; channels count from 1, as fibres do.
     """
+    from dataclasses import asdict
+
     from design.settings import Contact, PadSettings
     from sense.rig.operation import look_over
     from sense.rig.planning.setup import Setup
@@ -126,5 +128,5 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
     found = look_over(rig, Setup(pad, settings.section(Contact), options, Path(), "padforge sense doctor"))
     passed = all(diagnosis.status != "fail" for diagnosis in found)
     lines = [f"{d.status:<4} {d.name}: {d.found}" for d in found]
-    show_result({"passed": passed, "found": [d.document() for d in found]}, lines, as_json)
+    show_result({"passed": passed, "found": [asdict(d) for d in found]}, lines, as_json)
     ctx.exit(0 if passed else 1)

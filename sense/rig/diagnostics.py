@@ -1,7 +1,7 @@
 """What to know of a rig before a long run: whether it answers, how fast, and which channels are alive."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -33,10 +33,6 @@ class Diagnosis:
     name: str
     status: Status
     found: str
-
-    def document(self) -> dict[str, str]:
-        """The diagnosis as JSON."""
-        return asdict(self)
 
 
 def examine_converter(

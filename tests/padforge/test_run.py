@@ -70,7 +70,7 @@ def test_the_report_is_one_page_with_its_pictures(chain):
     text = (chain[0] / "out" / "pad" / "report.html").read_text()
     assert text.count('src="data:image/') == 5
     assert "http://" not in text.replace("http://www.w3.org", "")
-    for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Robustness", "Provenance"):
+    for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Provenance"):
         assert f">{heading}</h2>" in text
 
 

@@ -107,9 +107,8 @@ def drift_study(
     rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": drawn})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
     sources |= {label: partial(_same, recording) for label, recording in recordings.items()}
-    recorded = {label: own.source.get("kind") != SIMULATED for label, own in recordings.items()}
-    kinds = dict.fromkeys(pads, SIMULATED)
-    kinds |= {label: "recorded" if real else SIMULATED for label, real in recorded.items()}
+    simulated = {*pads, *(label for label, own in recordings.items() if own.source.get("kind") == SIMULATED)}
+    kinds = {label: SIMULATED if label in simulated else "recorded" for label in sources}
     known = {**dict.fromkeys(pads, presses), **{label: int(own.known.sum()) for label, own in recordings.items()}}
     for label, count in known.items():
         try:

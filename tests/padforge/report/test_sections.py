@@ -19,7 +19,7 @@ MOST_PAGE_BYTES = 8_000_000
 def test_every_stage_has_its_section_and_a_link_to_it(page: Path) -> None:
     text = page.read_text()
     titles = re.findall(r'<h2 id="(.*?)">(.*?)</h2>', text)
-    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Robustness", "Studies", "Provenance"]
+    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Studies", "Provenance"]
     assert [title for _, title in titles] == names
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
     assert text.count("data:image/") == 4  # plan, mould, tracks, and the study's figure
