@@ -48,14 +48,6 @@ def _few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made(tmp_path_factory.mktemp("few"), 60)
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With `--dist loadgroup` health is learnt by one process alone."""
-    if config.pluginmanager.hasplugin("xdist"):
-        for item in items:
-            if "enough" in getattr(item, "fixturenames", ()):
-                item.add_marker(pytest.mark.xdist_group("enough"))
-
-
 @pytest.fixture(scope="session")
 def _enough(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made(tmp_path_factory.mktemp("enough"), 360)

@@ -16,14 +16,6 @@ from tests.sense.rig.ur5.arms import HOST, Robots
 WAIT_S = 180.0
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With `--dist loadgroup` one process has all tests that want the ports, and no other waits for them."""
-    if config.pluginmanager.hasplugin("xdist"):
-        for item in items:
-            if "ports" in getattr(item, "fixturenames", ()):
-                item.add_marker(pytest.mark.xdist_group("ports"))
-
-
 @pytest.fixture(scope="module")
 def ports() -> Iterator[None]:
     """Held by one module of one test process at a time."""
