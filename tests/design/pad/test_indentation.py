@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 
 from design import InputError, Morphology
 from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
+from tests.stress.clock import few
 
 INDENTERS = [Indenter("sphere", 0.7), Indenter("cone", angle_deg=30), Indenter("flat", 0.45)]
 
@@ -140,8 +141,8 @@ def test_a_straight_fibre_through_the_axis_is_a_plain_integral_of_the_surface():
             assert under == pytest.approx(a * (1 / np.cos(np.radians(indenter.angle_deg)) - 1))
 
 
+@few(20)
 @given(indenters, st.integers(0, 6), st.floats(0.01, 0.19), st.integers(0, 2**32 - 1))
-@settings(max_examples=60)
 def test_signals_equal_adaptive_quadrature(indenter, knots, depth, seed):
     rng = np.random.default_rng(seed)
     pad = Morphology.random(2, knots, rng)

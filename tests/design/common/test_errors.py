@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from design.common import errors as arguments
+from design.common import errors
 from design.common.errors import InputError
 
 
@@ -15,15 +15,15 @@ from design.common.errors import InputError
 )
 def test_a_whole_number_is_one_within_its_bounds(value, allowed):
     if allowed:
-        assert arguments.whole("n", np.int8(value), 2, 5) == value
+        assert errors.whole("n", np.int8(value), 2, 5) == value
     else:
         with pytest.raises(InputError, match=r"n is .*, allowed is a whole number from 2 to 5"):
-            arguments.whole("n", value, 2, 5)
+            errors.whole("n", value, 2, 5)
 
 
 @pytest.mark.parametrize("value", [0.0, 2.5, 1, np.float32(0.5)])
 def test_a_number_within_its_bounds_is_a_float(value):
-    number = arguments.real("x", value, 0.0, 2.5)
+    number = errors.real("x", value, 0.0, 2.5)
     assert type(number) is float
     assert number == value
 
@@ -31,19 +31,19 @@ def test_a_number_within_its_bounds_is_a_float(value):
 @pytest.mark.parametrize("value", [-1e-9, 2.5 + 1e-9, math.nan, math.inf, True, "1", 10**400, None])
 def test_a_number_beyond_its_bounds_is_refused(value):
     with pytest.raises(InputError, match=r"x is .*, allowed is 0 to 2\.5"):
-        arguments.real("x", value, 0.0, 2.5)
+        errors.real("x", value, 0.0, 2.5)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_numbers_are_bounded_on_either_side(sign):
-    assert arguments.reals("xs", [0, 3 * sign], 3).tolist() == [0, 3 * sign]
+    assert errors.reals("xs", [0, 3 * sign], 3).tolist() == [0, 3 * sign]
     with pytest.raises(InputError, match=r"xs hold 3\.5, allowed is -3 to 3"):
-        arguments.reals("xs", [0, 3.5 * sign], 3)
+        errors.reals("xs", [0, 3.5 * sign], 3)
 
 
 def test_a_path_is_neither_empty_nor_longer_than_systems_take():
-    longest = "a" * arguments.LONGEST_PATH
-    assert arguments.path("file", longest) == Path(longest)
+    longest = "a" * errors.LONGEST_PATH
+    assert errors.path("file", longest) == Path(longest)
     for value in ("", "a\0b", longest + "a", 3, None):
         with pytest.raises(InputError, match=r"file is .*, expected a path"):
-            arguments.path("file", value)
+            errors.path("file", value)

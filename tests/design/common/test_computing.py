@@ -1,0 +1,138 @@
+"""Tasks on any executor, torch on one thread, and kernels that are kept until a source of their package changes."""
+
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import pytest
+import torch
+
+from design.common.computing import forget_outdated, one_torch_thread, run_tasks
+
+KERNELS = {
+    "__init__.py": "from pathlib import Path\nfrom design.common.computing import forget_outdated\n"
+    "forget_outdated(Path(__file__).parent)\n",
+    "inner.py": "from numba import njit\n@njit(cache=True)\ndef inner(x):\n    return x + 1\n",
+    "outer.py": "from numba import njit\nfrom .inner import inner\n@njit(cache=True)\ndef outer(x):\n"
+    "    return 10 * inner(x)\n",
+}
+
+
+@pytest.fixture
+def package(tmp_path):
+    folder = tmp_path / "kernels"
+    folder.mkdir()
+    for name, text in KERNELS.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def outer_of_one(package):
+    code = (
+        f"import sys; sys.path.insert(0, {str(package.parent)!r})\n"
+        "from kernels.outer import outer\nprint(outer(1), sum(outer.stats.cache_hits.values()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return tuple(map(int, done.stdout.split()))
+
+
+def test_a_change_in_what_a_kernel_calls_is_compiled_in(package):
+    assert outer_of_one(package) == (20, 0)
+    assert outer_of_one(package) == (20, 1)
+    (package / "inner.py").write_text(KERNELS["inner.py"].replace("x + 1", "x + 2"))
+    assert outer_of_one(package) == (30, 0)
+
+
+def test_a_folder_that_cannot_be_written_is_left_alone(package):
+    (package / "__pycache__").touch()
+    forget_outdated(package)
+    assert (package / "__pycache__").is_file()
+
+
+def test_a_damaged_stamp_is_no_stamp(package):
+    kept = package / "__pycache__"
+    kept.mkdir()
+    (kept / "outer.py311.1.nbc").touch()
+    (kept / "kernels.sha256").write_bytes(b"\xff\xfe")
+    forget_outdated(package)
+    assert not list(kept.glob("*.nbc"))
+
+
+@pytest.mark.parametrize("threads", [None, 1, 3])
+def test_results_of_tasks_come_with_their_keys(threads):
+    tasks = [(number, partial(pow, number, 2)) for number in range(20)]
+    pool = ThreadPoolExecutor(threads) if threads else None
+    assert dict(run_tasks(tasks, pool)) == {number: number**2 for number in range(20)}
+    assert dict(run_tasks([], pool)) == {}
+
+
+def test_a_task_is_followed_by_the_next_of_its_key():
+    def next_one(key, result):
+        return partial(str.__add__, result, key) if len(result) < 3 else None
+
+    found = list(run_tasks([("a", lambda: "a"), ("b", lambda: "b")], then=next_one))
+    for key in ("a", "b"):
+        assert [result for own, result in found if own == key] == [key, 2 * key, 3 * key]
+
+
+def test_results_come_as_they_are_done_and_so_many_at_once():
+    first, inside, most = threading.Event(), 0, 0
+
+    def counted(work):
+        nonlocal inside, most
+        inside += 1
+        most = max(most, inside)
+        work()
+        inside -= 1
+
+    tasks = [("slow", first.wait), ("quick", lambda: None), ("last", first.set)]
+    found = [key for key, _ in run_tasks([(key, partial(counted, work)) for key, work in tasks], at_once=2)]
+    assert found[0] == "quick"
+    assert most == 2
+
+
+def test_nothing_begins_once_nobody_listens_and_a_task_at_work_is_not_waited_for():
+    begun, never = [], threading.Event()
+
+    def work(number):
+        begun.append(number)
+        if number == 1:
+            never.wait()
+        return number
+
+    kept = []
+
+    def listen():
+        for key, _ in run_tasks([(number, partial(work, number)) for number in range(9)], at_once=2):
+            kept.append(key)
+            if len(kept) == 3:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        listen()
+    assert kept == [0, 2, 3]
+    assert begun == [0, 1, 2, 3]
+    never.set()
+
+
+def test_an_error_of_a_task_comes_out():
+    def fail():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        list(run_tasks([("a", fail), ("b", lambda: 1)]))
+
+
+def test_torch_has_one_thread_until_the_last_one_leaves():
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        with one_torch_thread():
+            with one_torch_thread():
+                assert list(run_tasks([("a", one_torch_thread()(torch.get_num_threads))])) == [("a", 1)]
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)

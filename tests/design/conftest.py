@@ -1,0 +1,18 @@
+"""What tests of design share."""
+
+import pytest
+
+from design.benchmarking import harness
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """What one quick round of a bench finds, by trial."""
+    monkeypatch.setattr(harness, "BUDGET_S", 0)
+
+    def found(bench):
+        rounds = harness.BenchRounds()
+        harness.measure_round(bench, rounds, lambda step: None, lambda key: False)
+        return rounds.found
+
+    return found
