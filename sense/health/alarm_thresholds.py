@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .fault_likelihoods import HYPOTHESES, Array
+from sense.processing.limits import Array
+
+from .fault_likelihoods import HYPOTHESES
 
 NEVER = 1e5
 """A height that no climb reaches."""

@@ -13,46 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from sense.processing.limits import LEAST_SPREAD_V
+from sense.processing.limits import LEAST_SPREAD_V, Array
 
 from .fibre_prediction import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
 
-Array = NDArray[np.float64]
-
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
 """Offsets of the rest that are looked for, in spreads of the residual of the rest."""
-
 HYPOTHESES = ("stuck", "silent", "weak", "odd", "noisy", *(f"offset {size:+g}" for size in OFFSETS))
 """Reads one value; answers nothing; answers by half; answers as to another press; is five times as noisy; and has a
 rest that was moved by one of `OFFSETS`."""
-
 GAINS = (0.0, 0.5)
-
 NOISIER = 5.0
-
 WIDER = 4.0
 """What is odd is either as another press would be, or off by this many times what is usual."""
-
 MOST, MOST_OF_STEP = 6.0, 12.0
 """Most that one press adds, either way: no mishap in a single press names a fibre. A step within a trace may add more
 where an offset begins, yet is worth less than the threshold until the rest has moved as well."""
-
 STEPS = np.arange(3, TRACE - 2)
 """Readings of a trace at which a step is looked for; one nearer to an end could as well be a spike."""
-
 LIBRARY = 64
 """Other presses that an odd answer is held against."""
-
 SCALES = np.geomspace(0.5, 2.0, 9)
-
 EXTRAS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Factors on predicted spreads, and what is added to them, among which the likeliest is chosen."""
-
 LEAST_SCALE = 1e-3
 """Least spread of what is new in a rest: where nothing is, nothing is divided by it."""
-
 _MEDIAN_T = 0.7267
-
 _FAR_T = 6.869
 """Median, and what one in a thousand lies beyond, of the absolute value of Student's t with `FREEDOM` degrees."""
 

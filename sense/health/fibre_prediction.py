@@ -14,18 +14,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
 from design.common.computing import one_torch_thread
-from sense.processing.limits import LEAST_SPREAD_V
+from sense.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
 from .trained_model import average_in, one_cycle
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.alive` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
 (E, C, H, 2 T) and `last.b` (E, C, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""

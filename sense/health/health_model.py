@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from design.common.errors import InputError
 from design.common.files import read_json
 from design.common.settings import validated
-from sense.processing.limits import as_numbers, stream_of
+from sense.processing.limits import Array, Indices, as_numbers, stream_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import HYPOTHESES, FaultLikelihoods
@@ -28,9 +28,6 @@ FALSE_ALARMS = 1e-5
 """False alarms a press, all fibres and kinds of fault together: one in 100 000 healthy presses."""
 SETTLED = 10
 """Presses after which the running level of a rest is worth comparing with."""
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -78,17 +75,9 @@ class HealthModel:
         Raises:
             InputError: the provenance is no JSON, or `folder` cannot be written.
         """
-        document = {
-            "format": FORMAT,
-            "fibres": self.fibres,
-            "dead": list(self.dead),
-            "rate_hz": self.rate_hz,
-            "false_alarms": self.false_alarms,
-            "presses": self.presses,
-            "weights_sha256": "",  # known when they are written
-            "provenance": dict(self.provenance),
-        }
-        files_of(folder, name).write(document, self._arrays(), "health")
+        numbers = {key: getattr(self, key) for key in ("fibres", "dead", "rate_hz", "false_alarms", "presses")}
+        unsealed = {"weights_sha256": "", "provenance": dict(self.provenance)}
+        files_of(folder, name).write({"format": FORMAT, **numbers, **unsealed}, self._arrays(), "health")
 
     @classmethod
     def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":

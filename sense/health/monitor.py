@@ -7,14 +7,13 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, whole
-from sense.processing.limits import MAX_VOLTS, as_numbers, refuse_beyond
+from sense.processing.limits import MAX_VOLTS, Array, Floats, Indices, Mask, as_numbers, refuse_beyond
 
 from .alarm_thresholds import climb
 from .fault_likelihoods import HYPOTHESES, MOST, noise_of
-from .fibre_prediction import RELEASED, REST, Floats, History, expected, press_trace
+from .fibre_prediction import RELEASED, REST, History, expected, press_trace
 from .health_model import SETTLED, HealthModel, checked_presses
 
 MISSING = 20
@@ -28,9 +27,6 @@ MOST_SCORE = 99.0
 FLOATING = 30.0
 """Noise, as a multiple of the usual, that no fibre makes: an open input picks it up."""
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
 TEXTS = {
     "stuck": "reads one value",

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, shown, whole
 from design.criteria.fibre_loss import lost_subsets
+from sense.processing.limits import Array
 from sense.recordings.recording import Recording
 
 from .features import bridged, window_inputs
@@ -19,8 +20,6 @@ CELLS = 5
 """Cells along a side of the map of errors by place."""
 ACTIVE = 0.02
 """Share of its total variation that a fibre must change by to be active in a press (paper, table III)."""
-
-Array = NDArray[np.float64]
 
 
 def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from sense.processing.limits import Array, Indices
+
 Window = tuple[int, int]
 
 REST: Window = (-10, 0)

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from design.common.errors import InputError, instance, shown
 from design.common.files import read_json
 from sense.health.trained_model import files_of, refuse_other_pad
+from sense.processing.limits import Array, Floats
 from sense.recordings.recording import Recording
 
 from .features import SIZES, Inputs, press_inputs
-from .network import Floats, Weights, forward, masked, pooled, refuse_unsound
+from .network import Weights, forward, masked, pooled, refuse_unsound
 from .normalization import Normalization, Scaled
 from .schema import FORMAT, read_document
 
@@ -25,8 +26,6 @@ TABLE = "table"
 UNKNOWN = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and the radii of 50 and 90 % for a place anywhere in a square of half-width 1."""
 _CHUNK = 8192
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from design.common.errors import InputError
+from sense.processing.limits import Floats
 
-Floats = NDArray[np.float32]
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 4) and
 `last.b` (E, 1, 4), for E members, D inputs, H hidden units and L residual layers; of the published network, E = 1,

@@ -6,16 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.common.errors import InputError
-from sense.processing.limits import LEAST_SPREAD_V
+from sense.processing.limits import LEAST_SPREAD_V, Array, Floats
 
 from .features import Inputs
-from .network import Floats
 from .response_model import STEPS, ResponseModel, settled
 
 MAX_INPUT = 1e4
 """Greatest scaled input, in spreads: what lies further off is no press, and is held there."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

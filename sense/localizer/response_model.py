@@ -11,9 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sense.processing.limits import LEAST_SPREAD_V
-
-Array = NDArray[np.float64]
+from sense.processing.limits import LEAST_SPREAD_V, Array
 
 BUMPS = 21
 """Bumps along a side of the pad."""

@@ -14,21 +14,13 @@ from sense.settings import Features, Method, Split
 from .features import PASTS, SIZES
 
 FORMAT = "padforge-localizer/2"
-
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-
 Volts = Annotated[float, Field(ge=-2 * MAX_VOLTS, le=2 * MAX_VOLTS)]
-
 Spread = Annotated[float, Field(ge=LEAST_SPREAD_V, le=2 * MAX_VOLTS)]
-
 Share = Annotated[float, Field(ge=0, le=1)]
-
 Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
-
 Factor = Annotated[float, Field(gt=0, le=1e6)]
-
 Distance = Annotated[float, Field(ge=0)]
-
 Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import linprog
@@ -12,8 +11,7 @@ from scipy.optimize import linprog
 from design.benchmarking.harness import Bench, BenchTrial
 
 from .filters import running_median, total_variation
-
-Array = NDArray[np.float64]
+from .limits import Array
 
 READINGS = 10_000
 LONG = (100_000, 1_000_000)

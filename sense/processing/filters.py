@@ -12,17 +12,15 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common.computing import in_chunks
 from design.common.errors import InputError, instance, real, shown, whole
 
 from .kernels import clipping, total_variation_l1, total_variation_l2
 from .kernels import running_median as median_kernel
-from .limits import MAX_S, as_numbers, refuse_beyond
+from .limits import MAX_S, Array, Indices, as_numbers, refuse_beyond
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Fidelity = Literal["robust", "squares"]
 
 KERNELS = {"robust": total_variation_l1, "squares": total_variation_l2}

@@ -17,6 +17,14 @@ MAX_BYTES = 8 * MAX_VALUES
 """Size of the largest file of a recording."""
 MAX_INDEX = 2**53
 """Greatest index that float64 holds exactly."""
+LEAST_SPREAD_V = 1e-9
+"""Least spread that an input is divided by: what varies less never varied."""
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+"""Kinds of arrays that all rooms of sense speak of."""
 
 
 def as_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
@@ -80,7 +88,3 @@ def refuse_descent(times_s: NDArray[np.float64]) -> None:
     if not late.all():
         row = int(np.argmin(late)) + 1
         raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
-
-
-LEAST_SPREAD_V = 1e-9
-"""Least spread that an input is divided by: what varies less never varied."""

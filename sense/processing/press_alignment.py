@@ -6,12 +6,9 @@ pad live: a release that is off by one reading costs several millimetres.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .limits import Array, Indices
 from .press_detection import as_commanded, find_presses
-
-Indices = NDArray[np.int64]
-Array = NDArray[np.float64]
 
 EARLY = 2
 """Readings before its command at which a press may show: commands are noted a little late."""

@@ -9,14 +9,14 @@ a quarter of a second, and a probe that sinks in within about half a second.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from design.common.errors import InputError, whole
 
 from .kernels.pad_state import unknown
 from .kernels.press_detection import find
-from .limits import MAX_FIBRES, stream_of
+from .limits import MAX_FIBRES, Array, Indices, stream_of
 
 DOUBT, SURE = 1e-3, 1e-9
 """Chances that white noise leaves the levels for a look, and that it is taken for a change."""
@@ -25,9 +25,6 @@ SENT_DOWN_S, SENT_UP_S = 0.16, 0.08
 0.5 readings (means of the published recording at 14.3 Hz)."""
 _PART = 65_536
 """Readings taken at a time, so that a long recording is not copied as a whole."""
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 class Event(NamedTuple):

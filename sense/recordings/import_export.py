@@ -14,12 +14,11 @@ from pathlib import Path
 from reprlib import repr as shortened
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError
 from design.common.files import atomic, writing
 from design.pad.published_files import load_mat
-from sense.processing.limits import MAX_FIBRES
+from sense.processing.limits import MAX_FIBRES, Array
 
 from .csv_table import read_csv
 from .recording import Recording
@@ -36,8 +35,6 @@ FOUND = {"presses": "found"}
 """What the source of a recording says whose presses were found in its readings."""
 UNKNOWN = -1.7e308
 """Stands for `?` among numbers; far beyond any place."""
-
-Array = NDArray[np.float64]
 
 
 def import_mat(path: str | Path) -> Recording:

@@ -12,13 +12,11 @@ wandering by 0.04 V, noise of 1.6 mV.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from design import Contact, Morphology, signals
+from sense.processing.limits import Array
 from sense.settings import RigSettings
-
-Array = NDArray[np.float64]
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095

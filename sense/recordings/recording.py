@@ -21,6 +21,8 @@ from sense.processing.limits import (
     MAX_S,
     MAX_VOLTS,
     MIN_RATE_HZ,
+    Array,
+    Indices,
     as_numbers,
     refuse_beyond,
     refuse_descent,
@@ -29,9 +31,6 @@ from sense.processing.limits import (
 from .block_file import read_blocks
 from .press_journal import read_journal
 from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

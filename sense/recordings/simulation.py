@@ -1,12 +1,11 @@
 """The simulated rig: the published protocol on the simulated pad."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design import Contact, Morphology, signals
 from design.common.errors import MOST_VALUES, InputError, instance, whole
 from design.common.settings import or_default
-from sense.processing.limits import MAX_FIBRES
+from sense.processing.limits import MAX_FIBRES, Array
 from sense.settings import RigSettings
 
 from .pad_model import Cycle, read_pad
@@ -14,8 +13,6 @@ from .recording import Recording
 
 JITTER = 0.1
 """Spread of the interval between readings, share of its mean: the loop of the recording is no clock."""
-
-Array = NDArray[np.float64]
 
 
 def simulate(pad: Morphology, rig: RigSettings | None = None, contact: Contact | None = None) -> Recording:

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Localizer
+from sense.processing.limits import Array
 
 GAIN, TURN, SHIFT = 0.2, 0.05, 0.1
 """Spreads expected: of the logarithm of a gain, of the angle (radians) and the stretch, of the shift (spans)."""
 STEP = 0.02
 """Way over which slopes are taken, in these spreads: shorter ones drown in the rounding of the network."""
-
-Array = NDArray[np.float64]
 
 
 def fit_correction(localizer: Localizer, raw: Inputs, places_mm: Array) -> Localizer:

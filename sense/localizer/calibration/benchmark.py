@@ -16,8 +16,9 @@ from design.benchmarking.harness import Bench, BenchTrial
 from design.common.computing import one_torch_thread
 from sense import settings
 from sense.localizer.features import press_inputs
-from sense.localizer.network import Floats, Weights, forward, masked, pooled
+from sense.localizer.network import Weights, forward, masked, pooled
 from sense.localizer.normalization import Normalization
+from sense.processing.limits import Array, Floats
 from sense.recordings.recording import Recording
 from sense.recordings.simulation import simulate
 
@@ -37,7 +38,6 @@ MARQUARDT = ("published",)
 """Inputs that Levenberg-Marquardt is tried on: with F times as many, each of its steps takes F^2 to F^3 as long."""
 BATCH, ADAM_RATE = 128, 3e-3
 
-Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance
 from design.common.files import provenance
@@ -18,20 +17,15 @@ from sense.localizer.features import press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.network import refuse_unsound
 from sense.localizer.normalization import Normalization, Scaled
+from sense.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
-
 CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that end it and find the radii; of the published method, 15 % of all."""
-
 SUBSETS = 32
 """Sets of lost fibres of a size that the radii are found on, at most."""
-
-Array = NDArray[np.float64]
-
-Indices = NDArray[np.int64]
 
 
 def calibrate(

@@ -23,7 +23,7 @@ from design.criteria.fibre_loss import lost_subsets
 from sense import settings
 from sense.localizer.evaluation import by_place, errors_by_loss, held_back
 from sense.localizer.localizer import Found, Localizer
-from sense.processing.limits import MAX_FIBRES
+from sense.processing.limits import MAX_FIBRES, Indices
 from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses
@@ -32,7 +32,6 @@ FORMAT = "padforge-fibre-loss/1"
 ONE, MANY = "one network", "retrained"
 """The two ways, as the document calls them."""
 
-Indices = NDArray[np.int64]
 Lost = tuple[int, ...]
 
 

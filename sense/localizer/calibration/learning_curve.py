@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.computing import one_torch_thread, run_tasks
 from design.common.errors import InputError, instance
@@ -18,6 +17,7 @@ from design.common.files import provenance
 from design.common.settings import or_default
 from sense import settings
 from sense.localizer.evaluation import distances
+from sense.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses
@@ -31,9 +31,6 @@ EXPONENTS = np.linspace(0.1, 1.5, 57)
 """Exponents b that are tried."""
 DRAWS = 400
 """Resamplings that the uncertainty is found by."""
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 def learning_curve(

@@ -8,10 +8,10 @@ all.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, whole
 from design.common.files import provenance
@@ -19,6 +19,7 @@ from design.criteria.fibre_loss import lost_subsets
 from sense.localizer.evaluation import conformal, distances, error_row
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Found, Localizer
+from sense.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .affine_correction import fit_correction
@@ -34,8 +35,6 @@ gains almost always, but less than a hundred presses can show, so it is kept unl
 SUBSETS = 16
 """Sets of lost fibres of a size that are looked at, at most."""
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 FoundByLoss = Mapping[tuple[int, ...], Found]
 Change = Callable[[Localizer, Inputs, Array], Localizer]
 
@@ -110,12 +109,10 @@ def _changed(
     progress: Callable[[int, int], None],
 ) -> tuple[Localizer, FoundByLoss, list[str]]:
     """The localizer with the changes that are worth it, what is found of presses left out, and the changes' names."""
-    steps, total = 0, 2 + (FOLDS + 1 if localizer.method == "masked" else 0)
+    steps, total = count(1), 2 + (FOLDS + 1 if localizer.method == "masked" else 0)
 
     def step() -> None:
-        nonlocal steps
-        steps += 1
-        progress(steps, total)
+        progress(next(steps), total)
 
     now, kept, after, changes = localizer, [localizer] * FOLDS, before, []
     corrected = validation.changed(kept, fit_correction)
