@@ -30,11 +30,9 @@ _SPECK_MM2 = 0.01
 _SLENDER, _TOO_SLENDER = 5.0, 10.0
 """Ridges taller than so many times their width may break off in demoulding, or do not print upright at all."""
 
-
 _NAMED = 8
 """More fibres than this are counted instead of named."""
 
-MESHES = (".stl", ".3mf")
 Inspected = tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]
 """Vertices (n, 3) mm, triangles (m, 3) vertex numbers, and what the checks found."""
 
@@ -54,7 +52,7 @@ def inspect_file(source: Path, settings: FabricationSettings = DEFAULTS) -> Insp
     Raises:
         InputError: the file cannot be read, or settings contradict each other.
     """
-    if source.suffix.lower() not in MESHES:
+    if source.suffix.lower() not in (".stl", ".3mf"):
         return meshed(Plan(Morphology.load(source), settings))
     vertices, triangles = read_mesh(source)
     return vertices, triangles, inspect_mesh(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)

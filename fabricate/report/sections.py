@@ -31,19 +31,15 @@ def _mould(folder: Path, document: Mapping[str, Any]) -> PageSection:
     passed = [finding for finding in findings if finding["status"] == "pass"]
     remarks = sorted((each for each in findings if each["status"] != "pass"), key=lambda each: each["status"])
     large = f"{solid.name} is too large to be turned on this page, also when made coarser; the pictures show it."
+    captions = {
+        "mould.png": f"The mould from above, {size} mm: colour tells family and height.",
+        "tracks.png": "The fibres as they lie in the mould; the deeper one interrupts the other.",
+    }
     return PageSection(
         "Mould",
         [
             *([view(mesh, document)] if mesh else [paragraph(large)] if solid.is_file() else []),
-            figures(
-                [
-                    (folder / "mould.png", f"The mould from above, {size} mm: colour tells family and height."),
-                    (
-                        folder / "tracks.png",
-                        "The fibres as they lie in the mould; the deeper one interrupts the other.",
-                    ),
-                ]
-            ),
+            figures([(folder / name, caption) for name, caption in captions.items()]),
             heading("Printability"),
             paragraph(f"{len(passed)} of {len(findings)} checks pass."),
             *([_checks(remarks)] if remarks else []),
