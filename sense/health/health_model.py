@@ -15,6 +15,7 @@ from design.common.errors import InputError
 from design.common.files import read_json
 from design.common.settings import validated
 from sense.processing.limits import Array, Indices, as_numbers, stream_of
+from sense.recordings.recording import rate_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import HYPOTHESES, FaultLikelihoods
@@ -142,8 +143,3 @@ def checked_presses(
             "before the first, and each to end before the next begins"
         )
     return readings, times_s, begun, lifted
-
-
-def rate_of(times_s: Array) -> float:
-    """Readings per second of a recording, by the median of the steps of its (R,) times, s."""
-    return 1 / float(np.median(np.diff(times_s)))

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, real
 from sense.processing.limits import LEAST_SPREAD_V, Array, Indices
-from sense.recordings.recording import Recording
+from sense.recordings.recording import Recording, rate_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import FaultLikelihoods
 from .fibre_prediction import MEMBERS, REST, Weights, expected, member, shapes_of, traces_of, train_predictors
-from .health_model import COMMANDED, DETECTED, FALSE_ALARMS, SETTLED, HealthModel, checked_presses, rate_of
+from .health_model import COMMANDED, DETECTED, FALSE_ALARMS, SETTLED, HealthModel, checked_presses
 from .schema import LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, WEAK_PRESSES
 
 BLOCK = 50

@@ -94,7 +94,7 @@ class Recording:
     @property
     def rate_hz(self) -> float:
         """Readings per second, by the median interval."""
-        return 1 / float(np.median(np.diff(self.times_s)))
+        return rate_of(self.times_s)
 
     @property
     def digest(self) -> str:
@@ -204,3 +204,8 @@ def _validate(recording: Recording) -> None:
             f"press {press} goes from reading {recording.begun[press]} to {recording.lifted[press]}, "
             f"expected presses that do not overlap, each after at least one reading and within {len(readings)}"
         )
+
+
+def rate_of(times_s: Array) -> float:
+    """Readings per second of a recording, by the median of the steps of its (R,) times, s."""
+    return 1 / float(np.median(np.diff(times_s)))
