@@ -69,12 +69,7 @@ class Normalization:
         variance = _mean((windows - centre) ** 2, there)
         spread = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
         scaling = cls(
-            centre,
-            np.where(spread >= LEAST_SPREAD_V, spread, 1.0),
-            response.memory,
-            response.usual,
-            middle,
-            span,
+            centre, np.where(spread >= LEAST_SPREAD_V, spread, 1.0), response.memory, response.usual, middle, span
         )
         return scaling, scaling.scaled(response.table)
 

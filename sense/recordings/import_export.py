@@ -155,11 +155,7 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     for place, begun, lifted in zip(recording.presses_mm.tolist(), recording.begun, recording.lifted, strict=True):
         cells: list[float | str] = ["?", "?"] if isnan(place[0]) else place
         places[begun:lifted] = [cells] * int(lifted - begun)
-    with (
-        writing(path),
-        atomic(path) as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as file,
-    ):
+    with writing(path), atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         for time, volts, place in zip(recording.times_s.tolist(), recording.readings.tolist(), places, strict=True):

@@ -25,8 +25,7 @@ def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
     colours.outline.set_visible(False)  # type: ignore[operator]
     axes.set_aspect("equal")
     axes.autoscale_view()
-    axes.set_xlabel("x from the pad's centre (mm)")
-    axes.set_ylabel("y from the pad's centre (mm)")
+    axes.set(xlabel="x from the pad's centre (mm)", ylabel="y from the pad's centre (mm)")
     axes.set_title(
         f"{len(errors)} presses never trained on: {errors.mean():.2f} mm off on average\n",
         loc="left",
@@ -53,9 +52,9 @@ def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
     counts = ["all fibres" if row["lost"] == 0 else f"{row['lost']} lost" for row in rows]
     subsets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
     axes.set_xticks(range(len(rows)), [f"{count}\n{subset}" for count, subset in zip(counts, subsets, strict=True)])
-    axes.set_xlim(-0.5, len(rows) - 0.3)
-    axes.set_ylim(0, 1.08 * max(row["max_mm"] for row in rows))
-    axes.set_ylabel("mean error (mm)")
+    axes.set(
+        xlim=(-0.5, len(rows) - 0.3), ylim=(0, 1.08 * max(row["max_mm"] for row in rows)), ylabel="mean error (mm)"
+    )
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_title(
         f"One network, {document['test_presses']} presses never trained on\n", loc="left", color=INK, fontsize=11

@@ -57,8 +57,7 @@ def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
     errors = np.full((len(y_mm), len(x_mm)), np.nan)
     for cell in cells:
         errors[y_mm.index(cell["y_mm"]), x_mm.index(cell["x_mm"])] = cell["mean_mm"]
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     lost = "+".join(str(fibre + 1) for fibre in found["lost"])
     axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
     return axes.imshow(errors, origin="lower", cmap="magma_r", vmin=0, vmax=highest_mm)

@@ -35,9 +35,7 @@ def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
     ticks = [*presses.astype(int).tolist(), ahead["presses"]]
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
-    axes.set_ylim(0, None)
-    axes.set_xlabel("presses learnt from")
-    axes.set_ylabel("mean error (mm)")
+    axes.set(ylim=(0, None), xlabel="presses learnt from", ylabel="mean error (mm)")
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False)
     axes.set_title(

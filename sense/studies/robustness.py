@@ -68,8 +68,7 @@ def robustness_study(
     ]
     tasks = [
         Task(
-            f"{label}, {len(part[0])} lost",
-            partial(_found, pads[label], contact, rule, part, hidden, side, test, seed),
+            f"{label}, {len(part[0])} lost", partial(_found, pads[label], contact, rule, part, hidden, side, test, seed)
         )
         for label, part in parts
     ]
@@ -229,8 +228,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         for column, each in enumerate(each for each in document["maps"] if each["pad"] == label):
             axes = figure.add_subplot(grid[1 + place, column], aspect="equal")
             picture = axes.imshow(each["errors"], origin="lower", cmap="magma_r", vmin=0, vmax=highest)
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.set(xticks=[], yticks=[])
             lost = "+".join(str(fibre + 1) for fibre in each["lost"])
             axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
             if column == 0:

@@ -141,10 +141,7 @@ def _found(tile: Morphology, grid: int, way: str, side: int, seed: int) -> State
 
 
 def _conclude(
-    pads: Mapping[str, Morphology],
-    cases: list[tuple[str, int, str]],
-    settings: Mapping[str, Any],
-    states: list[State],
+    pads: Mapping[str, Morphology], cases: list[tuple[str, int, str]], settings: Mapping[str, Any], states: list[State]
 ) -> Findings:
     rows, maps = [], []
     by_case = dict(zip(cases, states, strict=True))
@@ -241,8 +238,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
             )
         axes.set_xticks(grids, [str(grid) for grid in grids])
         axes.xaxis.minorticks_off()
-        axes.set_xlabel("grid")
-        axes.set_ylabel(name)
+        axes.set(xlabel="grid", ylabel=name)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         tidy(axes)
     panels = lower.subplots(len(labels), len(grids), squeeze=False)
@@ -251,8 +247,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         row, column = labels.index(each["pad"]), grids.index(each["grid"])
         axes = panels[row, column]
         picture = axes.imshow(each["errors"], origin="lower", cmap="magma_r", vmin=0, vmax=highest)
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xticks=[], yticks=[])
         axes.set_title(f"{each['grid']} x {each['grid']}", fontsize=8, color=INK)
         if column == 0:
             axes.set_ylabel(each["pad"], fontsize=8, color=INK)

@@ -149,10 +149,12 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
             errors = [_matched(rows, label, radius, shape) for radius in radii]
             colour = CURVES[number % len(CURVES)]
             axes.plot(radii, errors, style, color=colour, marker="o", markersize=4, label=f"{label}, D {shape}")
-    axes.set_xticks(radii)
-    axes.set_ylim(0, None)
-    axes.set_xlabel("size K of the object, trained and pressed with (grid units)")
-    axes.set_ylabel("mean error (grid units)")
+    axes.set(
+        xticks=radii,
+        ylim=(0, None),
+        xlabel="size K of the object, trained and pressed with (grid units)",
+        ylabel="mean error (grid units)",
+    )
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     tidy(axes)

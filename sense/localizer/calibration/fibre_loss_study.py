@@ -166,12 +166,7 @@ def _number(lost: Lost) -> int:
 
 
 def _state(found: Found) -> State:
-    return {
-        "places_mm": found.places_mm,
-        "sd_mm": found.sd_mm,
-        "r50_mm": found.r50_mm,
-        "r90_mm": found.r90_mm,
-    }
+    return {"places_mm": found.places_mm, "sd_mm": found.sd_mm, "r50_mm": found.r50_mm, "r90_mm": found.r90_mm}
 
 
 def _found_of(state: State, presses: int) -> Found:

@@ -30,11 +30,7 @@ class UrEmulator:
     truth: Truth
 
     def __init__(
-        self,
-        series: Series = "cb3",
-        pose: Pose = HOME,
-        surface_mm: float | None = None,
-        stiffness_n_mm: float = 2.0,
+        self, series: Series = "cb3", pose: Pose = HOME, surface_mm: float | None = None, stiffness_n_mm: float = 2.0
     ) -> None:
         """Describe the controller.
 
@@ -42,12 +38,7 @@ class UrEmulator:
             series: "cb3" (PolyScope 3, 125 Hz) or "e" (PolyScope 5, 500 Hz). pose: where the arm stands.
             surface_mm: height of a springy plane the tool can press on; None for none. stiffness_n_mm: of it.
         """
-        self._settings = {
-            "series": series,
-            "pose_mm": pose,
-            "surface_mm": surface_mm,
-            "stiffness_n_mm": stiffness_n_mm,
-        }
+        self._settings = {"series": series, "pose_mm": pose, "surface_mm": surface_mm, "stiffness_n_mm": stiffness_n_mm}
 
     def __enter__(self) -> Self:
         handle, name = tempfile.mkstemp(prefix="padforge-ur-")

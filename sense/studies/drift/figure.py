@@ -61,8 +61,7 @@ def _levels(axes: "Axes", stretch: Mapping[str, Any]) -> None:
     times_s, *volts = np.array(stretch["levels"]).T
     for (name, colour), own in zip(PHASES[:2], volts, strict=True):
         axes.scatter(times_s / 60, own, s=2.5, color=colour, label=name, linewidths=0)
-    axes.set_xlabel("time (min)")
-    axes.set_ylabel("filtered (V)")
+    axes.set(xlabel="time (min)", ylabel="filtered (V)")
     axes.set_title(f"{stretch['recording']}, fibre {stretch['fibre'] + 1}", loc="left", color=INK, fontsize=10)
     tidy(axes)
 
@@ -80,8 +79,7 @@ def _readings(axes: "Axes", stretch: Mapping[str, Any]) -> None:
         axes.plot(
             marks[:, 0] - start, marks[:, 1], "o", color=colour, markerfacecolor=face, markersize=size, label=name
         )
-    axes.set_xlabel(f"time since {start / 60:.1f} min (s)")
-    axes.set_ylabel("V")
+    axes.set(xlabel=f"time since {start / 60:.1f} min (s)", ylabel="V")
     tidy(axes)
 
 
@@ -105,9 +103,7 @@ def _errors(axes: "Axes", label: str, rows: Sequence[Mapping[str, Any]]) -> None
                 label=None if part else f"denoised: {name}",
             )
     axes.set_yticks(range(len(schemes)), schemes)
-    axes.set_ylim(len(schemes) - 0.5, -0.5)
-    axes.set_xlim(0, None)
-    axes.set_xlabel("mean error (mm)")
+    axes.set(ylim=(len(schemes) - 0.5, -0.5), xlim=(0, None), xlabel="mean error (mm)")
     axes.set_title(f"{label}, {rows[0]['kind']}", loc="left", color=INK, fontsize=10)
     axes.grid(axis="x", color=FAINT, linewidth=0.6)
     tidy(axes)

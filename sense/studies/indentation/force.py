@@ -252,8 +252,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         ends = [min(own[0]["pressed_mm"]), max(own[0]["pressed_mm"])]
         axes.plot(ends, ends, color=INK, linewidth=0.8)
         axes.set_title(label, loc="left", color=INK, fontsize=10)
-        axes.set_xlabel("depth pressed (mm)")
-        axes.set_ylabel("depth found (mm)" if at % columns == 0 else "")
+        axes.set(xlabel="depth pressed (mm)", ylabel="depth found (mm)" if at % columns == 0 else "")
         axes.legend(frameon=False, fontsize=8, markerscale=3, handletextpad=0.1)
         tidy(axes)
     axes = figure.add_subplot(grid[rows, :])
@@ -263,14 +262,9 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         name = f"{curve['pad']}, noise {curve['noise_counts']:g}"
         errors = [np.nan if error is None else error for error in curve["place_mm"]]
         axes.plot(curve["middles_mm"], errors, style, color=colour, marker="o", markersize=3.5, label=name)
-    axes.set_ylim(0, None)
-    axes.set_xlabel("depth pressed (mm)")
-    axes.set_ylabel("mean error of the place (mm)")
+    axes.set(ylim=(0, None), xlabel="depth pressed (mm)", ylabel="mean error of the place (mm)")
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=columns)
     tidy(axes)
-    head(
-        figure,
-        f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits",
-    )
+    head(figure, f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits")
     return figure

@@ -224,8 +224,5 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         if column == 0:
             axes.set_ylabel("pressed", color=INK)
         axes.set_xlabel("found" if at == len(SETS) - 1 else "", color=INK)
-    head(
-        figure,
-        f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on",
-    )
+    head(figure, f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on")
     return figure

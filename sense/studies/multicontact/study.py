@@ -223,8 +223,7 @@ def _draw(document: Mapping[str, Any]) -> "Figure":
         axes.plot(ends, ends / 4, ":", color=INK, linewidth=0.8, label="a quarter of the distance")
         axes.set_ylim(0, 1.05 * most)
         axes.set_title(label, loc="left", color=INK, fontsize=10)
-        axes.set_xlabel("distance of the two contacts (mm)")
-        axes.set_ylabel("mean error (mm)" if at == 0 else "")
+        axes.set(xlabel="distance of the two contacts (mm)", ylabel="mean error (mm)" if at == 0 else "")
         axes.legend(frameon=False, fontsize=8, loc="upper left")
         tidy(axes)
         _draw_confusions(figure.add_subplot(grid[2, at]), document["confusions"][at]["counts"], at == 0)
@@ -251,8 +250,7 @@ def _draw_bars(axes: Any, rows: list[dict[str, Any]], labels: list[str], colours
 
 def _draw_confusions(axes: Any, counts: list[list[int]], first: bool) -> None:
     draw_confusions(axes, counts)
-    axes.set_xticks(range(len(counts)))
-    axes.set_yticks(range(len(counts)))
+    axes.set(xticks=range(len(counts)), yticks=range(len(counts)))
     axes.set_title(f"number: {100 * np.trace(counts) / np.sum(counts):.0f} % right", loc="left", color=INK, fontsize=10)
     axes.set_xlabel("contacts found", color=INK)
     axes.set_ylabel("contacts pressed" if first else "", color=INK)
