@@ -4,15 +4,7 @@ from pathlib import Path
 
 import click
 
-from design.common.command_line import (
-    json_option,
-    load_spec,
-    out_option,
-    pad_folder,
-    seed_option,
-    show_result,
-    spec_option,
-)
+from design.common import command_line as common
 from design.common.errors import InputError
 
 from .options import FOLDER, lost_option, model_option, recording_argument, reported
@@ -21,9 +13,9 @@ from .options import FOLDER, lost_option, model_option, recording_argument, repo
 @click.command()
 @model_option
 @recording_argument
-@seed_option
-@out_option()
-@json_option
+@common.seed_option
+@common.out_option()
+@common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, as_json: bool) -> None:
     """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
 
@@ -40,7 +32,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
 
-    target = out or pad_folder(recording)
+    target = out or common.pad_folder(recording)
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
     refuse_unwritable(target)
@@ -51,7 +43,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
         localizer.save(folder)
         write_json(folder / "recalibration.json", document)
         copy_health(model, folder)
-    show_result(document, recalibration_lines(document), as_json)
+    common.show_result(document, recalibration_lines(document), as_json)
 
 
 @click.command("fibre-loss")
@@ -59,10 +51,10 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 @click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for every loss.")
 @click.option("--retrain", is_flag=True, help="As published: another network for every set of lost fibres.")
 @lost_option
-@seed_option
-@spec_option
-@out_option()
-@json_option
+@common.seed_option
+@common.spec_option
+@common.out_option()
+@common.json_option
 def fibre_loss(
     recording: Path,
     model: Path | None,
@@ -90,10 +82,10 @@ def fibre_loss(
 
     if not (model or retrain):
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
-    target = out or pad_folder(recording)
+    target = out or common.pad_folder(recording)
     refuse_unwritable(target)
     localizer = Localizer.load(model) if model else None
-    options, opened = load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
+    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with reported("networks") as report:
         document = fibre_loss_study(
             opened,
@@ -107,15 +99,15 @@ def fibre_loss(
     with staged(target) as folder:
         write_json(folder / "fibre_loss.json", document)
         draw_fibre_loss(document, folder / "fibre_loss.png")
-    show_result(document, fibre_loss_lines(document), as_json)
+    common.show_result(document, fibre_loss_lines(document), as_json)
 
 
 @click.command("learning-curve")
 @recording_argument
-@seed_option
-@spec_option
-@out_option()
-@json_option
+@common.seed_option
+@common.spec_option
+@common.out_option()
+@common.json_option
 def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Path | None, as_json: bool) -> None:
     """Errors by number of presses learnt from, and what recording more of them would bring.
 
@@ -131,12 +123,12 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     from sense.report.learning_curve_figure import draw_learning_curve
     from sense.settings import LocalizerSettings
 
-    target = out or pad_folder(recording)
+    target = out or common.pad_folder(recording)
     refuse_unwritable(target)
-    options, opened = load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
+    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with reported("training") as report:
         document = study(opened, options, progress=report)
     with staged(target) as folder:
         write_json(folder / "learning_curve.json", document)
         draw_learning_curve(document, folder / "learning_curve.png")
-    show_result(document, learning_curve_lines(document), as_json)
+    common.show_result(document, learning_curve_lines(document), as_json)

@@ -6,16 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.common.command_line import (
-    json_option,
-    load_spec,
-    out_option,
-    pad_folder,
-    profile_option,
-    seed_option,
-    show_result,
-    spec_option,
-)
+from design.common import command_line as common
 
 from .options import FEATURES, METHODS, lost_option, model_option, read_recording, recording_argument, reported
 
@@ -29,11 +20,11 @@ if TYPE_CHECKING:
 @click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
 @click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
 @click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
-@seed_option
-@spec_option
-@out_option()
-@json_option
-@profile_option
+@common.seed_option
+@common.spec_option
+@common.out_option()
+@common.json_option
+@common.profile_option
 def calibrate(
     recording: Path,
     method: str | None,
@@ -56,10 +47,10 @@ def calibrate(
     from sense.report.calibration_results import calibration_lines
 
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
-    folder = out or pad_folder(recording)
+    folder = out or common.pad_folder(recording)
     with claimed(folder):
-        document = run_calibration(load_spec(spec), read_recording(recording), folder, overrides)
-    show_result(document, calibration_lines(document), as_json)
+        document = run_calibration(common.load_spec(spec), read_recording(recording), folder, overrides)
+    common.show_result(document, calibration_lines(document), as_json)
 
 
 def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -76,8 +67,8 @@ def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: 
 @model_option
 @recording_argument
 @lost_option
-@json_option
-@profile_option
+@common.json_option
+@common.profile_option
 def evaluate(model: Path, recording: Path, lost: int, as_json: bool) -> None:
     """Errors on RECORDING for every set of lost fibres.
 
@@ -93,4 +84,4 @@ def evaluate(model: Path, recording: Path, lost: int, as_json: bool) -> None:
     localizer = Localizer.load(model)
     levels = range(min(lost, localizer.fibres - 1) + 1)
     document = test(localizer, read_recording(recording), levels)
-    show_result(document, calibration_lines(document), as_json)
+    common.show_result(document, calibration_lines(document), as_json)

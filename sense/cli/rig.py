@@ -5,16 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from design.common.command_line import (
-    json_option,
-    load_spec,
-    out_option,
-    pad_folder,
-    profile_option,
-    seed_option,
-    show_result,
-    spec_option,
-)
+from design.common import command_line as common
 from design.common.errors import InputError
 
 from .options import FILE, FOLDER, recording_line, reported
@@ -40,10 +31,10 @@ drivers_option = click.option(
 @click.option("--dry-run", is_flag=True, help="Go through the whole plan above the pad, touching nothing.")
 @click.option("--resume", is_flag=True, help="Go on with a recording that was left unfinished.")
 @drivers_option
-@seed_option
-@spec_option
-@out_option(what="Folder of the recording; must be new or empty")
-@profile_option
+@common.seed_option
+@common.spec_option
+@common.out_option(what="Folder of the recording; must be new or empty")
+@common.profile_option
 def record(
     rig: str,
     morphology: Path | None,
@@ -76,7 +67,7 @@ def record(
     from sense.rig.planning.setup import Setup
     from sense.settings import RigSettings
 
-    settings, target = load_spec(spec), out or pad_folder(morphology) / "recording"
+    settings, target = common.load_spec(spec), out or common.pad_folder(morphology) / "recording"
     pad = _pad(morphology, settings.section(PadSettings))
     inputs = [path for path in (morphology, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
@@ -105,8 +96,8 @@ def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
 @click.command()
 @rig_option
 @drivers_option
-@spec_option
-@json_option
+@common.spec_option
+@common.json_option
 @click.pass_context
 def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | None, as_json: bool) -> None:
     """Look the rig over before a long run; nothing moves. Exit 1 where something fails.
@@ -123,10 +114,10 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
     from sense.rig.planning.setup import Setup
     from sense.settings import RigSettings
 
-    settings = load_spec(spec)
+    settings = common.load_spec(spec)
     pad, options = _pad(None, settings.section(PadSettings)), settings.section(RigSettings)
     found = look_over(rig, Setup(pad, settings.section(Contact), options, Path(), "padforge sense doctor"))
     passed = all(diagnosis.status != "fail" for diagnosis in found)
     lines = [f"{d.status:<4} {d.name}: {d.found}" for d in found]
-    show_result({"passed": passed, "found": [asdict(d) for d in found]}, lines, as_json)
+    common.show_result({"passed": passed, "found": [asdict(d) for d in found]}, lines, as_json)
     ctx.exit(0 if passed else 1)

@@ -10,10 +10,9 @@ measured on presses that the prediction was not fitted on: the heights of health
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from sense.processing.limits import LEAST_SPREAD_V, Array
+from sense.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 from .fibre_prediction import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
 
@@ -199,7 +198,7 @@ def _log_noise(traces: Array, usual: Array) -> Array:
     return np.log(noise_of(traces) / usual + 0.25)
 
 
-def _constant(traces: Array) -> NDArray[np.bool_]:
+def _constant(traces: Array) -> Mask:
     return np.ptp(traces, axis=-1) == 0
 
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, real
-from sense.processing.limits import LEAST_SPREAD_V, Array, Indices
+from sense.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 from sense.recordings.recording import Recording, rate_of
 
 from .alarm_thresholds import Tail
@@ -137,14 +136,14 @@ class _HeldOut:
         inputs: (Q, L, N), targets: (Q, L, T), scaled. fold: (Q,) of each press. settled: (Q,) presses to learn from.
     """
 
-    inputs: NDArray[np.float32]
+    inputs: Floats
     targets: Array
     fold: Indices
-    settled: NDArray[np.bool_]
+    settled: Mask
     weights: Weights
 
     @classmethod
-    def train(cls, inputs: NDArray[np.float32], targets: Array, rng: np.random.Generator) -> "_HeldOut":
+    def train(cls, inputs: Floats, targets: Array, rng: np.random.Generator) -> "_HeldOut":
         presses = np.arange(len(inputs))
         fold, settled = presses // min(BLOCK, len(inputs) // (4 * MEMBERS)) % MEMBERS, presses >= SETTLED
         rows = [np.flatnonzero(settled & (fold != k)) for k in range(MEMBERS)]

@@ -27,7 +27,6 @@ MOST_SCORE = 99.0
 FLOATING = 30.0
 """Noise, as a multiple of the usual, that no fibre makes: an open input picks it up."""
 
-
 TEXTS = {
     "stuck": "reads one value",
     "open": "is open: it reads what its rest never was, or noise alone",

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, real, shown, whole
 from sense.health.health_model import HealthModel
@@ -20,15 +19,13 @@ from sense.health.trained_model import refuse_other_pad
 from sense.localizer.features import REST, bridged, press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.normalization import Scaled
-from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, stream_of
+from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
 from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
 
 from .press_buffer import DONE, NEEDS, Press, Ring
 
 TRAIL = 12
 """Presses that are kept to be shown."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -168,7 +165,7 @@ class Live:
         rest = self._rest(end) if self._press is None else self._press.rest
         return (self._ring.rows(end - 1, end)[0, 1:] - rest) / self._usual
 
-    def _states(self, missing: NDArray[np.bool_]) -> list[str]:
+    def _states(self, missing: Mask) -> list[str]:
         kinds = {fibre: finding.kind for finding in self.findings for fibre in finding.fibres}
         usual = "unwatched" if self._monitor is None else "sound"
         return [

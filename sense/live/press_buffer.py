@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sense.health.fibre_prediction import RELEASED
 from sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
+from sense.processing.limits import Array
 
 HISTORY = SLOW[-1]
 """Readings before a press that its localizer looks at, as far as there are so many."""
@@ -24,8 +24,6 @@ DONE = max(UP[-1][1], RELEASED)
 """Readings after the probe was sent up with which a press is done."""
 SLACK = 4096
 """Readings kept beyond `HISTORY`: a press is found only some readings after it began."""
-
-Array = NDArray[np.float64]
 
 
 class Ring:

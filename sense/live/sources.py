@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design import Contact, Morphology
 from design.common.errors import InputError, real
 from design.common.files import read_json
 from design.common.settings import validated
+from sense.processing.limits import Array
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.recording import Recording
 from sense.rig.devices import Converter
@@ -19,7 +19,6 @@ from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.rig.session.averaging import Averager
 from sense.settings import RigSettings
 
-Array = NDArray[np.float64]
 Block = tuple[Array, Array]
 """Times (n,) in s, and readings (n, C) in V."""
 

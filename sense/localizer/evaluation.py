@@ -5,11 +5,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, shown, whole
 from design.criteria.fibre_loss import lost_subsets
-from sense.processing.limits import Array
+from sense.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .features import bridged, window_inputs
@@ -75,7 +74,7 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     }
 
 
-def held_back(localizer: Localizer, recording: Recording) -> NDArray[np.int64]:
+def held_back(localizer: Localizer, recording: Recording) -> Indices:
     """Presses of the recording it was trained on that a localizer says were held back, by index.
 
     Raises:

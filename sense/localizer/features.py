@@ -11,9 +11,8 @@ Readings may be missing (NaN): short gaps are bridged, and a fibre that lacks to
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sense.processing.limits import Array, Indices
+from sense.processing.limits import Array, Indices, Mask
 
 Window = tuple[int, int]
 
@@ -58,7 +57,7 @@ class Inputs:
 
     windows: Array
     history: Array
-    alive: NDArray[np.bool_]
+    alive: Mask
 
     def __getitem__(self, rows: Indices | slice) -> "Inputs":
         return Inputs(self.windows[rows], self.history[rows], self.alive[rows])
@@ -99,7 +98,7 @@ def bridged(readings: Array) -> Array:
     return filled
 
 
-def _there(readings: Array, begun: Indices, lifted: Indices, features: str) -> NDArray[np.bool_]:
+def _there(readings: Array, begun: Indices, lifted: Indices, features: str) -> Mask:
     """(Q, C) whether enough of a press's readings are there, from its rest to the end of what `features` looks at."""
     counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
     first = np.maximum(begun + REST[0], 0)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, instance, shown
 from design.common.files import read_json
 from sense.health.trained_model import files_of, refuse_other_pad
-from sense.processing.limits import Array, Floats
+from sense.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
 
 from .features import SIZES, Inputs, press_inputs
@@ -103,7 +103,7 @@ class Localizer:
         Raises:
             InputError: a lost fibre that is not there, or none left, or a published localizer that is to do without.
         """
-        alive: NDArray[np.bool_] = np.logical_and(presses.alive, self._alive(lost))
+        alive: Mask = np.logical_and(presses.alive, self._alive(lost))
         if self.method == "published" and np.size(lost):
             raise InputError("fibres are lost: a published localizer knows none, train one of method masked")
         chunks = range(0, len(presses), _CHUNK)
@@ -121,11 +121,11 @@ class Localizer:
         r50, r90 = np.where(blind, anywhere[1], r50), np.where(blind, anywhere[2], r90)
         return Found(self.normalization.places_mm(places), sd, r50, r90)
 
-    def _pooled(self, inputs: Floats, alive: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    def _pooled(self, inputs: Floats, alive: Mask) -> tuple[Floats, Floats]:
         entries = inputs.reshape(len(inputs), -1) if self.method == "published" else masked(inputs, alive)
         return pooled(forward(self.weights, entries))
 
-    def _alive(self, lost: ArrayLike) -> NDArray[np.bool_]:
+    def _alive(self, lost: ArrayLike) -> Mask:
         alive = np.ones(self.fibres, dtype=bool)
         try:
             fibres = np.asarray(lost).ravel().tolist()

@@ -9,11 +9,10 @@ method "published": one layer of tanh neurons leads to two coordinates.
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
 from design.common.errors import InputError
-from sense.processing.limits import Floats
+from sense.processing.limits import Floats, Mask
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 4) and
@@ -56,7 +55,7 @@ def refuse_unsound(weights: Weights, entries: int, method: str) -> None:
             )
 
 
-def masked(inputs: Floats, alive: NDArray[np.bool_]) -> Floats:
+def masked(inputs: Floats, alive: Mask) -> Floats:
     """What enters the network: the inputs of the living fibres, zeros for the lost, then the mask.
 
     Args:

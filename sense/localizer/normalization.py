@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError
-from sense.processing.limits import LEAST_SPREAD_V, Array, Floats
+from sense.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
 from .features import Inputs
 from .response_model import STEPS, ResponseModel, settled
@@ -24,9 +23,9 @@ class Scaled:
     """
 
     inputs: Floats
-    alive: NDArray[np.bool_]
+    alive: Mask
 
-    def __getitem__(self, rows: slice | NDArray[np.int64]) -> "Scaled":
+    def __getitem__(self, rows: slice | Indices) -> "Scaled":
         return Scaled(self.inputs[rows], self.alive[rows])
 
     def __len__(self) -> int:
@@ -103,6 +102,6 @@ class Normalization:
         return targets * self.span_mm + self.middle_mm
 
 
-def _mean(windows: Array, there: NDArray[np.bool_]) -> Array:
+def _mean(windows: Array, there: Mask) -> Array:
     """(C, F) means over the presses in which a fibre was there; 0 for one that never was."""
     return np.where(there, windows, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)

@@ -9,9 +9,8 @@ first lets a press be moved by a few millimetres, which turns thousands of press
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sense.processing.limits import LEAST_SPREAD_V, Array
+from sense.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 BUMPS = 21
 """Bumps along a side of the pad."""
@@ -39,7 +38,7 @@ class ResponseModel:
     usual: Array
 
     @classmethod
-    def fit(cls, places: Array, windows: Array, history: Array, alive: NDArray[np.bool_]) -> "ResponseModel":
+    def fit(cls, places: Array, windows: Array, history: Array, alive: Mask) -> "ResponseModel":
         """From places (Q, 2) within [-1, 1], windows (Q, C, F) V, history (Q, C, J) V of presses of training.
 
         A fibre learns from the presses in which it is alive, (Q, C).

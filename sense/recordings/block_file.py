@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
-from sense.processing.limits import MAX_BYTES, Array
+from sense.processing.limits import MAX_BYTES, Array, Mask
 
 _MAGIC = b"PFB1"
 _UNIT = 256
@@ -142,7 +142,7 @@ def _blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]:
     return np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
 
 
-def _sound(blocks: NDArray[np.void]) -> NDArray[np.bool_]:
+def _sound(blocks: NDArray[np.void]) -> Mask:
     """(B,) whether each block has its magic and checksum and stands where it was written."""
     counts = blocks["count"].astype(np.int64)
     return (

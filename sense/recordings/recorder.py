@@ -15,11 +15,11 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, shown, whole
 from design.common.files import lock, read_json, refuse_unwritable, write_json, writing
-from sense.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, as_numbers
+from sense.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, write_at
 from .press_journal import cut_torn_line, read_journal
@@ -130,7 +130,7 @@ class Recorder:
         self._note_time(rows)
         self.readings += len(rows)
 
-    def append_states(self, rows: NDArray[np.float64]) -> None:
+    def append_states(self, rows: Array) -> None:
         """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
         if self._states is None:
             file = (self._path / STATES).open("xb", buffering=0)
@@ -138,7 +138,7 @@ class Recorder:
         self._states[0].append(rows)
         self._note_time(rows)
 
-    def _note_time(self, rows: NDArray[np.float64]) -> None:
+    def _note_time(self, rows: Array) -> None:
         if len(rows):
             self.last_s = max(self.last_s, float(rows[-1, 0]))
 

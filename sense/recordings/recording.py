@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.errors import InputError, shown
 from design.common.files import read_json, writing
@@ -23,6 +22,7 @@ from sense.processing.limits import (
     MIN_RATE_HZ,
     Array,
     Indices,
+    Mask,
     as_numbers,
     refuse_beyond,
     refuse_descent,
@@ -87,7 +87,7 @@ class Recording:
         return self.readings.shape[1]
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """(Q,) whether the place of each press is known."""
         return ~(np.isnan(self.presses_mm[:, 0]) | np.isnan(self.presses_mm[:, 1]))
 

@@ -8,12 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from design.common.errors import Fault
-
-Array = NDArray[np.float64]
+from sense.processing.limits import Array, Indices
 
 Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""
@@ -93,7 +89,7 @@ class ConverterSamples:
 
     times_s: Array
     volts: Array
-    missing: NDArray[np.int64]
+    missing: Indices
 
 
 class Converter(Protocol):

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from sense.processing.limits import Array
 
 from .devices import Arm, Converter, RigFault
 
-Array = NDArray[np.float64]
 Status = Literal["ok", "warn", "fail"]
 
 LOOK_S = 2.0

@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.common.command_line import (
-    INTERRUPTED,
-    json_option,
-    load_spec,
-    out_option,
-    progress,
-    seed_option,
-    show_result,
-    spec_option,
-)
+from design.common import command_line as common
 from design.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,7 +55,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             from .study import run, study_lines
 
             refuse_unwritable(out)
-            with progress() as bar:
+            with common.progress() as bar:
                 task = bar.add_task(name, total=None, note="pads")
                 made = make(names, seed=seed or 0, **options)
 
@@ -77,16 +68,16 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
                     bar.stop()
                     print("padforge: interrupted; --resume goes on from what was finished", file=sys.stderr, flush=True)
                     # At once: threads in the middle of their arithmetic cannot be told to stop, nor be waited for.
-                    os._exit(INTERRUPTED)
-            show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
+                    os._exit(common.INTERRUPTED)
+            common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (
             click.argument("names", metavar=f"[{of}]...", nargs=-1),
-            seed_option,
+            common.seed_option,
             click.option("--jobs", type=click.IntRange(1, 256), help="Tasks at once (default: one a core)."),
             click.option("--resume", is_flag=True, help="Go on where a study into the same folder was broken off."),
-            out_option("out/study"),
-            json_option,
+            common.out_option("out/study"),
+            common.json_option,
         )
         for option in reversed(options):
             command = option(command)
@@ -114,7 +105,7 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
     help="Fibres sampled as in the paper, or exact.",
 )
 @click.option("--presses", type=click.IntRange(4), default=1024, show_default=True, help="To train on, a square.")
-@spec_option
+@common.spec_option
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
     """Errors by number of lost fibres, over all sets of them, and maps before and after (figures 3, 4 and 5).
 
@@ -127,7 +118,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     from .robustness import robustness_study
 
-    return robustness_study(_pads(names, seed), seed=seed, contact=load_spec(spec).section(Contact), **options)
+    return robustness_study(_pads(names, seed), seed=seed, contact=common.load_spec(spec).section(Contact), **options)
 
 
 @_command("sensitivity")

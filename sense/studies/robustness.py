@@ -3,26 +3,23 @@
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from design.common.checkpoints import State
 from design.common.errors import InputError
+from design.common.figures import CURVES, FAINT, INK, tidy
 from design.criteria.fibre_loss import lost_subsets
 from design.evaluation.localisation_error import Loss, PressSets, batches
 from design.pad.contact import signals, signals_quantized
 from design.pad.morphology import Morphology
 from design.settings import Contact
+from sense.processing.limits import Array
 
 from .pads import described
 from .study import Findings, Study, Task
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 RULES = {"published": signals_quantized, "exact": signals}
 """How a pad's signals are made: by sampled fibres, as the published figures were, or exactly."""
@@ -198,12 +195,8 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     return text
 
 
-def _draw(document: Mapping[str, Any]) -> "Figure":
+def _draw(document: Mapping[str, Any]) -> Figure:
     """Errors by number of lost fibres, and maps of them before a loss and after the worst ones."""
-    from matplotlib.figure import Figure
-
-    from design.common.figures import CURVES, FAINT, INK, tidy
-
     labels = list(document["settings"]["pads"])
     levels = 1 + max(row["lost"] for row in document["rows"])
     figure = Figure(figsize=(max(7.2, 1.9 * levels), 3.6 + 1.75 * len(labels)), layout="constrained")

@@ -11,25 +11,22 @@ All presses teach it whatever tile they are in, so that neither its size nor its
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from design.common.checkpoints import State
 from design.common.errors import InputError
+from design.common.figures import CURVES, FAINT, INK, tidy
 from design.evaluation.levenberg_marquardt import fit
 from design.evaluation.localisation_error import fresh_presses, training_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
+from sense.processing.limits import Array
 
 from .pads import described
 from .study import Findings, Study, Task
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"
@@ -211,12 +208,8 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     return text
 
 
-def _draw(document: Mapping[str, Any]) -> "Figure":
+def _draw(document: Mapping[str, Any]) -> Figure:
     """Errors and their share of the side by the grid, and maps of errors on fresh presses."""
-    from matplotlib.figure import Figure
-
-    from design.common.figures import CURVES, FAINT, INK, tidy
-
     grids, labels = document["settings"]["grids"], list(document["settings"]["pads"])
     figure = Figure(figsize=(max(7.2, 1.45 * len(grids)), 3.4 + 1.6 * len(labels)), layout="constrained")
     halves: Any = figure.subfigures(2, 1, height_ratios=[3.2, 1.6 * len(labels)])

@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from design.common.checkpoints import State
+from design.common.figures import CURVES, FAINT, INK, tidy
 from design.evaluation.levenberg_marquardt import fit_many
 from design.evaluation.localisation_error import PressSets
 from design.pad.contact import signals
@@ -16,9 +18,6 @@ from design.settings import Contact
 
 from .pads import described
 from .study import Findings, Study, Task
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MEMBERS = 6
 """Networks whose errors are averaged, for what one network comes to is luck."""
@@ -133,12 +132,8 @@ def _trained(row: Mapping[str, Any]) -> bool:
     return (row["trained_radius"], row["trained_sides"]) == (row["radius"], row["sides"])
 
 
-def _draw(document: Mapping[str, Any]) -> "Figure":
+def _draw(document: Mapping[str, Any]) -> Figure:
     """Errors by size of the object for every shape, and errors on objects that were not trained with."""
-    from matplotlib.figure import Figure
-
-    from design.common.figures import CURVES, FAINT, INK, tidy
-
     rows, settings = document["rows"], document["settings"]
     labels, radii, sides = list(settings["pads"]), settings["radii"], settings["sides"]
     figure = Figure(figsize=(max(6.4, 2.6 * len(labels)), 6.4), layout="constrained")

@@ -8,11 +8,10 @@ any other.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Localizer
-from sense.processing.limits import Array
+from sense.processing.limits import Array, Floats
 
 GAIN, TURN, SHIFT = 0.2, 0.05, 0.1
 """Spreads expected: of the logarithm of a gain, of the angle (radians) and the stretch, of the shift (spans)."""
@@ -66,7 +65,7 @@ def _corrected(localizer: Localizer, numbers: Array) -> Localizer:
     )
 
 
-def _moved_table(localizer: Localizer, turn: Array, shift: Array) -> NDArray[np.float32]:
+def _moved_table(localizer: Localizer, turn: Array, shift: Array) -> Floats:
     """The table by places as they are called now; over the edge, what is at the edge."""
     from scipy.interpolate import RegularGridInterpolator
 

@@ -9,7 +9,6 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design import Morphology
 from design.benchmarking.harness import Bench, BenchTrial
@@ -18,7 +17,7 @@ from sense import settings
 from sense.localizer.features import press_inputs
 from sense.localizer.network import Weights, forward, masked, pooled
 from sense.localizer.normalization import Normalization
-from sense.processing.limits import Array, Floats
+from sense.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
 from sense.recordings.simulation import simulate
 
@@ -77,7 +76,7 @@ def _trainings(features: str) -> Iterator[BenchTrial]:
             yield BenchTrial(features, way, size, partial(train, size), judge)
 
 
-def _held(presses: int) -> NDArray[np.bool_]:
+def _held(presses: int) -> Mask:
     """(Q,) presses that end a training, where it looks at some, and are not learnt from."""
     return np.arange(presses) % 12 == 0
 

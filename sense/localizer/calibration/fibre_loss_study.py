@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.checkpoints import Checkpoints, State
 from design.common.computing import one_torch_thread, run_tasks
@@ -23,7 +22,7 @@ from design.criteria.fibre_loss import lost_subsets
 from sense import settings
 from sense.localizer.evaluation import by_place, errors_by_loss, held_back
 from sense.localizer.localizer import Found, Localizer
-from sense.processing.limits import MAX_FIBRES, Indices
+from sense.processing.limits import MAX_FIBRES, Array, Indices
 from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses
@@ -95,7 +94,7 @@ def fibre_loss_study(
     }
 
 
-def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm: NDArray[np.float64]) -> dict[str, Any]:
+def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm: Array) -> dict[str, Any]:
     rows, by_subset = errors_by_loss(fibres, levels, locate, places_mm)
     worst = [
         max((each for each in by_subset if len(each["lost"]) == level), key=lambda each: each["mean_mm"])["lost"]

@@ -15,7 +15,6 @@ from threading import Event, Lock
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,7 +23,7 @@ from design.common.computing import one_torch_thread, run_tasks
 from sense import settings
 from sense.health.trained_model import average_in, one_cycle
 from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Weights
-from sense.processing.limits import Floats
+from sense.processing.limits import Floats, Mask
 
 MOST_STEPS = 11_000
 """Steps of training at most: with moved presses, the length of the recording does not matter beyond."""
@@ -52,7 +51,7 @@ class TrainingPresses:
     """
 
     inputs: Floats
-    alive: NDArray[np.bool_]
+    alive: Mask
     places: Floats
 
 

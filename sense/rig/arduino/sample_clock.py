@@ -9,9 +9,9 @@ and stays in the times.
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from sense.processing.limits import Array
+
 Point = tuple[float, float]
 
 _BUCKET_S = 1.0

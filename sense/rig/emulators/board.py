@@ -14,8 +14,8 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sense.processing.limits import Array, Indices
 from sense.rig.arduino.framing import (
     BITS,
     FULL_SCALE,
@@ -34,7 +34,6 @@ from sense.rig.arduino.framing import (
     encode,
 )
 
-Array = NDArray[np.float64]
 Source = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the inputs of the board or more than are asked for."""
 
@@ -119,7 +118,7 @@ class EmulatedBoard:
         """Drop the next `samples` samples, up to whole blocks."""
         self._overrun_asked += samples
 
-    def truth_s(self, index: int | NDArray[np.int64]) -> Array:
+    def truth_s(self, index: int | Indices) -> Array:
         """Host times at which the samples of these indices since the last start were complete."""
         if self._started_s is None:
             raise ValueError("the board is not sampling")

@@ -6,15 +6,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design import Contact, Morphology, signals
+from sense.processing.limits import Array
 from sense.recordings.pad_model import TRAVEL_S, LivePad
 from sense.recordings.simulation import random_places
 from sense.rig.devices import ConverterSamples, RigFault
 from sense.settings import RigSettings
-
-Array = NDArray[np.float64]
 
 
 class SimulatedConverter:

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from sense.processing.limits import Array, Indices
 
 COLUMNS = 8
 """Time on the host's monotonic clock in s, pose in mm and rad, force on the tool in N."""
@@ -61,6 +61,6 @@ def create(path: Path) -> None:
         file.truncate(8 + 8 * COLUMNS * ROWS)
 
 
-def _map(path: Path, mode: str) -> tuple[NDArray[np.int64], Array]:
+def _map(path: Path, mode: str) -> tuple[Indices, Array]:
     data = np.memmap(path, np.uint8, mode)  # pyright: ignore[reportCallIssue, reportArgumentType]
     return data[:8].view(np.int64), data[8:].view(np.float64).reshape(ROWS, COLUMNS)

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design import Contact, Morphology, signals
+from sense.processing.limits import Array
 from sense.recordings.pad_model import LivePad
 from sense.rig.arduino.driver import Arduino
 from sense.rig.session.pad_frame import Frame
@@ -35,7 +35,7 @@ def emulated(
     start = frame.pose(np.zeros(2), -2 * rig.clearance_mm)
     with UrEmulator(pose=start, surface_mm=rig.contact_mm) as robot:
 
-        def volts(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        def volts(times_s: Array) -> Array:
             return model.volts(*frame.tip(robot.pose_at(times_s)))
 
         with EmulatedBoard(volts) as board:

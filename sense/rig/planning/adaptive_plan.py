@@ -3,16 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from sense.localizer.localizer import Localizer
 from sense.localizer.locating import locate
+from sense.processing.limits import Array
 from sense.recordings.recording import Recording
 
 from .press_plan import PressPlan
-
-Array = NDArray[np.float64]
 
 EVERY = 20
 """Presses between two looks at how well the localizer finds them."""

@@ -4,15 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
-from sense.processing.limits import MAX_MM, as_numbers, refuse_beyond
+from sense.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
 from sense.recordings.csv_table import read_csv
 from sense.settings import RigSettings
-
-Array = NDArray[np.float64]
 
 COLUMNS = ("x_mm", "y_mm", "depth_mm")
 

@@ -1,11 +1,9 @@
 """From the samples of a converter to the readings of a recording: means over a whole number of samples."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sense.processing.limits import Array
 from sense.rig.devices import ConverterSamples
-
-Array = NDArray[np.float64]
 
 
 class Averager:

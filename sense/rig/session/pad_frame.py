@@ -4,12 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sense.processing.limits import Array
 from sense.rig.devices import Pose, RigFault
 from sense.settings import RigSettings
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

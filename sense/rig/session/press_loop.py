@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sense.processing.limits import Array
 from sense.recordings.recorder import Recorder
 from sense.rig.devices import Arm, Converter, Pose, RigFault
 from sense.rig.planning.press_plan import PressPlan
@@ -20,8 +20,6 @@ from sense.settings import RigSettings
 
 from .averaging import Averager
 from .pad_frame import Frame
-
-Array = NDArray[np.float64]
 
 _SPARE_S = 3.0
 """A reading that is waited for may take this long."""

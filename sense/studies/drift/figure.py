@@ -1,28 +1,24 @@
 """The figure of the study of drift."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from design.common.figures import ALARM, CURVES, FAINT, INK, tidy
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLUMNS = 2
 """Recordings side by side whose errors are shown."""
 PHASES = (("before", INK), ("pressed", ALARM), ("after", CURVES[2]))
 
 
-def draw(document: Mapping[str, Any]) -> "Figure":
+def draw(document: Mapping[str, Any]) -> Figure:
     """Drift of a fibre, its readings and what is taken of them, and the errors of every way to deal with it.
 
     Readings are shown of the first simulated and of the first real recording.
     """
-    from matplotlib.figure import Figure
-
     stretches, rows = document["stretches"], document["rows"]
     shown = [next(s for s in stretches if s["kind"] == kind) for kind in dict.fromkeys(s["kind"] for s in stretches)]
     labels = list(dict.fromkeys(row["recording"] for row in rows))
@@ -56,7 +52,7 @@ def draw(document: Mapping[str, Any]) -> "Figure":
     return figure
 
 
-def _levels(axes: "Axes", stretch: Mapping[str, Any]) -> None:
+def _levels(axes: Axes, stretch: Mapping[str, Any]) -> None:
     """The values before and in presses, over the whole recording."""
     times_s, *volts = np.array(stretch["levels"]).T
     for (name, colour), own in zip(PHASES[:2], volts, strict=True):
@@ -66,7 +62,7 @@ def _levels(axes: "Axes", stretch: Mapping[str, Any]) -> None:
     tidy(axes)
 
 
-def _readings(axes: "Axes", stretch: Mapping[str, Any]) -> None:
+def _readings(axes: Axes, stretch: Mapping[str, Any]) -> None:
     """Some presses, as read and filtered, and the three values that are taken of each."""
     times_s, raw, filtered = np.array(stretch["stretch"])
     start = times_s[0]
@@ -83,7 +79,7 @@ def _readings(axes: "Axes", stretch: Mapping[str, Any]) -> None:
     tidy(axes)
 
 
-def _errors(axes: "Axes", label: str, rows: Sequence[Mapping[str, Any]]) -> None:
+def _errors(axes: Axes, label: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """A dot for every way: filled for presses at random, hollow for the last ones."""
     schemes = list(dict.fromkeys(row["compensate"] for row in rows))
     filters = list(dict.fromkeys(row["denoise"] for row in rows))

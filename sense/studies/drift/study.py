@@ -12,7 +12,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.common.checkpoints import State
 from design.common.errors import InputError
@@ -25,6 +24,7 @@ from sense.localizer.evaluation import distances
 from sense.localizer.evaluation import idle_share as recorded_idle_share
 from sense.localizer.features import bridged, press_inputs
 from sense.processing.filters import running_median, total_variation
+from sense.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 from sense.recordings.simulation import simulate
 from sense.settings import RigSettings
@@ -33,9 +33,6 @@ from sense.studies.study import Findings, Study, Task
 
 from .figure import draw
 from .text import told
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MEMBERS = 3
 """Networks whose errors are averaged: they differ by their first weights."""

@@ -3,23 +3,19 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from design.common.checkpoints import State
-from design.common.figures import CURVES, FAINT, INK
+from design.common.figures import CURVES, FAINT, INK, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from design.pad.morphology import Morphology
+from sense.processing.limits import Array
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 COUNTS = 2**12 - 1
 """Full scale of the converter the signals are read with."""
@@ -231,12 +227,8 @@ def _told(indenter: Indenter, settings: Mapping[str, Any], rows: list[dict[str, 
     return text
 
 
-def _draw(document: Mapping[str, Any]) -> "Figure":
+def _draw(document: Mapping[str, Any]) -> Figure:
     """Depth found against depth pressed for every pad, and the error of the place by depth."""
-    from matplotlib.figure import Figure
-
-    from design.common.figures import head, tidy
-
     curves, noises = document["curves"], document["settings"]["noise_counts"]
     labels = list(document["settings"]["pads"])
     columns = min(len(labels), COLUMNS)

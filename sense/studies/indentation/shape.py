@@ -3,27 +3,23 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from design.common.checkpoints import State
-from design.common.figures import INK
+from design.common.figures import INK, draw_confusions, head
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.contact import signals
 from design.pad.indentation import Indenter, indented_signals
 from design.pad.morphology import Morphology
 from design.settings import Contact
+from sense.processing.limits import Array, Indices
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
 
 from .force import EPOCHS, MEMBERS, committee, magnitudes, readings
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 INDENTERS = {
     "sphere": Indenter("sphere", radius=0.7),
@@ -92,7 +88,7 @@ class _Presses:
     test: int
     seed: int
 
-    def made(self) -> tuple[Array, Array, NDArray[np.int64], np.random.Generator]:
+    def made(self) -> tuple[Array, Array, Indices, np.random.Generator]:
         """What a network is given (Q, 2M), places (Q, 2), the shape's index (Q,), and what to draw further from."""
         rng = np.random.default_rng([4, self.seed, list(SETS).index(self.of)])
         count = self.learnt + self.test
@@ -106,7 +102,7 @@ class _Presses:
         return magnitudes(read) if self.of == "indenters" else read, places, shape, rng
 
 
-def _indented(pad: Morphology, places: Array, shape: NDArray[np.int64], depths: Array) -> Array:
+def _indented(pad: Morphology, places: Array, shape: Indices, depths: Array) -> Array:
     """(Q, 2M) signals of indenters."""
     given = np.empty((len(places), 2 * pad.grid))
     for index, indenter in enumerate(INDENTERS.values()):
@@ -115,7 +111,7 @@ def _indented(pad: Morphology, places: Array, shape: NDArray[np.int64], depths: 
     return given
 
 
-def _printed(pad: Morphology, places: Array, shape: NDArray[np.int64], size: NDArray[np.int64]) -> Array:
+def _printed(pad: Morphology, places: Array, shape: Indices, size: Indices) -> Array:
     """(Q, 2M) signals of footprints, of SIZES[size]."""
     given = np.empty((len(places), 2 * pad.grid))
     for index, sides in enumerate(FOOTPRINTS.values()):
@@ -204,12 +200,8 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     return text
 
 
-def _draw(document: Mapping[str, Any]) -> "Figure":
+def _draw(document: Mapping[str, Any]) -> Figure:
     """The confusion matrices: a column for every pad, a row for every set of shapes, in per cent of each true shape."""
-    from matplotlib.figure import Figure
-
-    from design.common.figures import draw_confusions, head
-
     labels = list(document["settings"]["pads"])
     figure = Figure(figsize=(max(6.4, 1.2 + 2.7 * len(labels)), 6.2), layout="constrained")
     grid = figure.subplots(len(SETS), len(labels), squeeze=False)

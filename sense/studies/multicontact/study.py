@@ -2,26 +2,22 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from design.common.checkpoints import State
 from design.common.figures import CURVES, INK, draw_confusions, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
+from sense.processing.limits import Array
 from sense.studies.indentation.force import COUNTS, readings
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
 
 from .pairs import LABELLED, WAYS, Way, learnt, unordered_distances
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 MEMBERS = 3
 EPOCHS = 100
@@ -203,10 +199,8 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     return text
 
 
-def _draw(document: Mapping[str, Any]) -> "Figure":
+def _draw(document: Mapping[str, Any]) -> Figure:
     """The error by way and pad; under it, for every pad, the error by distance, and confusions of the number."""
-    from matplotlib.figure import Figure
-
     labels = list(document["settings"]["pads"])
     figure = Figure(figsize=(max(8.0, 1.2 + 2.9 * len(labels)), 9.6), layout="constrained")
     grid = figure.add_gridspec(3, len(labels), height_ratios=[1, 1, 1.1])
