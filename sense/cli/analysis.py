@@ -27,8 +27,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     """
     from design.common.files import refuse_unwritable, staged, write_json
     from sense.health.model_folder import copy_health
-    from sense.localizer.calibration.recalibration import recalibrate as follow
-    from sense.localizer.calibration.recalibration import recalibration_lines
+    from sense.localizer.calibration import recalibration
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
 
@@ -38,12 +37,12 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     refuse_unwritable(target)
     old, opened = Localizer.load(model), open_recording(recording)
     with reported("recalibrating") as report:
-        localizer, document = follow(old, opened, seed=seed or 0, progress=report)
+        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
     with staged(target) as folder:
         localizer.save(folder)
         write_json(folder / "recalibration.json", document)
         copy_health(model, folder)
-    common.show_result(document, recalibration_lines(document), as_json)
+    common.show_result(document, recalibration.recalibration_lines(document), as_json)
 
 
 @click.command("fibre-loss")
@@ -117,8 +116,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     Writes learning_curve.json and learning_curve.png.
     """
     from design.common.files import refuse_unwritable, staged, write_json
-    from sense.localizer.calibration.learning_curve import learning_curve as study
-    from sense.localizer.calibration.learning_curve import learning_curve_lines
+    from sense.localizer.calibration import learning_curve as study
     from sense.recordings.import_export import open_recording
     from sense.report.learning_curve_figure import draw_learning_curve
     from sense.settings import LocalizerSettings
@@ -127,8 +125,8 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     refuse_unwritable(target)
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with reported("training") as report:
-        document = study(opened, options, progress=report)
+        document = study.learning_curve(opened, options, progress=report)
     with staged(target) as folder:
         write_json(folder / "learning_curve.json", document)
         draw_learning_curve(document, folder / "learning_curve.png")
-    common.show_result(document, learning_curve_lines(document), as_json)
+    common.show_result(document, study.learning_curve_lines(document), as_json)

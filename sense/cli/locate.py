@@ -26,9 +26,8 @@ def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path | None
     deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases).
     """
     from sense.health.model_folder import examined, has_health
+    from sense.localizer import locating
     from sense.localizer.localizer import Localizer
-    from sense.localizer.locating import locate as find
-    from sense.localizer.locating import write_places
 
     file = out or pad_folder(recording) / "places.csv"
     localizer = Localizer.load(model)
@@ -37,8 +36,8 @@ def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path | None
     findings = examined(model, opened)[1] if has_health(model) else []
     for finding in findings:
         click.echo(f"{finding.text}; left out from there on", err=True)
-    found = find(localizer, opened, lost, findings)
-    write_places(found, file)
+    found = locating.locate(localizer, opened, lost, findings)
+    locating.write_places(found, file)
     click.echo(f"{len(found.r50_mm)} places -> {file}")
 
 

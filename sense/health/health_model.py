@@ -106,12 +106,8 @@ class HealthModel:
             evidence=FaultLikelihoods(**parts["evidence"]),
             tail=Tail(**parts["tail"]),
             rests=arrays["rests"],
-            fibres=document.fibres,
             dead=tuple(dead),
-            rate_hz=document.rate_hz,
-            presses=document.presses,
-            false_alarms=document.false_alarms,
-            provenance=document.provenance,
+            **{key: getattr(document, key) for key in ("fibres", "rate_hz", "presses", "false_alarms", "provenance")},
         )
 
     def _arrays(self) -> dict[str, NDArray[Any]]:

@@ -150,10 +150,7 @@ class Localizer:
         """
         document = {
             "format": FORMAT,
-            "method": self.method,
-            "features": self.features,
-            "fibres": self.fibres,
-            "rate_hz": self.rate_hz,
+            **{name: getattr(self, name) for name in ("method", "features", "fibres", "rate_hz")},
             "scaling": {
                 "centre_v": self.normalization.centre.tolist(),
                 "spread_v": self.normalization.spread.tolist(),
@@ -196,18 +193,14 @@ class Localizer:
             table = weights.pop(TABLE)
             normalization.refuse_unsound(table)
             refuse_unsound(weights, normalization.entries(document.method), document.method)
+        plain = ("method", "features", "rate_hz", "learnt_from", "split", "provenance")
         return cls(
-            weights=weights,
-            normalization=normalization,
-            table=table,
-            method=document.method,
-            features=document.features,
+            weights,
+            normalization,
+            table,
             factors=np.array(document.factors),
-            rate_hz=document.rate_hz,
-            learnt_from=document.learnt_from,
-            split=document.split,
             test=tuple(document.test),
             recalibrated_by=tuple(document.recalibrated_by),
             errors=[row.model_dump() for row in document.errors],
-            provenance=document.provenance,
+            **{name: getattr(document, name) for name in plain},
         )

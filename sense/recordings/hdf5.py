@@ -22,13 +22,7 @@ FORMAT = "padforge-hdf5/1"
 PACKED = 1040
 """Bytes that a byte of a file may stand for, at most: gzip packs no closer than 1032 to 1."""
 
-_ARRAYS = {
-    "times_s": "times_s",
-    "readings_v": "readings",
-    "presses_mm": "presses_mm",
-    "begun": "begun",
-    "lifted": "lifted",
-}
+_ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {key: key for key in ("presses_mm", "begun", "lifted")}
 """Names of the datasets and of what they hold of a `Recording`."""
 
 

@@ -13,20 +13,8 @@ import numpy as np
 
 from design.common.errors import InputError, shown
 from design.common.files import read_json, writing
-from sense.processing.limits import (
-    MAX_FIBRES,
-    MAX_MM,
-    MAX_RATE_HZ,
-    MAX_S,
-    MAX_VOLTS,
-    MIN_RATE_HZ,
-    Array,
-    Indices,
-    Mask,
-    as_numbers,
-    refuse_beyond,
-    refuse_descent,
-)
+from sense.processing import limits
+from sense.processing.limits import Array, Indices, Mask
 
 from .block_file import read_blocks
 from .press_journal import read_journal
@@ -68,7 +56,7 @@ class Recording:
             ("begun", np.int64),
             ("lifted", np.int64),
         ):
-            array = as_numbers(getattr(self, name), kind, name)
+            array = limits.as_numbers(getattr(self, name), kind, name)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         _validate(self)
@@ -175,26 +163,27 @@ def _validate(recording: Recording) -> None:
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"source is {shown(dict(recording.source))}, expected what JSON can hold ({error})") from error
     readings, presses = recording.readings, recording.presses_mm
-    if readings.ndim != 2 or not 1 <= readings.shape[1] <= MAX_FIBRES or len(readings) < 2:
-        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
+    if readings.ndim != 2 or not 1 <= readings.shape[1] <= limits.MAX_FIBRES or len(readings) < 2:
+        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {limits.MAX_FIBRES}")
     if recording.times_s.shape != (len(readings),):
         raise InputError(f"times have shape {recording.times_s.shape}, expected ({len(readings)},)")
     if presses.ndim != 2 or presses.shape[1] != 2 or len(presses) == 0:
         raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
     if recording.begun.shape != (len(presses),) or recording.lifted.shape != (len(presses),):
         raise InputError(f"{len(presses)} presses have {recording.begun.size} begins and {recording.lifted.size} ends")
-    refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
-    refuse_beyond("times", recording.times_s[:, None], MAX_S, "s")
-    refuse_beyond("presses", presses, MAX_MM, "mm", missing=True)
+    limits.refuse_beyond("readings", readings, limits.MAX_VOLTS, "V", missing=True)
+    limits.refuse_beyond("times", recording.times_s[:, None], limits.MAX_S, "s")
+    limits.refuse_beyond("presses", presses, limits.MAX_MM, "mm", missing=True)
     if np.isnan(readings).all():
         raise InputError(f"readings are all missing (NaN), all {readings.size} of them, expected some numbers")
     half = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
     if half.any():
         raise InputError(f"press {int(np.argmax(half))} has one of x and y, expected both or neither")
-    refuse_descent(recording.times_s)
-    if not MIN_RATE_HZ <= recording.rate_hz <= MAX_RATE_HZ:
+    limits.refuse_descent(recording.times_s)
+    if not limits.MIN_RATE_HZ <= recording.rate_hz <= limits.MAX_RATE_HZ:
         raise InputError(
-            f"times give {recording.rate_hz:g} readings a second, allowed is {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"
+            f"times give {recording.rate_hz:g} readings a second, "
+            f"allowed is {limits.MIN_RATE_HZ:g} to {limits.MAX_RATE_HZ:g}"
         )
     edges = np.column_stack([recording.begun, recording.lifted]).ravel()
     late = np.diff(edges, prepend=0, append=len(readings) + 1) < 1

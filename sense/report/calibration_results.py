@@ -7,11 +7,9 @@ from typing import Any
 from design.common.errors import InputError
 from design.common.files import refuse_unwritable, staged, write_json
 from design.common.profiling import stage
-from sense.health.health_model import HealthModel
 from sense.health.learning import learn_health
 from sense.health.model_folder import forget_health
 from sense.localizer.calibration.calibration import calibrate
-from sense.localizer.localizer import Localizer
 from sense.recordings.recording import Recording
 from sense.settings import LocalizerSettings
 
@@ -39,33 +37,24 @@ def calibrate_into(
     localizer, document = calibrate(recording, options, progress=progress)
     progress(0, 0)
     with stage("health"):
-        health = _health(recording, localizer, warn)
+        try:
+            health = learn_health(recording, localizer.test, localizer.provenance)
+        except InputError as error:
+            health = {}
+            warn(f"no watch is kept on the fibres' health: {error}")
     with staged(out) as folder:
         localizer.save(folder)
         for name, model in health.items():
             model.save(folder, name)
         write_json(folder / "calibration.json", document)
         with stage("figures"):
-            _draw(document, folder)
+            from .calibration_figures import draw_error_by_loss, draw_error_map
+
+            draw_error_map(document, folder / "error_map.png")
+            draw_error_by_loss(document, folder / "error_by_loss.png")
     if not health:
         forget_health(out)
     return document
-
-
-def _health(recording: Recording, localizer: Localizer, warn: Callable[[str], None]) -> dict[str, HealthModel]:
-    """Models that health is told by, by name, or none where the recording does not suffice."""
-    try:
-        return learn_health(recording, localizer.test, localizer.provenance)
-    except InputError as error:
-        warn(f"no watch is kept on the fibres' health: {error}")
-        return {}
-
-
-def _draw(document: Mapping[str, Any], folder: Path) -> None:
-    from .calibration_figures import draw_error_by_loss, draw_error_map
-
-    draw_error_map(document, folder / "error_map.png")
-    draw_error_by_loss(document, folder / "error_by_loss.png")
 
 
 def calibration_lines(document: Mapping[str, Any]) -> list[str]:

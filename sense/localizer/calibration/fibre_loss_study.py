@@ -142,7 +142,7 @@ def _retrained(
         for lost, result in run_tasks(trainings):
             found[lost] = result
             if kept:
-                kept.save(_number(lost), _state(result))
+                kept.save(_number(lost), dict(vars(result)))
             progress(len(found), len(subsets))
     if kept:
         kept.clear()
@@ -162,10 +162,6 @@ def _train_without(
 def _number(lost: Lost) -> int:
     """A number that stands for a set of fibres: the sum of 2^fibre."""
     return sum(1 << fibre for fibre in lost)
-
-
-def _state(found: Found) -> State:
-    return {"places_mm": found.places_mm, "sd_mm": found.sd_mm, "r50_mm": found.r50_mm, "r90_mm": found.r90_mm}
 
 
 def _found_of(state: State, presses: int) -> Found:

@@ -10,29 +10,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 
 from sense.processing.limits import Array, Indices
-from sense.rig.arduino.framing import (
-    BITS,
-    FULL_SCALE,
-    MAX_AVERAGING,
-    MAX_CHANNELS,
-    MAX_SAMPLES,
-    Ack,
-    Block,
-    BoardSettings,
-    Decoder,
-    Frame,
-    Identity,
-    Kind,
-    Request,
-    Status,
-    encode,
-)
+from sense.rig.arduino import framing
+from sense.rig.arduino.framing import FULL_SCALE, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Status
 
 Source = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the inputs of the board or more than are asked for."""
@@ -70,14 +54,15 @@ class EmulatedBoard:
         self._source = source
         self._supply_v = supply_v
         self._skew_ppm = skew_ppm
-        self._identity = Identity(firmware, BITS, MAX_CHANNELS, "padforge-due", b"emulated board".ljust(16, b"\0"))
+        serial = b"emulated board".ljust(16, b"\0")
+        self._identity = Identity(firmware, framing.BITS, MAX_CHANNELS, "padforge-due", serial)
         self._silent = silent
         self._rng = np.random.default_rng(seed)
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.port = os.ttyname(self._slave)
-        self._decoder = Decoder()
+        self._decoder = framing.Decoder()
         self._out = bytearray()
         self._settings = BoardSettings(1_000_000, 0xFF, 1)
         self._started_s: float | None = None
@@ -92,9 +77,7 @@ class EmulatedBoard:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.unplug()
 
     def unplug(self) -> None:
@@ -157,14 +140,14 @@ class EmulatedBoard:
                 if (answer := self._answer(frame)) is not None:
                     self._queue(answer)
 
-    def _answer(self, frame: Frame) -> Identity | Ack | None:
+    def _answer(self, frame: framing.Frame) -> Identity | Ack | None:
         status = Status.OK
         if isinstance(frame, BoardSettings):
             status = Status.RUNNING if self._started_s is not None else judge_settings(frame)
             if status == Status.OK:
                 self._settings = frame
             return Ack(Kind.SETTINGS, status, self._settings)
-        if not isinstance(frame, Request):
+        if not isinstance(frame, framing.Request):
             return None
         if frame.kind == Kind.IDENTIFY:
             return self._identity
@@ -193,7 +176,7 @@ class EmulatedBoard:
                 self._queue(self._block(int(index[0]), times_s))
 
     def _block_samples(self) -> int:
-        return min(max(BLOCK_NS // self._settings.period_ns, 1), MAX_SAMPLES)
+        return min(max(BLOCK_NS // self._settings.period_ns, 1), framing.MAX_SAMPLES)
 
     def _block(self, first: int, times_s: Array) -> Block:
         mask, averaging = self._settings.mask, self._settings.averaging
@@ -204,8 +187,8 @@ class EmulatedBoard:
         self._sequence += 1
         return Block((steps * averaging).astype(np.uint16), averaging, mask, *numbers)
 
-    def _queue(self, frame: Frame) -> None:
-        data = encode(frame)
+    def _queue(self, frame: framing.Frame) -> None:
+        data = framing.encode(frame)
         self._out += self._damaged(data) if self._garble else data
 
     def _damaged(self, data: bytes) -> bytes:
@@ -224,6 +207,7 @@ class EmulatedBoard:
 def judge_settings(settings: BoardSettings) -> Status:
     """What the board says to settings."""
     mask, averaging, period_ns = settings.mask, settings.averaging, settings.period_ns
-    if not (0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= MAX_AVERAGING and 0 < period_ns <= MAX_PERIOD_NS):
+    possible = 0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
+    if not (possible and 0 < period_ns <= MAX_PERIOD_NS):
         return Status.BAD_SETTINGS
     return Status.TOO_FAST if period_ns < averaging * mask.bit_count() * MIN_NS_PER_CONVERSION else Status.OK

@@ -25,7 +25,6 @@ from sense.rig.ur5 import rtde_frames as frames
 from .ur_controller import RATES_HZ, VERSIONS, Controller, Series, SpringySurface
 from .ur_truth import TruthWriter
 
-ADDRESS = "127.0.0.1"
 PORTS = {"rtde": frames.RTDE_PORT, "script": frames.SCRIPT_PORT, "dashboard": frames.DASHBOARD_PORT}
 MAX_BACKLOG = 1 << 16
 """Bytes a client may leave unread before the stream skips frames for it."""
@@ -56,8 +55,8 @@ class Client:
 class Server:
     """The sockets of one controller."""
 
-    def __init__(self, controller: Controller, truth: TruthWriter) -> None:
-        self.controller, self.truth = controller, truth
+    def __init__(self, controller: Controller, truth: TruthWriter, host: str) -> None:
+        self.controller, self.truth, self.host = controller, truth, host
         self.clients: list[Client] = []
         self.listeners: dict[str, socket.socket] = {}
         self.frozen = self.unplugged = False
@@ -69,7 +68,7 @@ class Server:
     def listen(self) -> None:
         """Open the ports; OSError where one is taken."""
         for name, port in PORTS.items():
-            self.listeners[name] = socket.create_server((ADDRESS, port))
+            self.listeners[name] = socket.create_server((self.host, port))
 
     def refuse(self) -> None:
         """Close the ports; links that are open stay."""
@@ -254,15 +253,17 @@ def _say(what: Any) -> None:
     print(json.dumps(what), flush=True)
 
 
-def main(series: Series, pose_mm: list[float], surface_mm: float | None, stiffness_n_mm: float, truth: str) -> None:
+def main(
+    series: Series, pose_mm: list[float], surface_mm: float | None, stiffness_n_mm: float, host: str, truth: str
+) -> None:
     """Open the ports and serve; the first line on stdout is null, or why it cannot be."""
     surface = None if surface_mm is None else SpringySurface(surface_mm / 1e3, stiffness_n_mm * 1e3)
     controller = Controller(series, np.array(pose_mm) / TO_MM, surface, time.monotonic())
-    server = Server(controller, TruthWriter(Path(truth)))
+    server = Server(controller, TruthWriter(Path(truth)), host)
     try:
         server.listen()
     except OSError as error:
-        _say(f"{ADDRESS}: {error.strerror}")
+        _say(f"{host}: {error.strerror}")
         return
     _say(None)
     server.serve()

@@ -14,9 +14,7 @@ from sense.rig.ur5.driver import UR5
 from sense.settings import RigSettings
 
 from .board import EmulatedBoard
-from .ur import UrEmulator
-
-HOST = "127.0.0.1"
+from .ur import HOST, UrEmulator
 
 
 @contextmanager
@@ -33,7 +31,7 @@ def emulated(
     model = LivePad(pad, contact, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     start = frame.pose(np.zeros(2), -2 * rig.clearance_mm)
-    with UrEmulator(pose=start, surface_mm=rig.contact_mm) as robot:
+    with UrEmulator(pose=start, surface_mm=rig.contact_mm, host=HOST) as robot:
 
         def volts(times_s: Array) -> Array:
             return model.volts(*frame.tip(robot.pose_at(times_s)))

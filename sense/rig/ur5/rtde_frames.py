@@ -18,15 +18,8 @@ PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
 
 _HEADER = struct.Struct(">HB")
-_CODES = {
-    "DOUBLE": "d",
-    "VECTOR3D": "3d",
-    "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-    "INT32": "i",
-    "UINT32": "I",
-    "UINT64": "Q",
-}
+_CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}
+_CODES |= {"VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i"}
 _TYPES = (
     (r"robot_mode|safety_mode|(input|output)_int_register_\d+", "INT32"),
     (r"runtime_state|robot_status_bits|safety_status_bits|output_bit_registers\d+_to_\d+", "UINT32"),

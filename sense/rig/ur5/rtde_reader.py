@@ -11,14 +11,8 @@ from typing import Any
 from . import rtde_frames as frames
 
 VARIABLES = (
-    "timestamp",
-    "actual_TCP_pose",
-    "actual_TCP_speed",
-    "actual_TCP_force",
-    "robot_mode",
-    "runtime_state",
-    "safety_status_bits",
-    "output_int_register_2",
+    *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
+    *("robot_mode", "runtime_state", "safety_status_bits", "output_int_register_2"),
 )
 FORCE_SERIES = 5
 """First major version of PolyScope whose arms have a force sensor at the tool."""

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from design.common.figures import ALARM, CURVES, FAINT, INK, tidy
+from design.common.figures import ALARM, CURVES, FAINT, INK, head, tidy
 
 COLUMNS = 2
 """Recordings side by side whose errors are shown."""
@@ -42,13 +42,8 @@ def draw(document: Mapping[str, Any]) -> Figure:
             figure.legend(
                 *axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=5
             )
-    figure.suptitle(
-        "Drift of a fibre, and errors on presses never trained on: filled for presses at random, hollow for the last",
-        x=0.01,
-        ha="left",
-        color=INK,
-        fontsize=11,
-    )
+    told = "errors on presses never trained on: filled for presses at random, hollow for the last"
+    head(figure, f"Drift of a fibre, and {told}")
     return figure
 
 
