@@ -133,11 +133,7 @@ def score(morphology: Path, spec: Path | None) -> None:
     from .settings import Contact, RulesSettings, SearchSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
-    contact, search, rules = (
-        settings.section(Contact),
-        settings.section(SearchSettings),
-        settings.section(RulesSettings),
-    )
-    terms = score_terms(pad, contact, search.lost, search.noise, rules)
+    search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
+    terms = score_terms(pad, settings.section(Contact), search.lost, search.noise, rules)
     found = [asdict(violation) for violation in check_rules(pad, rules)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)

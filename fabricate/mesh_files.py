@@ -13,25 +13,21 @@ from numpy.typing import NDArray
 from design.common.errors import InputError
 from design.common.errors import path as as_path
 from design.common.files import require_file
+from design.pad.knots import Array
 
 if TYPE_CHECKING:
     from build123d import Solid
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 LARGEST_MM = 1e6
 """Greatest coordinate of a vertex, by amount."""
-
 MOST_BYTES = 2**27
 """Unpacked; a model of a million triangles takes half of it."""
-
 MOST_COPIES = 1000
 """Objects that are built, each counted as often as it is used."""
-
 MOST_DEPTH = 16
 """Objects within objects within objects."""
-
 _EPOCH = "2000-01-01T00:00:00"
 """The time written into STEP files, which must carry one."""
 

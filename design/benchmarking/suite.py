@@ -58,11 +58,7 @@ def run_benches(
         for bench in benches:
             if slower := _slower(before, {bench.name: documents[bench.name]}):
                 take(bench, "once more", slower.__contains__)
-    summary = {
-        "format": SUMMARY_FORMAT,
-        "summary": summary_rows(list(documents.values())),
-        "benches": documents,
-    }
+    summary = {"format": SUMMARY_FORMAT, "summary": summary_rows(list(documents.values())), "benches": documents}
     write_csv(summary["summary"], out / "bench.csv")
     write_json(out / "bench.json", summary)
     return summary, _worse(before, documents)

@@ -142,13 +142,9 @@ def _error(error: float | None) -> str:
 
 
 def _time(seconds: float) -> str:
-    return (
-        f"{1e6 * seconds:.1f} us"
-        if seconds < 1e-3
-        else f"{1e3 * seconds:.1f} ms"
-        if seconds < 1
-        else f"{seconds:.2f} s"
-    )
+    if seconds < 1e-3:
+        return f"{1e6 * seconds:.1f} us"
+    return f"{1e3 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
 def _draw(name: str, rows: Sequence[Row], error_label: str) -> Figure:

@@ -37,7 +37,6 @@ class Fault(Exception):  # noqa: N818  of things outside the program, not an err
 
 MOST_VALUES = 2**28
 """Most numbers an array may hold that a public function is given or makes: 2 GiB of them."""
-
 LONGEST_PATH = 4096
 """Most characters of a path: no system takes more."""
 

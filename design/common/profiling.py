@@ -5,8 +5,8 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.abc import MetaPathFinder
+from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
 
@@ -122,28 +122,14 @@ class _ImportClock(MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
         """The usual specification, its loader timed."""
-        if fullname not in HEAVY:
-            return None
-        spec: ModuleSpec | None = PathFinder.find_spec(fullname, path, target)
-        if spec is not None and spec.loader is not None:
-            spec.loader = _Timed(spec.loader)
+        spec = PathFinder.find_spec(fullname, path, target) if fullname in HEAVY else None
+        loader: Any = spec and spec.loader
+        if loader is not None:
+
+            def timed(module: ModuleType) -> None:
+                del loader.exec_module  # which is its class's own again
+                with stage(f"import {fullname}"):
+                    loader.exec_module(module)
+
+            loader.exec_module = timed
         return spec
-
-
-class _Timed(Loader):
-    """A loader whose work is a stage."""
-
-    def __init__(self, loader: Loader) -> None:
-        self._loader = loader
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """As the loader does."""
-        return self._loader.create_module(spec)
-
-    def exec_module(self, module: ModuleType) -> None:
-        """As the loader does, on the clock, with the loader the module would have without it."""
-        if module.__spec__ is not None:
-            module.__spec__.loader = self._loader
-        module.__loader__ = self._loader
-        with stage(f"import {module.__name__}"):
-            self._loader.exec_module(module)

@@ -13,7 +13,6 @@ from .files import read_bytes
 
 MOST_BYTES = 2**18
 """Longer settings are none that anybody wrote, and would take long to be refused."""
-
 MOST_DOTS = 200
 """In a line: keys of very many parts take the reader of TOML time that grows with their square."""
 

@@ -4,9 +4,8 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from design.pad.knots import Array
 
 DRAWS = 2  # random losses of each size a step of the search looks at
 

@@ -6,13 +6,12 @@ from numpy.typing import NDArray
 from design.pad.contact import fibre_axes, signals
 from design.pad.kernels import information as kernels
 from design.pad.kernels.pchip import population_slopes, sample_curves
+from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import Contact
 
 LEVELS = 4096
 """Levels of the published 12-bit converter."""
-
-Array = NDArray[np.float64]
 
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:

@@ -66,7 +66,7 @@ def published_terms(
     found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:
-        terms_kernel(travel, cross, places, *shape, samples, LEVELS, begin, end, found)
+        terms_kernel(travel, cross, places, shape, samples, LEVELS, begin, end, found)
 
     in_chunks(work, len(travel), grain=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]

@@ -7,22 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from design.common.errors import instance
 from design.pad.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
 from design.pad.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
+from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import RulesSettings
-
-Array = NDArray[np.float64]
 
 _TOLERANCE_MM = 1e-3
 _FOLD_TOLERANCE = 1e-4  # of the gap where that is more: all points within a gap of each other are compared
 
 _FINEST_TURN = 1e-4
 """Radians between the points at which bends are looked at, at least: matters for radii far beyond the pad's size."""
-
 _CROSSING_TOLERANCE = 1e-6
 """Grid units; places a crossing so well that, at the default pitch, the angle of two fibres of 1 mm radius that cross
 at 10 degrees is right to 0.01 degrees."""

@@ -10,12 +10,11 @@ from design.benchmarking import harness
 from design.common.computing import one_torch_thread
 from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import signals
+from design.pad.knots import Array
 from design.pad.morphology import Morphology
 
 from .levenberg_marquardt import LEARN, VALIDATE, ColumnScale, Network, first_weights
 from .localisation_error import Loss, PressSets
-
-Array = NDArray[np.float64]
 
 HIDDEN = 50
 EPOCHS = 1000

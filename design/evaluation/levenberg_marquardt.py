@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from design.common.errors import InputError
+from design.pad.knots import Array
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-Array = NDArray[np.float64]
 
 EPOCHS = 1000
 LEARN, VALIDATE = 0.7, 0.15  # shares of the samples; the rest is the test set of the published split

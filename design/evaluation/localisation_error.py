@@ -13,12 +13,12 @@ from design.common.errors import InputError, instance, shown, whole
 from design.common.settings import or_default
 from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import boustrophedon, signals
+from design.pad.knots import Array
 from design.pad.morphology import MOST_GRID, Morphology
 from design.settings import Contact
 
 from .levenberg_marquardt import Network, best_device, fit_many
 
-Array = NDArray[np.float64]
 Loss = tuple[int, ...]
 """Fibres that are lost, by index."""
 

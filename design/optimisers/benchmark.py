@@ -36,21 +36,11 @@ def trials() -> Iterator[BenchTrial]:
     The genetic search minimises the published objective; the gradient search runs without design rules, as the genetic
     one does, and with them.
     """
-    ways = [
-        (
-            "genetic",
-            generations,
-            SearchSettings(method="genetic", generations=generations),
-            RulesSettings(enforce=False),
-        )
-        for generations in GENERATIONS
-    ]
+    free = RulesSettings(enforce=False)
+    ways = [("genetic", n, SearchSettings(method="genetic", generations=n), free) for n in GENERATIONS]
     for steps in STEPS:
         descent = SearchSettings(method="descent", starts=1, steps=steps)
-        ways += [
-            ("descent", steps, descent, RulesSettings(enforce=False)),
-            ("with rules", steps, descent, RulesSettings()),
-        ]
+        ways += [("descent", steps, descent, free), ("with rules", steps, descent, RulesSettings())]
     for knots in KNOTS:
         for way, size, settings, rules in ways:
             for seed in SEEDS:
@@ -68,10 +58,5 @@ def judge_pad(found: SearchResult) -> Mapping[str, float]:
 
 
 BENCH = Bench(
-    "search",
-    trials,
-    "localisation error (grid units)",
-    ("genetic", GENERATIONS[-1]),
-    ("descent", STEPS[0]),
-    plain=(),
+    "search", trials, "localisation error (grid units)", ("genetic", GENERATIONS[-1]), ("descent", STEPS[0]), plain=()
 )

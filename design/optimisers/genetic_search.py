@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pymoo.algorithms.soo.nonconvex.ga import GA
 from pymoo.core.population import Population
 from pymoo.core.problem import Problem as PymooProblem
@@ -16,12 +15,10 @@ from pymoo.operators.sampling.rnd import FloatRandomSampling
 from design.common.checkpoints import State
 from design.criteria.published_objective import published_terms
 from design.pad.curves import refine
-from design.pad.knots import MARGIN, assemble
+from design.pad.knots import MARGIN, Array, assemble
 from design.pad.morphology import Morphology
 
 from .problem import SearchProblem
-
-Array = NDArray[np.float64]
 
 AROUND_LEVEL, AROUND_ORIGIN = 1.0, 0.3
 """Standard deviations of the first knots about a fibre's own level, and about those of a given pad; grid units."""

@@ -2,15 +2,12 @@
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from design.pad.curves import refine
-from design.pad.knots import MARGIN, assemble
+from design.pad.knots import MARGIN, Array, assemble
 from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings
-
-Array = NDArray[np.float64]
 
 KNOTS_PER_TURN = 3  # before, at and after: a turn of given radius needs its shoulders
 WIDEST_BORDER = 0.45  # of the pad's side: a wider border leaves no room, which the rule check then says

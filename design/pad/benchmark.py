@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path as Outline
 from numba import njit
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from design.benchmarking.harness import Bench, BenchTrial
@@ -16,9 +15,8 @@ from design.pad.kernels.pchip import pchip_sample
 from design.settings import Contact
 
 from .contact import quantized_and_samples, signals_and_spans, signals_sparse
+from .knots import Array
 from .morphology import Morphology
-
-Array = NDArray[np.float64]
 
 SAMPLES = (250, 500, 1000, 2000, 4000, 8000, 16000)
 KNOTS = (1, 5, 20)

@@ -6,18 +6,14 @@ angle either side of 0 and it never meets itself.
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from .curves import cubic, quadratic
-
-Array = NDArray[np.float64]
+from .knots import Array
 
 FOLD = np.pi / 2
 """Points of a fibre that lie `FOLD` gaps apart along it, half a turn of a circle one gap wide, are to keep that gap."""
-
 UNFOLDED = 2 * np.arccos(1 / FOLD)
 """Headings within this range cannot fold: a curve within an angle a of a line has chords of cos a times its length."""
-
 _TINY = 1e-30
 """Divides in place of the length of a segment whose ends coincide."""
 

@@ -6,41 +6,28 @@ A press deforms a regular polygon around its centre; a fibre signals the weighte
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common import profiling
 from design.common.computing import in_chunks
 from design.common.errors import MOST_VALUES, InputError, instance, reals, whole
 from design.common.settings import or_default
+from design.pad.kernels import press
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
-from design.pad.kernels.press import (
-    EUCLIDEAN,
-    INVERSE,
-    INVERSE_SQUARE,
-    MANHATTAN,
-    UNIFORM,
-    count_touched,
-    family_strays,
-    frames,
-)
 from design.pad.kernels.sampled_signals import quantized_signals
 from design.settings import Contact
 
-from .knots import FARTHEST, LEAST_SPAN, axes
+from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes
 from .morphology import Morphology
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Array = NDArray[np.float64]
-
 MOST_SAMPLES = 2**20
 """Most points a fibre is sampled at."""
-
-_WEIGHTS = {"uniform": UNIFORM, "inverse_square": INVERSE_SQUARE, "inverse": INVERSE}
-
-_LENGTHS = {"manhattan": MANHATTAN, "euclidean": EUCLIDEAN}
+_WEIGHTS = {"uniform": press.UNIFORM, "inverse_square": press.INVERSE_SQUARE, "inverse": press.INVERSE}
+_LENGTHS = {"manhattan": press.MANHATTAN, "euclidean": press.EUCLIDEAN}
 
 
 def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None) -> Array:
@@ -71,7 +58,7 @@ def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Cont
     fibres = travel.shape[1]
     require_room(len(travel) * len(flat) * fibres)
     out = np.zeros(len(travel) * len(flat) * fibres)
-    visited = _run_exact(travel, cross, family_strays(cross), flat, contact, _NONE, _NONE, out)
+    visited = _run_exact(travel, cross, press.family_strays(cross), flat, contact, _NONE, _NONE, out)
     return _summed(out, (*batch, *places, fibres)), visited
 
 
@@ -97,8 +84,8 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
     contact = or_default("contact", contact, Contact)
     travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
-    places, strays = as_presses(presses)[0], family_strays(cross)
-    starts = count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
+    places, strays = as_presses(presses)[0], press.family_strays(cross)
+    starts = press.count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
     require_room(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
     _run_exact(travel, cross, strays, places, contact, starts, fibre, signal)
@@ -111,20 +98,13 @@ _NONE = np.empty(0, np.int64)
 
 
 def _run_exact(
-    travel: Array,
-    cross: Array,
-    strays: Array,
-    places: Array,
-    contact: Contact,
-    starts: NDArray[np.int64],
-    fibre: NDArray[np.int64],
-    signal: Array,
+    travel: Array, cross: Array, strays: Array, places: Array, contact: Contact, starts: Ints, fibre: Ints, out: Array
 ) -> int:
     """`exact_signals` over the cores."""
     slope, shape = population_slopes(travel, cross), press_shape(contact)
 
     def work(begin: int, end: int) -> int:
-        return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, signal)
+        return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, out)
 
     visited = sum(in_chunks(work, len(travel) * len(places), grain=2000))
     if profiling.is_profiling():
@@ -135,7 +115,7 @@ def _run_exact(
 def note_reach(travel: Array, strays: Array, places: Array, reach: Array, visited: int) -> None:
     """Tell the profile how many fibres and spans were looked at, press by press."""
     pads, fibres, knots = travel.shape
-    within = sum(int(count_touched(each, places, reach, fibres // 2)[-1]) for each in strays)
+    within = sum(int(press.count_touched(each, places, reach, fibres // 2)[-1]) for each in strays)
     profiling.looked_at("fibres, press by press", within, pads * len(places) * fibres)
     profiling.looked_at("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
 
@@ -158,7 +138,7 @@ def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
 
 def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, float, int, int]:
     """A contact as the kernels take it: chains and extents in the frame of each family, radius, weight, length."""
-    chains, reach = frames(contact.radius, contact.sides)
+    chains, reach = press.frames(contact.radius, contact.sides)
     return chains, reach, contact.radius, _WEIGHTS[contact.weight], _LENGTHS[contact.length]
 
 
@@ -194,7 +174,7 @@ def quantized_and_samples(
     out = np.zeros((len(travel), len(places), travel.shape[1]))
 
     def work(begin: int, end: int) -> int:
-        return quantized_signals(travel, cross, places, *shape, samples, begin, end, out)
+        return quantized_signals(travel, cross, places, shape, samples, begin, end, out)
 
     looked_at = sum(in_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
     return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from design.common.errors import InputError, instance, real
 from design.pad.kernels.pchip import pchip_slopes
 
-from .knots import assemble
+from .knots import Array, assemble
 from .morphology import Morphology
-
-Array = NDArray[np.float64]
 
 MOST_POINTS = 10**7
 """Most points the curves of a pad are flattened to."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common.computing import in_chunks
 from design.common.errors import InputError, instance, real, reals, shown
@@ -28,10 +28,9 @@ from design.pad.kernels.indentation import CONE, FLAT, SPHERE, lengthenings
 from design.pad.kernels.pchip import population_slopes
 
 from .contact import as_presses, fibre_axes, require_room
-from .knots import FARTHEST
+from .knots import FARTHEST, Array
 from .morphology import Morphology
 
-Array = NDArray[np.float64]
 Shape = Literal["sphere", "cone", "flat"]
 
 REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
@@ -40,7 +39,6 @@ NEGLIGIBLE = 1e-7
 """Error of a piece of fibre that does not matter, of the lengthening right at the press."""
 SHALLOWEST = 1e-9
 """Depth below which a press lengthens nothing, grid units: its error could no longer be told from rounding."""
-
 _SHAPES = {"sphere": SPHERE, "cone": CONE, "flat": FLAT}
 
 

@@ -6,13 +6,12 @@ from numpy.typing import ArrayLike, NDArray
 from design.common.errors import InputError, reals
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 LEAST_SPAN = 1e-12
 """Least distance of knots along a fibre's travel axis, grid units: slopes stay numbers that can be squared."""
-
 FARTHEST = 1e6
 """Greatest coordinate of a place, by amount, in grid units or mm."""
-
 MARGIN = 1e-3
 """Least distance of a free knot to the pad's edge, grid units, as in the published optimiser."""
 

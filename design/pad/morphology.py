@@ -11,23 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, mapping, real, reals, shown, whole
 from design.common.errors import path as as_path
 from design.common.files import read_json, write_json
 
-from .knots import FARTHEST, LEAST_SPAN, MARGIN, assemble, of_parameters
+from .knots import FARTHEST, LEAST_SPAN, MARGIN, Array, assemble, of_parameters
 
 FORMAT = "padforge-morphology/1"
 
 MOST_GRID = 1024
 """Most fibres of a family of a pad that is made of tiles."""
-
 MOST_KNOTS = 2**22
 """Most knots of a pad, over all its fibres."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,10 @@ from .knots import FARTHEST, Array, assemble, axes, of_parameters
 
 PITCH_MM = 11.25
 """Pitch of the built pads."""
-
 MOST_BYTES = 2**29
 """Unpacked; the longest published recording is far below."""
-
 MOST_SAMPLES = 2**20
 """Most points a fibre is sampled at."""
-
 _PACKED, _PIECE = 15, 2**20
 """Kind of the elements of a MATLAB file that are packed, and how much of them is unpacked at a time, bytes."""
 
@@ -115,10 +112,10 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
     places, expected = reals("loc_all", content["loc_all"][:presses], FARTHEST), content["sens_raw_all"][:presses]
     samples = whole("fineness", int(settings["fineness"].item()), 2, MOST_SAMPLES)
     travel, cross = axes(knots[None])
-    shape = (*frames(contact.radius, contact.sides), contact.radius)
     misfits = []
     for weight in (UNIFORM, INVERSE_SQUARE):
         found = np.zeros((1, len(places), len(knots)))
-        quantized_signals(travel, cross, places, *shape, weight, MANHATTAN, samples, 0, len(knots), found)
+        shape = (*frames(contact.radius, contact.sides), contact.radius, weight, MANHATTAN)
+        quantized_signals(travel, cross, places, shape, samples, 0, len(knots), found)
         misfits.append(float(np.abs(found[0] - expected).max()))
     return min(misfits)

@@ -13,16 +13,12 @@ from .slices import Slab
 
 WIDEST_MM = 10.0
 """Wider openings in a wall are no leaks but the shape of a part that is no tray."""
-
 _LEAST_MM2 = 0.01
 """Smaller openings are what roundings leave."""
-
 _NEAR_MM = 1e-3
 """Areas this near each other meet, but for the grid they are cut on."""
-
 _BASIN = 0.25
 """Share of a part's outline that a tray's hollow takes up, at least: less is a funnel, or a hole."""
-
 _FLOORLESS = 0.5
 """Where less than this share of what walls surround has a floor, they are no tray's."""
 

@@ -23,10 +23,8 @@ from .thickness import floor_thickness, ridge_width, silicone_wall, wall_thickne
 
 SOUND = ("manifold", "watertight", "self_intersection", "bodies", "volume", "genus")
 """The checks a mesh must pass to be a solid at all."""
-
 _MOST_PAIRS = 1000
 """Pairs of triangles that cut through each other, after which no more are looked for."""
-
 _SHELLS = 100
 """Shells that are told apart into bodies and hollows; more are a heap of pieces, all counted as bodies."""
 

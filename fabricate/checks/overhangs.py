@@ -15,19 +15,14 @@ from .surface import Surface
 
 STEEPEST_DEG = 45.0
 """Faces that lean farther from upright than this need support."""
-
 _SPARE_DEG = 1.0
 """By how much a face may lean more and still count as what it was drawn."""
-
 _UPRIGHT_DEG = 0.1
 """Faces that lean by less are upright but for the rounding of their corners."""
-
 _SPECK_MM2 = 0.01
 """Smaller faces hold nothing back and need no support."""
-
 _OFF_FACE_MM = 5e-3
 """How far before a face it is looked whether silicone would lie there."""
-
 _HEIGHTS = 32
 """Heights at which that is looked up, at most."""
 

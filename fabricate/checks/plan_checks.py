@@ -26,10 +26,8 @@ from .thickness import least_line_mm
 
 _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""
-
 _SLENDER, _TOO_SLENDER = 5.0, 10.0
 """Ridges taller than so many times their width may break off in demoulding, or do not print upright at all."""
-
 _NAMED = 8
 """More fibres than this are counted instead of named."""
 

@@ -17,22 +17,17 @@ import shapely
 from numba import njit
 from numpy.typing import NDArray
 
+from design.pad.knots import Array
 from fabricate.mould.plan import SNAP_MM
-
-Array = NDArray[np.float64]
 
 PENETRATION_MM = 1e-3
 """Triangles that reach less far into each other only touch: a thousand times what writing an STL moves a corner."""
-
 _PLANE_ULPS = 4
 """Corners this many float32 steps off a plane lie in it: an STL can say no better."""
-
 _NEEDLE_MM = 1e-6
 """Triangles less high than this have no plane to speak of, and no area to cut through."""
-
 _PARALLEL = 1e-16
 """Edges whose squared sine is less have no cross product worth the name; other axes stand in for it."""
-
 _APART, _ACROSS, _LEVEL = 0, 1, 2
 
 

@@ -19,22 +19,16 @@ from .surface import Surface
 
 _SLABS, _MOST_SLABS = 8, 12
 """How many slices are looked at, at least and at most: moulds of up to ten levels are seen whole."""
-
 _LEVEL_MM = 1e-3
 """Faces that rise by less are level, and levels that differ by less are one."""
-
 _SLOT_MM = 2.0
 """Narrower gaps in a wall do not make what it surrounds open to the side."""
-
 _SPECK_MM2 = 0.01
 """Smaller areas are corners and the width of a line, not walls."""
-
 _LINE_MM = 0.01
 """Narrower strips are what two outlines of one curve leave between them, not walls."""
-
 _TIP = 2.0
 """What narrows to a point within so many least widths is a corner, as where strips cross at 29 degrees or more."""
-
 _PRECISION = 0.02
 """Share to which least widths are found, or `_LINE_MM` where that is more."""
 

@@ -14,7 +14,6 @@ from .findings import Place, as_places
 
 _APART_MM = 1.0
 """Places less far apart than about this are one, for whoever looks for them."""
-
 _NEEDLE_MM = 1e-3
 """Lower triangles have a normal that rounding turns: their neighbours speak for them."""
 

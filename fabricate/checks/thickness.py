@@ -20,28 +20,20 @@ from .surface import Surface, spread
 
 LEAST_FLOOR_MM = 0.4
 """Thinner floors bend when the casting is pulled out."""
-
 LEAST_SILICONE_MM = 0.1
 """Silicone thinner than this does not come out of the mould in one piece."""
-
 _WALL_LINES = 2
 """Lines side by side that make a wall hold."""
-
 _FLOOR_LAYERS = 2
 """Layers that make a floor tight."""
-
 _APART = 1.5
 """Ridges whose tops differ by this many least silicone walls leave tracks at two depths, which may come close."""
-
 _STEEPEST_WALL = math.tan(math.radians(10))
 """How much a wall leans outwards per mm of height, at most; what leans more is not known for a wall."""
-
 _RIDGE_SLOPE = math.tan(math.radians(20))
 """How much a ridge widens on either side per mm downwards, at most."""
-
 _LEVEL = math.cos(math.radians(10))
 """Least cosine of the slope of a face that a floor may have."""
-
 _NEAR_CORNER = 0.98
 """Share of the way from a triangle's middle to its corners where its thickness is measured too."""
 

@@ -25,13 +25,10 @@ if TYPE_CHECKING:
 
 WELL_MM = 3.0
 """Diameter of the wells for conductive material."""
-
 _WELL_RIM_MM = 1.0
 """Silicone around a well."""
-
 _VENT_INSET_MM = 3.0
 """How far from the cavity's rim the lid's vents lie."""
-
 LID_MM = 3.0
 """Thickness of the lid."""
 

@@ -1,6 +1,6 @@
 """How near the mould's surface comes to the exact tracks, against the time and the size of the file it takes."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,14 +12,14 @@ import shapely
 from build123d import Face, Solid, Vector, Wire
 from numpy.typing import NDArray
 from shapely import affinity
-from shapely.geometry.base import BaseGeometry
 
 from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.curves import flatten
 from design.pad.morphology import Morphology
 from fabricate.settings import DEFAULTS, MouldSettings
 
-from .assembly import mould_body
+from .assembly import mould_body, plan_mesh
+from .cad_solid import faceted_solid
 from .plan import Plan, polygon_rings
 from .prisms import Body, Prism
 
@@ -27,11 +27,9 @@ GRID, KNOTS = 4, (1, 5, 20)
 TOLERANCES_MM = (0.05, 0.01, 0.002)
 FUSED_UP_TO = 5
 """Beyond so many knots a fibre, Boolean operations of the CAD kernel take minutes."""
-
 SEED = 0
 _EXACT_MM = 1e-5
 """What exact curves are flattened to for comparison."""
-
 _CLEAR_MM = 1.0
 """Near the walls outlines belong to exits."""
 
@@ -51,28 +49,12 @@ def trials() -> Iterator[BenchTrial]:
                 yield BenchTrial(f"N={knots}", way, 1000 * tolerance, partial(work, plan), partial(judge, plan))
 
 
-def _meshed(new_plan: Callable[[], Plan]) -> Any:
-    from .assembly import plan_mesh
-
-    return plan_mesh(new_plan())
-
-
 def _mesh_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     plan = new_plan()
     outline = solid.slice(plan.settings.mould.floor_mm + plan.heights_mm[0] / 2).to_polygons()
     points = np.vstack([_with_middles(np.asarray(ring)) for ring in outline])
     faces = solid.num_tri()
     return {"error": _deviation(plan, points), "faces": faces, "file_bytes": 84 + 50 * faces}
-
-
-def _direct(new_plan: Callable[[], Plan]) -> Any:
-    from .cad_solid import faceted_solid
-
-    return faceted_solid(_meshed(new_plan))
-
-
-def _fused(new_plan: Callable[[], Plan]) -> Any:
-    return fused_solid(mould_body(new_plan()))
 
 
 def _cad_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
@@ -90,8 +72,11 @@ def _cad_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
 
 
 Way = tuple[Callable[..., Any], Callable[..., Mapping[str, float]]]
-DIRECT: dict[str, Way] = {"manifold3d": (_meshed, _mesh_row), "direct CAD": (_direct, _cad_row)}
-FUSED: dict[str, Way] = {"fused CAD": (_fused, _cad_row)}
+DIRECT: dict[str, Way] = {
+    "manifold3d": (lambda new_plan: plan_mesh(new_plan()), _mesh_row),
+    "direct CAD": (lambda new_plan: faceted_solid(plan_mesh(new_plan())), _cad_row),
+}
+FUSED: dict[str, Way] = {"fused CAD": (lambda new_plan: fused_solid(mould_body(new_plan())), _cad_row)}
 
 
 def _level_edges(solid: Any, z: float) -> Iterator[NDArray[np.float64]]:
@@ -112,7 +97,7 @@ def _deviation(plan: Plan, points: NDArray[np.float64]) -> float:
     """How far ridge outlines stray, at most, from where they belong: half a ridge's width from the nearest curve."""
     pad, width = plan.pad, plan.settings.mould.ridge_width_mm
     lines = [pad.to_mm(line) for line in flatten(pad, _EXACT_MM / pad.pitch_mm)]
-    curves = np.asarray(shapely.linestrings(np.concatenate([_segments(line) for line in lines])))
+    curves = np.asarray(shapely.linestrings(np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in lines])))
     inside = np.abs(points).max(axis=1) < plan.cavity.bounds[2] - _CLEAR_MM
     _, distance = shapely.STRtree(curves).query_nearest(
         shapely.points(points[inside]), return_distance=True, all_matches=False
@@ -120,18 +105,8 @@ def _deviation(plan: Plan, points: NDArray[np.float64]) -> float:
     return float(np.abs(distance - width / 2).max())
 
 
-def _segments(line: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n - 1, 2, 2) ends of the segments of a polyline (n, 2)."""
-    return np.stack([line[:-1], line[1:]], axis=1)
-
-
 BENCH = Bench(
-    "mould",
-    trials,
-    "deviation from the exact tracks (mm)",
-    ("fused CAD", 10),
-    ("manifold3d", 10),
-    plain=("fused CAD",),
+    "mould", trials, "deviation from the exact tracks (mm)", ("fused CAD", 10), ("manifold3d", 10), plain=("fused CAD",)
 )
 
 
@@ -152,26 +127,15 @@ def _prisms(prisms: Iterable[Prism]) -> list[Solid]:
 
 def _solids(prism: Prism) -> list[Solid]:
     """One solid for every polygon of a prism's area."""
-    polygons = polygon_rings(prism.area)
+    polygons = [[_wire(ring, prism.bottom_mm) for ring in rings] for rings in polygon_rings(prism.area)]
     if not prism.flare_mm:
         up = Vector(0, 0, prism.top_mm - prism.bottom_mm)
-        faces = [Face(*_wires(rings, prism.bottom_mm)) for rings in polygons]
-        return [Solid.extrude(face, up) for face in faces]
-    ((outer,),) = polygons
-    ((grown,),) = polygon_rings(_grown(prism.area, prism.flare_mm))
-    ends = [_wire(outer, prism.bottom_mm), _wire(grown, prism.top_mm)]
-    return [Solid.make_loft(ends, ruled=True)]
-
-
-def _grown(area: BaseGeometry, by_mm: float) -> BaseGeometry:
-    low, high = np.reshape(area.bounds, (2, 2))
-    x, y = 1 + 2 * by_mm / (high - low)
-    return affinity.scale(area, x, y, origin=tuple((low + high) / 2))
-
-
-def _wires(rings: Sequence[np.ndarray], z: float) -> tuple[Wire, list[Wire]]:
-    outer, *holes = (_wire(ring, z) for ring in rings)
-    return outer, holes
+        return [Solid.extrude(Face(outer, holes), up) for outer, *holes in polygons]
+    low, high = np.reshape(prism.area.bounds, (2, 2))
+    x, y = 1 + 2 * prism.flare_mm / (high - low)
+    grown = affinity.scale(prism.area, x, y, origin=tuple((low + high) / 2))
+    (((outer,),), ((ring,),)) = polygons, polygon_rings(grown)
+    return [Solid.make_loft([outer, _wire(ring, prism.top_mm)], ruled=True)]
 
 
 def _wire(ring: np.ndarray, z: float) -> Wire:

@@ -28,7 +28,6 @@ Ints = NDArray[np.int64]
 Loops = list[list[int]]
 """Closed rounds of vertex numbers, the face to the left of each."""
 
-
 SHORTEST_MM = 2e-7
 """Edges below this are contracted: the CAD kernel takes points within 1e-7 mm for one."""
 
@@ -41,7 +40,6 @@ def faceted_solid(solid: Manifold) -> Solid:
 
     Returns:
         A closed solid with outward normals; its vertices are those of the mesh, in double precision.
-
     """
     mesh = solid.to_mesh64()
     vertices, triangles = np.asarray(mesh.vert_properties), np.asarray(mesh.tri_verts, dtype=np.int64)
@@ -49,7 +47,8 @@ def faceted_solid(solid: Manifold) -> Solid:
     kept = _contracted(vertices, triangles)
     shell = _Shell(vertices, _together(vertices))
     for loops, normal in _faces(vertices, triangles, np.stack([source, np.asarray(mesh.face_id, np.int64)], axis=1)):
-        simple = [part for loop in loops for part in shell.parted(_without_repeats(kept[loop])) if len(part) > 2]
+        steady = [loop[loop != np.roll(loop, 1)].tolist() for loop in map(kept.__getitem__, loops)]  # without repeats
+        simple = [part for loop in steady for part in shell.parted(loop) if len(part) > 2]
         for outer, holes in _nested(simple, vertices, normal):
             shell.add(normal, [outer, *holes])
     return Solid(shell.close())
@@ -59,19 +58,19 @@ def _contracted(vertices: NDArray[np.float64], triangles: Ints) -> Ints:
     """(n,) number of the vertex that stands for each: the same one for the two ends of an edge too short for CAD."""
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     short = np.linalg.norm(vertices[start] - vertices[end], axis=1) < SHORTEST_MM
-    count = len(vertices)
-    links = coo_array((np.ones(short.sum()), (start[short], end[short])), shape=(count, count))
-    _, group = connected_components(links, directed=False)
-    _, first = np.unique(group, return_index=True)
-    return first[group]
+    return _first_linked(len(vertices), np.stack([start[short], end[short]]))
 
 
 def _together(vertices: NDArray[np.float64]) -> Ints:
     """(n,) number that stands for all vertices at one place: where the solid touches itself there are several."""
     pairs = KDTree(vertices).query_pairs(SHORTEST_MM, output_type="ndarray").reshape(-1, 2)
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=2 * (len(vertices),))
-    _, group = connected_components(links, directed=False)
-    _, first = np.unique(group, return_index=True)
+    return _first_linked(len(vertices), pairs.T)
+
+
+def _first_linked(count: int, pairs: Ints) -> Ints:
+    """(count,) number of the first of all that pairs (2, k) link with each."""
+    links = coo_array((np.ones(pairs.shape[1]), tuple(pairs)), shape=(count, count))
+    _, first, group = np.unique(connected_components(links, directed=False)[1], return_index=True, return_inverse=True)
     return first[group]
 
 
@@ -86,11 +85,6 @@ def _nested(loops: Loops, vertices: NDArray[np.float64], normal: NDArray[np.floa
     shapes = [shapely.Polygon(flat[outer]) for outer in outers]
     inside = [[hole for hole in holes if shape.covers(shapely.LinearRing(flat[hole]))] for shape in shapes]
     return list(zip(outers, inside, strict=True))
-
-
-def _without_repeats(loop: Ints) -> list[int]:
-    """A loop without vertices that equal the one before."""
-    return loop[loop != np.roll(loop, 1)].tolist()
 
 
 def _faces(vertices: NDArray[np.float64], triangles: Ints, plane: Ints) -> list[tuple[Loops, NDArray[np.float64]]]:

@@ -11,7 +11,6 @@ _CORNERS = {"a": "TLTR", "b": "TRMR", "c": "MRBR", "d": "BLBR", "e": "MLBL", "f"
 _HEIGHT, _SIDE = {"T": 1.0, "M": 0.5, "B": 0.0}, {"L": 0.0, "R": 0.5}
 _STROKES = ("abcdef", "bc", "abged", "abgcd", "fgbc", "afgcd", "afgedc", "abc", "abcdefg", "abcdfg")
 """The strokes of the digits 0 to 9, of seven."""
-
 _SEARCH_MM = 0.5
 """Spacing of the places that are tried for a number."""
 

@@ -14,13 +14,10 @@ from .prisms import Body, Prism, cylinder
 
 INTO_FLOOR_MM = 0.2
 """How far parts sink into what they stand on before they are joined to it: no two faces coincide."""
-
 VENT_MM = 1.5
 """Diameter of a vent of the lid."""
-
 BORE_MM, FUNNEL_MM, FUNNEL_DEG, _FUNNEL_WALL_MM = 6.0, 6.0, 30.0, 2.0
 """Spout: its bore, the height, lean from upright and wall of its funnel."""
-
 PIN_CLEARANCE_MM = 0.3
 """By how much wider the lid's holes are than the pins."""
 

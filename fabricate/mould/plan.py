@@ -22,18 +22,14 @@ from .numerals import number_strokes, with_room
 
 INTO_WALL_MM = 0.5
 """How far ridges run into the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
-
 COVER_MM = 1.0
 """Least silicone over the deepest track; a pad of many levels is made thicker for it."""
-
 SNAP_MM = 1e-4
 """Grid that areas are snapped to where they are cut and joined, mm.
 
 No edge of the solid is shorter; and without a grid, outlines that almost coincide can defeat the cut."""
-
 _BESIDE = 5
 """Further from a fibre's start than so many times its height a number is no longer seen to belong to it."""
-
 _CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
 """How the tolerance is shared: most thins out the outline, which sets the size of every file."""
 

@@ -15,13 +15,10 @@ from .fibre_layers import fibre_name, layers
 SILICONE = "EcoFlex 00-20"
 DENSITY_G_PER_ML = 1.07
 """Specific gravity of EcoFlex 00-20, as its maker states it."""
-
 SURPLUS_PERCENT = 10
 """What sticks to the cup and the stick."""
-
 PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
 """What a filament and a resin printer commonly print, and its density, g/ml."""
-
 _LONGEST_TABLE = 24
 """More crossings than this leave no room for them on a page."""
 

@@ -18,16 +18,12 @@ from .fibre_layers import COLOURS, FAMILIES
 
 MOST_BYTES = 3_000_000
 """A packed mesh takes no more: base64 makes 4 MB of it, half of what a page may have."""
-
 _STEPS = np.iinfo(np.uint16).max
 """Places along a side of the box around a mesh."""
-
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)
 """How far a mesh that is too large may be off, one after the other; the last is half of a common nozzle."""
-
 _MOST_LEVELS = 64
 """So many heights get a colour: graphics chips have room for few numbers that all pixels share."""
-
 _VIEW = """\
 <figure class="view" id="mould-view" hidden>
 <canvas tabindex="0" role="application" aria-label="{label}"></canvas>

@@ -26,27 +26,20 @@ if TYPE_CHECKING:
 
 CARE = "#7b3fa0"
 """Colour of what a check warns of: unlike both families, and unlike what fails."""
-
 _NUMBER, _EDGE, _GREY = "#8a867d", "#a7a49c", "#77746c"
 """Greys of the numbers on the floor, of outlines, and of what stands beside a picture."""
-
 _RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
 """Colours of a mesh from its lowest visible height to its highest."""
-
 _DPI = 100
 
 _PIXELS = 900
 """Longer side of what is shown: 14 pixels a mm for the published pad, about six for a ridge."""
-
 _NARROWEST = 600
 """Least width in pixels: room for a title and a legend."""
-
 _LEFT, _RIGHT, _TOP, _BOTTOM = 66, 24, 44, 62
 """Pixels around it for title, ticks and axis labels; the rows of the legend come below."""
-
 _ROW, _COLUMNS = 21, 3
 """Height of a row of the legend in pixels, and entries in one."""
-
 _FAIL_MARKS, _CARE_MARKS = "osp8H", "D^v<>"
 """A mark of its own for every check, as long as they last."""
 
@@ -139,7 +132,8 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
         line = substring(plan.lines[fibre], INTO_WALL_MM, plan.lines[fibre].length - INTO_WALL_MM)
         edged = [withStroke(linewidth=width + 2, foreground=PAPER)]
         style = {"linewidth": width, "color": layer.colour, "zorder": 2, "path_effects": edged}
-        drawn += sheet.axes.plot(*np.array(line.coords).T, label=_depth(layer), solid_capstyle="butt", **style)
+        label = f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
+        drawn += sheet.axes.plot(*np.array(line.coords).T, label=label, solid_capstyle="butt", **style)
         (x, y), *_ = line.coords
         away, place = ((0, -5), ("center", "top")) if layer.family else ((-5, 0), ("right", "center"))
         sheet.axes.annotate(
@@ -147,10 +141,6 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
             color=COLOURS[layer.family], fontsize=size, fontweight="bold",
         )  # fmt: skip
     return drawn[:1]
-
-
-def _depth(layer: Layer) -> str:
-    return f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
 
 
 def _marked(findings: Sequence[Finding]) -> list[Finding]:

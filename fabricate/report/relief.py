@@ -9,24 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from design.pad.knots import Array
 from fabricate.mould.assembly import mould_body
 from fabricate.mould.plan import Plan, polygon_rings
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 FLOOR, WALL, NUMBER, RIDGE = 0, 1, 2, 3
 """What a pixel of a mould shows; `RIDGE` + level for the ridges of a level."""
-
 _AT_ONCE = 2_000_000
 """Pixels of triangles worked on together: bounds memory at about 200 MB, however large the mesh."""
-
 _EDGE = 1e-6
 """Pixels by which a triangle reaches over its edges: no pixel between two neighbours is lost to rounding."""
-
 _SMALLEST_MM = 1e-6
 """What is smaller is drawn as a dot of this size."""
-
 _STEPS = 8
 """Steps of shade on either side: enough for the eye, and small files."""
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from design.pad.curves import beziers
+from design.pad.knots import Array
 from fabricate.mould.plan import Plan, polygon_rings
 
 from .fibre_layers import COLOURS, FAMILIES, fibre_name, layers
@@ -27,22 +27,17 @@ if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts import Modelspace
 
-Array = NDArray[np.float64]
 Point = tuple[float, float]
 
 SCALE_MM = 10.0
 """Length of the scale bar: whoever prints a drawing measures it."""
-
 _TEXT_MM = 2.5
 """Height of writing, as drawing standards have it; less where the pitch is narrow."""
-
 _ASIDE_MM = 1.0
 """Between the silicone and the writing beside it."""
-
 _NOTE = "as it lies in the tray, seen from above"
 _NOTE_MM = 70.0
 """Room for the scale bar and its two texts."""
-
 _DESCRIPTION = (
     "True size, 1 unit = 1 mm. Seen from above as the pad lies in the tray, tracks down: the mould's ridges lie as"
     " drawn. The numbers beside the starts read as drawn. Turned over for laying, the pad is the mirror image of this"

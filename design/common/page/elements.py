@@ -22,21 +22,16 @@ from design.common.errors import InputError
 from design.common.files import read_bytes
 
 _HERE = "design.common.page"
-
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
 _MOST_PICTURE = 2**25
 """Bytes of a picture at most: a page holds it as it is."""
-
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")
 """What stands flush right in a table."""
-
 _SHORT = 16
 """Columns of cells with no more letters are not wrapped."""
-
 _LONG = 30
 """Words of more letters are broken."""
-
 _VERDICTS = ("pass", "warn", "fail")
 """Cells of these words are coloured."""
 
@@ -162,27 +157,21 @@ def html_pieces(text: str) -> Iterator[str]:
 
 
 def _picture(path: Path, caption: str) -> dict[str, Any]:
+    from PIL import Image
+
     content = read_bytes(path, _MOST_PICTURE)
     try:
-        size = _png_size(path) if path.suffix == ".png" else _svg_size(content)
+        size = None  # an SVG says its own; but it must be one
+        if path.suffix == ".png":
+            with Image.open(path, formats=["PNG"]) as picture:
+                size = picture.size
+                picture.verify()
+        else:
+            ElementTree.fromstring(content)
     except Exception as error:  # readers of broken pictures raise whatever comes
         raise InputError(f"{path}: not a picture that can be read ({error})") from error
     source = f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode()}"
     return {"caption": caption, "size": size, "source": source}
-
-
-def _png_size(path: Path) -> tuple[int, int]:
-    from PIL import Image
-
-    with Image.open(path, formats=["PNG"]) as picture:
-        size = picture.size
-        picture.verify()
-    return size
-
-
-def _svg_size(content: bytes) -> None:
-    """None: an SVG says its own; but it must be one."""
-    ElementTree.fromstring(content)
 
 
 def _text(value: object) -> str:

@@ -15,12 +15,11 @@ import numpy as np
 from numba import njit
 
 from .exact_signals import local_cubic, make_scratch, stretches_inside
-from .press import EPS, INVERSE, MANHATTAN, UNIFORM, touched_range, weigh
+from .press import EPS, INVERSE, MANHATTAN, UNIFORM, in_frame, touched_range, weigh
 from .quadrature import HALVINGS, across, kronrod, precise
 
 GRAZING = 0.02
 """Least sine of the angle of a fibre to the boundary: flatter ones change their length there without bound."""
-
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
@@ -68,22 +67,9 @@ def _weight_rate(square: float, radius: float, weight: int) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _end(
-    span: Any,
-    s: float,
-    s0: float,
-    sign: float,
-    d0: float,
-    d1: float,
-    chains: Any,
-    radius: float,
-    weight: int,
-    length: int,
-    place: Any,
-    rate: Any,
-    out: Any,
-) -> None:
+def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, work: Any, out: Any) -> None:
     """Add to out (6,) what the end at s of a stretch contributes; sign is 1 for its last end and -1 for its first."""
+    (chains, _, radius, weight, length), (span, place, rate) = shape, work
     t, v = span[0] + span[1] * s, across(span, s)
     along_t, along_v = span[1], span[3] + s * (2 * span[4] + 3 * s * span[5])
     nt, nv = _normal(t, v, chains, radius)
@@ -99,22 +85,9 @@ def _end(
 
 
 @njit(cache=True, error_model="numpy")
-def _inner(
-    span: Any,
-    a: float,
-    b: float,
-    s0: float,
-    d0: float,
-    d1: float,
-    radius: float,
-    weight: int,
-    length: int,
-    place: Any,
-    rate: Any,
-    stack: Any,
-    out: Any,
-) -> None:
+def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any) -> None:
     """Add to out (6,) the integral over [a, b]: a closed form, or quadrature on the pieces that suit the signal."""
+    (_, _, radius, weight, length), (span, place, rate) = shape, work
     if weight == UNIFORM and length == MANHATTAN:
         rising = 1.0 if across(span, b) >= across(span, a) else -1.0
         for sign, s in ((1.0, b), (-1.0, a)):
@@ -151,31 +124,23 @@ def _inner(
 
 @njit(cache=True, error_model="numpy")
 def _span(
-    t: Any,
-    v: Any,
-    d: Any,
-    j: int,
-    ct: float,
-    cv: float,
-    chains: Any,
-    radius: float,
-    tolerance: float,
-    weight: int,
-    length: int,
-    scratch: Any,
-    work: Any,
-    change: Any,
+    t: Any, v: Any, d: Any, j: int, ct: float, cv: float, shape: Any, scratch: Any, work: Any, change: Any
 ) -> None:
-    """Set change (6,) to the derivatives of what span j of a fibre signals for a press at (ct, cv)."""
-    span, place, rate = work
+    """Set change (6,) to the derivatives of what span j of a fibre signals for a press at (ct, cv).
+
+    Args:
+        shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `_variations`, all overwritten.
+    """
+    span, chains, radius = work[0], shape[0], shape[2]
+    tolerance = 4 * EPS * (abs(cv) + radius)
     s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
     for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
         a, b = scratch[4][i]
-        _inner(span, a, b, s0, d[j], d[j + 1], radius, weight, length, place, rate, scratch[3], change)
+        _inner(a, b, s0, d[j], d[j + 1], shape, work, scratch[3], change)
         for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
             if not is_knot:
-                _end(span, s, s0, sign, d[j], d[j + 1], chains, radius, weight, length, place, rate, change)
+                _end(s, s0, sign, d[j], d[j + 1], shape, work, change)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -206,7 +171,7 @@ def signals_gradient(
     for q in range(len(presses)):
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = chains[0] if family == 0 else chains[1]
+            shape = in_frame((chains, reach, radius, weight, length), family)
             tolerance = 4 * EPS * (abs(cv) + radius)
             low, high = cv + reach[family, 2] - tolerance, cv + reach[family, 3] + tolerance
             first, last = touched_range(cv, reach[family], strays[family], grid)
@@ -215,7 +180,7 @@ def signals_gradient(
                 j = max(np.searchsorted(t, ct + reach[family, 0], side="right") - 1, 0)
                 while j < n - 1 and t[j] < ct + reach[family, 1]:
                     if min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:
-                        _span(t, v, d, j, ct, cv, shape, radius, tolerance, weight, length, scratch, work, change)
+                        _span(t, v, d, j, ct, cv, shape, scratch, work, change)
                         for x in range(6):
                             out[x // 2, f, j + x % 2] += upstream[q, f] * change[x]
                     j += 1

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .press import EPS, INVERSE, touched_range
+from .press import EPS, INVERSE, in_frame, touched_range
 from .quadrature import HALVINGS, across, length_element
 from .roots import SCRATCH, roots_in_unit
 
@@ -189,25 +189,15 @@ def local_cubic(
 
 @njit(cache=True, error_model="numpy")
 def fibre_signal(
-    t: Any,
-    v: Any,
-    d: Any,
-    ct: float,
-    cv: float,
-    chains: Any,
-    reach: Any,
-    radius: float,
-    weight: int,
-    length: int,
-    span: Any,
-    scratch: Any,
+    t: Any, v: Any, d: Any, ct: float, cv: float, shape: Any, span: Any, scratch: Any
 ) -> tuple[float, int]:
     """Signal of one fibre for the press at (ct, cv), and how many spans were looked at.
 
     Args:
-        t, v, d: (n,) knots and slopes.
-        reach: (5,) of the shape: least and greatest t, least and greatest v, radius of the circle inside.
+        t, v, d: (n,) knots and slopes. shape: of `in_frame`; its extents (5,) are least and greatest t, least and
+            greatest v, radius of the circle inside.
     """
+    chains, reach, radius, weight, length = shape
     n = len(t)
     begin, end = ct + reach[0], ct + reach[1]
     if end <= t[0] or begin >= t[n - 1]:
@@ -270,23 +260,11 @@ def exact_signals(
         slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = chains[0] if family == 0 else chains[1]
+            shape = in_frame((chains, reach, radius, weight, length), family)
             first, last = touched_range(cv, reach[family], strays[p, family], grid)
             for f in range(family * grid + first, family * grid + last):
-                value, spans = fibre_signal(
-                    travel[p, f],
-                    cross[p, f],
-                    slope[p, f],
-                    ct,
-                    cv,
-                    shape,
-                    reach[family],
-                    radius,
-                    weight,
-                    length,
-                    span,
-                    scratch,
-                )
+                t, v, d = travel[p, f], cross[p, f], slope[p, f]
+                value, spans = fibre_signal(t, v, d, ct, cv, shape, span, scratch)
                 visited += spans
                 if len(starts):
                     fibre[slot], signal[slot] = f, value

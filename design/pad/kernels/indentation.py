@@ -96,10 +96,7 @@ def _integral(
         s0, s1 = (
             (start + width * low * low, start + width * high * high)
             if bent
-            else (
-                start + width * low,
-                start + width * high,
-            )
+            else (start + width * low, start + width * high)
         )
         taken = top >= HALVINGS or not _is_long(span, s0, s1, bent and low == 0, a, shape)
         if taken:

@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 
 from .pchip import pchip_sample
+from .press import in_frame
 from .roots import SCRATCH, roots_in_unit
 from .sampled_signals import fibre_quantized
 
@@ -73,19 +74,7 @@ def disorder(curves: Any) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def published_terms(
-    travel: Any,
-    cross: Any,
-    presses: Any,
-    chains: tuple[Any, Any],
-    reach: Any,
-    radius: float,
-    weight: int,
-    length: int,
-    samples: int,
-    levels: int,
-    begin: int,
-    end: int,
-    out: Any,
+    travel: Any, cross: Any, presses: Any, shape: Any, samples: int, levels: int, begin: int, end: int, out: Any
 ) -> None:
     """Entropy (sum of the families' joint entropies), sharpness and disorder of pads begin..end into out (P, 3)."""
     fibres = travel.shape[1]
@@ -96,23 +85,9 @@ def published_terms(
     scaled = np.empty((len(presses), fibres))
     for p in range(begin, end):
         for f in range(fibres):
-            family = f // grid
-            shape = chains[0] if family == 0 else chains[1]
-            pchip_sample(travel[p, f], cross[p, f], step, curves[f])
-            fibre_quantized(
-                travel[p, f],
-                cross[p, f],
-                curves[f],
-                step,
-                presses,
-                family,
-                shape,
-                reach[family],
-                radius,
-                weight,
-                length,
-                signals[:, f],
-            )
+            t, v, own = travel[p, f], cross[p, f], in_frame(shape, f // grid)
+            pchip_sample(t, v, step, curves[f])
+            fibre_quantized(t, v, curves[f], step, presses, f // grid, own, signals[:, f])
         to_levels(signals, levels, scaled)
         out[p, 0] = row_entropy(scaled, 0, grid) + row_entropy(scaled, grid, fibres)
         out[p, 1] = second_differences(scaled)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 EPS = 2.0**-52
-
 UNIFORM, INVERSE_SQUARE, INVERSE = 0, 1, 2
 MANHATTAN, EUCLIDEAN = 0, 1
 
@@ -53,6 +52,13 @@ def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array
         chains.append(radius * np.stack([t, upper, lower]))
         reach.append([t[0], t[-1], lower.min(), upper.max(), apothem])
     return (chains[0], chains[1]), radius * np.array(reach)
+
+
+@njit(cache=True, error_model="numpy")
+def in_frame(shape: Any, family: int) -> Any:
+    """A shape (chains and extents in both frames, radius, weight, length) in the frame of one family."""
+    chains, reach, radius, weight, length = shape
+    return (chains[0] if family == 0 else chains[1]), reach[family], radius, weight, length
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from .pchip import pchip_sample
-from .press import MANHATTAN, UNIFORM, weigh
+from .press import MANHATTAN, UNIFORM, in_frame, weigh
 
 
 @njit(cache=True, error_model="numpy")
@@ -78,21 +78,10 @@ def _uniform_sum(
 
 
 @njit(cache=True, error_model="numpy")
-def _stretch_sum(
-    curve: Any,
-    runs: Any,
-    low: int,
-    high: int,
-    step: float,
-    ct: float,
-    cv: float,
-    chains: Any,
-    radius: float,
-    apothem: float,
-    weight: int,
-) -> float:
+def _stretch_sum(curve: Any, runs: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any) -> float:
     """Sum over the samples [low, high) that start inside the press at (ct, cv)."""
-    outer, inner = radius * radius, apothem * apothem
+    chains, reach, radius, weight, _ = shape
+    outer, inner = radius * radius, reach[4] * reach[4]
     if weight == UNIFORM:
         return _uniform_sum(curve, runs, low, high, step, ct, cv, chains, outer, inner)
     total = 0.0
@@ -105,29 +94,17 @@ def _stretch_sum(
 
 
 @njit(cache=True, error_model="numpy")
-def fibre_quantized(
-    t: Any,
-    v: Any,
-    curve: Any,
-    step: float,
-    presses: Any,
-    family: int,
-    shape: Any,
-    reach: Any,
-    radius: float,
-    weight: int,
-    length: int,
-    out: Any,
-) -> int:
+def fibre_quantized(t: Any, v: Any, curve: Any, step: float, presses: Any, family: int, shape: Any, out: Any) -> int:
     """Signals of one sampled fibre for presses (Q, 2) into out (Q,); returns how many samples were looked at.
 
     Between knots a fibre is monotone, so the samples a press can touch are index ranges: by its extent along the
     travel axis, then by bisection across it.
 
     Args:
-        t, v: (n,) knots. curve: samples of the fibre at 0, step, ... shape: its chains, see `press`.
-        reach: (5,) of the shape: least and greatest t, least and greatest v, radius of the circle inside.
+        t, v: (n,) knots. curve: samples of the fibre at 0, step, ... shape: of `in_frame`; its extents (5,) are least
+            and greatest t, least and greatest v, radius of the circle inside.
     """
+    reach, length = shape[1], shape[4]
     n, segments = len(t), len(curve) - 1
     runs = np.empty(segments)
     here, ahead = curve[:-1], curve[1:]
@@ -158,7 +135,7 @@ def fibre_quantized(
                     a, b = _first_at_least(curve, a, b, high, False), _first_at_least(curve, a, b, low, False)
                 # one more on either side: bisection is by sampled values, which rounding may put out of order
                 a, b = max(a - 1, first, starts[j]), min(b + 1, last, starts[j + 1])
-                out[q] += _stretch_sum(curve, runs, a, b, step, ct, cv, shape, radius, reach[4], weight)
+                out[q] += _stretch_sum(curve, runs, a, b, step, ct, cv, shape)
                 looked_at += b - a
             j += 1
     return looked_at
@@ -166,23 +143,12 @@ def fibre_quantized(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def quantized_signals(
-    travel: Any,
-    cross: Any,
-    presses: Any,
-    chains: tuple[Any, Any],
-    reach: Any,
-    radius: float,
-    weight: int,
-    length: int,
-    samples: int,
-    begin: int,
-    end: int,
-    out: Any,
+    travel: Any, cross: Any, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
 ) -> int:
     """The published rule: sum over sampled segments that start inside the press.
 
     Args:
-        travel, cross: (P, 2M, n) knots. presses: (Q, 2) x and y. chains, reach: the shape, see `press`.
+        travel, cross: (P, 2M, n) knots. presses: (Q, 2) x and y. shape: as `in_frame` takes it.
         samples: points per fibre, uniform along its travel axis.
         begin, end: range of fibres to do, counted through the population, 0..2M P.
         out: (P, Q, 2M) to fill.
@@ -197,10 +163,7 @@ def quantized_signals(
     for index in range(begin, end):
         p, f = index // fibres, index % fibres
         family = 0 if f < fibres // 2 else 1
-        shape = chains[0] if family == 0 else chains[1]
         t, v = travel[p, f], cross[p, f]
         pchip_sample(t, v, step, curve)
-        looked_at += fibre_quantized(
-            t, v, curve, step, presses, family, shape, reach[family], radius, weight, length, out[p, :, f]
-        )
+        looked_at += fibre_quantized(t, v, curve, step, presses, family, in_frame(shape, family), out[p, :, f])
     return looked_at
