@@ -8,6 +8,7 @@ from .criteria.score import score as score
 from .evaluation.localisation_error import LossError as LossError
 from .evaluation.localisation_error import localisation_error as localisation_error
 from .optimisers.search import SearchResult as SearchResult
+from .optimisers.search import SearchRun as SearchRun
 from .optimisers.search import search as search
 from .pad.contact import signals as signals
 from .pad.contact import signals_quantized as signals_quantized
