@@ -1,40 +1,60 @@
-"""The emulated arm's ports are fixed, so only one test process at a time may have them."""
+"""The emulated arm's ports are fixed, so every test process takes an address of this machine of its own."""
 
 import fcntl
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 
 from sense.rig.emulators.ur import UrEmulator
 from sense.rig.emulators.ur_controller import Series
 from sense.rig.ur5.driver import UR5
-from tests.sense.rig.ur5.arms import HOST, Robots
+from tests.sense.rig.ur5.arms import Robots
 
 WAIT_S = 180.0
+ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]
+"""Of this machine: on Linux all that begin with 127, elsewhere the first alone."""
+
+
+def taken(address: str) -> IO[str] | None:
+    """The lock on an address; None where another process has it."""
+    lock = (Path(tempfile.gettempdir()) / f"padforge-ur-{address}.lock").open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return None
+    return lock
 
 
 @pytest.fixture(scope="module")
-def ports() -> Iterator[None]:
-    """Held by one module of one test process at a time."""
-    with (Path(tempfile.gettempdir()) / "padforge-ur-ports.lock").open("w") as lock:
-        end = time.monotonic() + WAIT_S
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > end:
-                    pytest.fail(f"another process has had the emulator's ports for {WAIT_S} s")
-                time.sleep(0.1)
-        yield
+def address() -> Iterator[str]:
+    """An address whose ports are held by one module of one test process at a time."""
+    end = time.monotonic() + WAIT_S
+    while True:
+        for address in ADDRESSES:
+            if lock := taken(address):
+                with lock:
+                    yield address
+                return
+        if time.monotonic() > end:
+            pytest.fail(f"other processes have had the emulator's ports for {WAIT_S} s")
+        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")
-def robots(ports: None) -> Iterator[Robots]:
-    robots = Robots()
+def host(address: str) -> str:
+    """The address by a name for which ur-rtde asks whether the arm is in remote control."""
+    return address.replace("127.0.0.", "127.")
+
+
+@pytest.fixture(scope="module")
+def robots(address: str) -> Iterator[Robots]:
+    robots = Robots(address)
     yield robots
     robots.free()
 
@@ -50,8 +70,8 @@ def robot(robots: Robots, series: Series) -> UrEmulator:
 
 
 @pytest.fixture
-def arm(robot: UrEmulator) -> Iterator[UR5]:
-    arm = UR5(HOST)
+def arm(robot: UrEmulator, host: str) -> Iterator[UR5]:
+    arm = UR5(host)
     arm.connect()
     yield arm
     arm.close()

@@ -3,6 +3,7 @@
 import collections
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 import time
@@ -60,14 +61,13 @@ def test_the_truth_keeps_the_newest_rows(tmp_path: Path, monkeypatch: pytest.Mon
         truth.pose_at(36.0)
 
 
-@pytest.mark.usefixtures("ports")
 class TestSockets:
     """What clients of the running emulator see."""
 
     @pytest.mark.parametrize(("series", "rate_hz"), [("cb3", 125), ("e", 500)])
-    def test_a_reader_gets_every_state(self, series: Series, rate_hz: int) -> None:
-        with UrEmulator(series) as robot:
-            reader = RtdeReader("127.0.0.1", 1.0)
+    def test_a_reader_gets_every_state(self, address: str, series: Series, rate_hz: int) -> None:
+        with UrEmulator(series, host=address) as robot:
+            reader = RtdeReader(address, 1.0)
             states = [reader.read(1.0) for _ in range(rate_hz)]
             reader.close()
             assert reader.rate_hz == rate_hz
@@ -78,14 +78,15 @@ class TestSockets:
             np.testing.assert_allclose(robot.pose_at(times[-1])[0], HOME)
             np.testing.assert_allclose(states[-1].pose, START, atol=1e-12)
 
-    def test_one_at_a_time_and_the_ports_are_free_again(self) -> None:
-        with UrEmulator(), pytest.raises(RigFault, match=r"127\.0\.0\.1: Address already in use") as caught:
-            UrEmulator().__enter__()
+    def test_one_at_a_time_and_the_ports_are_free_again(self, address: str) -> None:
+        taken = re.escape(f"{address}: Address already in use")
+        with UrEmulator(host=address), pytest.raises(RigFault, match=taken) as caught:
+            UrEmulator(host=address).__enter__()
         assert "\n" not in str(caught.value)
-        with UrEmulator("e") as robot:
+        with UrEmulator("e", host=address) as robot:
             robot.remote_control(False)
             asked = ["PolyscopeVersion", "is in remote control", "get serial number", "running", "nonsense"]
-            answers = ur_frames.ask_dashboard("127.0.0.1", asked, 1.0)
+            answers = ur_frames.ask_dashboard(address, asked, 1.0)
             assert answers[0].startswith("URSoftware 5.12.2.")
             assert answers[1:4] == ["false", "20185500000", "Program running: false"]
             assert answers[4].startswith("could not understand")
@@ -93,10 +94,11 @@ class TestSockets:
 
     @needs_ur_rtde
     @pytest.mark.parametrize("series", ["cb3", "e"])
-    def test_ur_rtde_itself(self, series: Series) -> None:
+    def test_ur_rtde_itself(self, address: str, host: str, series: Series) -> None:
         program = """
-import json, time, rtde_control, rtde_receive
-control, receive = rtde_control.RTDEControlInterface("127.1"), rtde_receive.RTDEReceiveInterface("127.1")
+import json, sys, time, rtde_control, rtde_receive
+host = sys.argv[1]
+control, receive = rtde_control.RTDEControlInterface(host), rtde_receive.RTDEReceiveInterface(host)
 time.sleep(0.05)
 start = receive.getActualTCPPose()
 arrived = control.moveL([*start[:2], 0.19, *start[3:]], 0.2, 2.0)
@@ -112,9 +114,9 @@ print(json.dumps([start, arrived, below, speed, refused]), flush=True)
 import os
 os._exit(0)
 """
-        with UrEmulator(series):
+        with UrEmulator(series, host=address):
             done = subprocess.run(
-                [sys.executable, "-c", program], capture_output=True, text=True, timeout=20, check=True
+                [sys.executable, "-c", program, host], capture_output=True, text=True, timeout=20, check=True
             )
         start, arrived, below, speed, refused = json.loads(done.stdout)
         np.testing.assert_allclose(start, START, atol=1e-9)
@@ -123,14 +125,14 @@ os._exit(0)
         assert 0.09 < speed[2] < 0.101
         assert not refused
 
-    def test_a_restart_takes_its_time(self) -> None:
-        with UrEmulator() as robot:
-            reader = RtdeReader("127.0.0.1", 1.0)
+    def test_a_restart_takes_its_time(self, address: str) -> None:
+        with UrEmulator(host=address) as robot:
+            reader = RtdeReader(address, 1.0)
             robot.restart(0.3)
             with pytest.raises(ConnectionError):
                 collections.deque(iter(lambda: reader.read(1.0), None))
             with pytest.raises(ConnectionRefusedError):
-                RtdeReader("127.0.0.1", 1.0)
+                RtdeReader(address, 1.0)
             time.sleep(0.4)
-            RtdeReader("127.0.0.1", 1.0).close()
+            RtdeReader(address, 1.0).close()
             reader.close()

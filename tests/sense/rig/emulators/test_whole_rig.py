@@ -6,7 +6,7 @@ import random
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
 from sense.rig.devices import RigFault
+from sense.rig.emulators import whole_rig
 from sense.rig.emulators.whole_rig import emulated, emulated_rig
 from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.pad_frame import Frame
@@ -25,7 +26,7 @@ from sense.settings import RigSettings
 from tests.stress.clock import few
 
 pytest.importorskip("rtde_control")
-pytestmark = pytest.mark.usefixtures("ports")
+pytestmark = pytest.mark.usefixtures("own_address")
 
 PAD = Morphology.straight(2)
 QUICK = {
@@ -35,6 +36,21 @@ QUICK = {
 RIG = emulated_rig(RigSettings.model_validate({"rate_hz": 125, "presses": 6, **QUICK}), PAD)
 PLAN = planned(PAD, RIG, np.random.default_rng(0))
 SHORT = PressPlan(PLAN.places_mm[:3], PLAN.depths_mm[:3])
+PROGRAM = """
+import sys
+from sense.rig.emulators import whole_rig
+whole_rig.HOST = sys.argv.pop(1)
+import padforge
+padforge.main()
+"""
+
+
+@pytest.fixture(scope="module")
+def own_address(address: str) -> Iterator[None]:
+    """Rigs are emulated at the address of this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_rig, "HOST", address)
+        yield
 
 
 def record(
@@ -132,14 +148,14 @@ def test_damaged_bytes_cost_samples_but_never_give_wrong_ones(tmp_path):
     assert np.abs(recording.readings - rest).max() < 0.6
 
 
-def test_a_killed_recorder_resumes_to_the_whole_plan(tmp_path):
+def test_a_killed_recorder_resumes_to_the_whole_plan(tmp_path, address):
     """Killed while a press is under way: once a day, three times under stress."""
     settings = "[pad]\ngrid = 2\n[rig]\nrate_hz = 125.0\n" + "".join(
         f"{key} = {value}\n" for key, value in QUICK.items()
     )
     (tmp_path / "pad.toml").write_text(settings, encoding="utf-8")
     root = Path(__file__).parents[4]
-    command = [sys.executable, str(root / "padforge.py"), *["sense", "record", "--through-drivers", "--presses", "8"]]
+    command = [sys.executable, "-c", PROGRAM, address, "sense", "record", "--through-drivers", "--presses", "8"]
     command += ["--out", "run", "--resume"]
     environment = os.environ | {"PYTHONPATH": str(root)}
     journal = tmp_path / "run" / "journal.ndjson"

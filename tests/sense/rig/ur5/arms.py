@@ -14,8 +14,6 @@ from sense.rig.emulators.ur_controller import Series
 from sense.rig.safety import Limits, wait_until_still
 from sense.rig.ur5.driver import UR5
 
-HOST = "127.1"
-"""127.0.0.1 by a name for which ur-rtde asks whether the arm is in remote control."""
 LIMITS = Limits(box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, deadline_s=10)
 LOW: Pose = (*HOME[:2], 40.0, *HOME[3:])
 REST_S = 0.5
@@ -27,13 +25,13 @@ T = TypeVar("T")
 class Robots:
     """One emulator at a time, kept while the next test wants the same."""
 
-    def __init__(self) -> None:
-        self.series, self.robot = "", None
+    def __init__(self, host: str) -> None:
+        self.host, self.series, self.robot = host, "", None
 
     def get(self, series: Series, **settings: Any) -> UrEmulator:
         if self.robot is None or settings or self.series != series:
             self.free()
-            self.series, self.robot = series, UrEmulator(series, **settings).__enter__()
+            self.series, self.robot = series, UrEmulator(series, host=self.host, **settings).__enter__()
         return self.robot
 
     def free(self) -> None:

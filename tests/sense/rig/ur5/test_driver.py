@@ -13,7 +13,6 @@ from sense.rig.safety import wait_until_still
 from sense.rig.ur5 import driver as ur5
 from sense.rig.ur5.driver import UR5
 from tests.sense.rig.ur5.arms import (
-    HOST,
     LIMITS,
     LONGEST_CALL_S,
     LOW,
@@ -26,10 +25,7 @@ from tests.sense.rig.ur5.arms import (
     within,
 )
 
-pytestmark = [
-    pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here"),
-    pytest.mark.usefixtures("ports"),
-]
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 BOTH = pytest.mark.parametrize("series", ["cb3", "e"])
 
 
@@ -55,8 +51,8 @@ def test_moves_arrive_and_no_state_is_missed(robot: UrEmulator, arm: UR5) -> Non
 
 
 @BOTH
-def test_what_the_arm_says_of_itself(robot: UrEmulator) -> None:
-    arm = UR5(HOST)
+def test_what_the_arm_says_of_itself(robot: UrEmulator, host: str) -> None:
+    arm = UR5(host)
     about = within(LONGEST_CALL_S, arm.connect)
     assert about["rate_hz"] in (125, 500)
     assert about["model"] == "UR5"
@@ -97,9 +93,9 @@ def test_one_move_at_a_time(robot: UrEmulator, arm: UR5) -> None:
     arm.stop()
 
 
-def test_arms_that_cannot_be_had(robots: Robots, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arms_that_cannot_be_had(robots: Robots, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     robots.free()
-    arm = UR5(HOST)
+    arm = UR5(host)
     assert fault_of(arm.connect) == "refused"
     assert fault_of(arm.state) == "lost"
     arm.stop()
@@ -122,15 +118,15 @@ def test_arms_that_cannot_be_had(robots: Robots, monkeypatch: pytest.MonkeyPatch
     arm.close()
 
 
-def test_without_ur_rtde(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ur_rtde(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'"):
-        UR5(HOST).connect()
+        UR5(host).connect()
 
 
-def test_force_is_felt_and_limited(robots: Robots) -> None:
+def test_force_is_felt_and_limited(robots: Robots, host: str) -> None:
     robots.get("e", surface_mm=100, stiffness_n_mm=2.0)
-    arm = UR5(HOST)
+    arm = UR5(host)
     arm.connect()
     assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
     arm.move(LOW, 50, 500)

@@ -15,7 +15,6 @@ from sense.rig.safety import wait_until_still
 from sense.rig.ur5 import link as ur5_link
 from sense.rig.ur5.driver import UR5
 from tests.sense.rig.ur5.arms import (
-    HOST,
     LIMITS,
     LONGEST_CALL_S,
     LOW,
@@ -28,10 +27,7 @@ from tests.sense.rig.ur5.arms import (
     within,
 )
 
-pytestmark = [
-    pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here"),
-    pytest.mark.usefixtures("ports"),
-]
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 
 
 def nothing(robot: UrEmulator) -> None:
@@ -107,10 +103,10 @@ def test_the_child_dies_or_hangs(robot: UrEmulator, arm: UR5, name: str) -> None
 
 
 PARENT = f"""
-import time
+import sys, time
 from sense.rig.ur5.driver import UR5
 from sense.rig.emulators.ur_controller import Series
-arm = UR5("{HOST}")
+arm = UR5(sys.argv[1])
 arm.connect()
 arm.move({LOW}, 50, 500)
 print("moving", flush=True)
@@ -121,10 +117,10 @@ while True:
 
 
 @pytest.mark.parametrize(("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), ("e", "SIGKILL")])
-def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, name: str) -> None:
+def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)
     arm.close()
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen([sys.executable, "-c", PARENT, host], stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         assert program.stdout.readline() == "moving\n"
         time.sleep(0.15)
