@@ -4,6 +4,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -11,6 +12,7 @@ import padforge
 from design import Morphology
 from design.common.settings import Spec
 from sense.cli.calibration import run_calibration
+from sense.health import fibre_prediction
 from sense.rig.operation import record_simulated
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
@@ -35,11 +37,12 @@ def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
 
 
 def made(folder: Path, presses: int) -> Path:
-    """A folder with a recording `rec` of so many presses, and `model`, calibrated by it."""
+    """A folder with a recording `rec` of so many presses, and `model`, quickly calibrated by it."""
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    run_calibration(spec, recording, folder / "model", {})
+    with mock.patch.object(fibre_prediction, "STEPS", 250):
+        run_calibration(spec, recording, folder / "model", {})
     return folder
 
 
