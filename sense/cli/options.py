@@ -14,15 +14,11 @@ if TYPE_CHECKING:
     from sense.recordings.recording import Recording
 
 METHODS, FEATURES = ("masked", "published"), ("full", "causal", "early", "published")
-
 FILE = click.Path(path_type=Path, dir_okay=False)
-
 FOLDER = click.Path(path_type=Path, file_okay=False)
 
 recording_argument = click.argument("recording", type=click.Path(path_type=Path))
-
 model_option = click.option("--model", type=FOLDER, required=True, help="Folder that calibrate wrote.")
-
 lost_option = click.option(
     "--lost", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
 )

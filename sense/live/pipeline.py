@@ -223,20 +223,9 @@ class Live:
         alive = presses.alive.copy()
         alive[:, list(self.lost)] = False
         found = localizer.locate(Scaled(presses.inputs, alive))
-        x, y, sd_x, sd_y = np.concatenate([found.places_mm[0], found.sd_mm[0]]).tolist()
-        estimate = Estimate(
-            press=press.number,
-            time_s=press.time_s,
-            features=localizer.features,
-            final=localizer is self._localizers[-1],
-            x_mm=x,
-            y_mm=y,
-            sd_x_mm=sd_x,
-            sd_y_mm=sd_y,
-            r50_mm=float(found.r50_mm[0]),
-            r90_mm=float(found.r90_mm[0]),
-            lost=tuple(np.flatnonzero(~alive[0]).tolist()),
-        )
+        numbers = np.concatenate([found.places_mm[0], found.sd_mm[0], found.r50_mm, found.r90_mm]).tolist()
+        final, lost = localizer is self._localizers[-1], tuple(np.flatnonzero(~alive[0]).tolist())
+        estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, lost=lost)
         if self.presses and self.presses[-1].press == press.number:
             self.presses.pop()
         self.presses.append(estimate)

@@ -18,10 +18,8 @@ from sense.processing.limits import MAX_BYTES, MAX_VALUES
 from .recording import Recording
 
 FORMAT = "padforge-hdf5/1"
-
 PACKED = 1040
 """Bytes that a byte of a file may stand for, at most: gzip packs no closer than 1032 to 1."""
-
 _ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {key: key for key in ("presses_mm", "begun", "lifted")}
 """Names of the datasets and of what they hold of a `Recording`."""
 

@@ -20,6 +20,10 @@ from .block_file import read_blocks
 from .press_journal import read_journal
 from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
 
+_ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64) | dict.fromkeys(
+    ("begun", "lifted"), np.int64
+)
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -49,13 +53,7 @@ class Recording:
     torn_presses: int = field(default=0, compare=False)
 
     def __post_init__(self) -> None:
-        for name, kind in (
-            ("readings", np.float64),
-            ("times_s", np.float64),
-            ("presses_mm", np.float64),
-            ("begun", np.int64),
-            ("lifted", np.int64),
-        ):
+        for name, kind in _ARRAYS.items():
             array = limits.as_numbers(getattr(self, name), kind, name)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -64,8 +62,7 @@ class Recording:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Recording):
             return NotImplemented
-        names = ("readings", "times_s", "presses_mm", "begun", "lifted")
-        return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in names)
+        return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in _ARRAYS)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -88,7 +85,7 @@ class Recording:
     def digest(self) -> str:
         """Hex SHA-256 of all readings and presses, wherever they are kept."""
         digest = hashlib.sha256()
-        for array in (self.readings, self.times_s, self.presses_mm, self.begun, self.lifted):
+        for array in (getattr(self, name) for name in _ARRAYS):
             plain = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # one NaN of many
             digest.update(repr(array.shape).encode() + plain.tobytes())
         return digest.hexdigest()

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from design.common.figures import ALARM, FAINT, INK, canvas, explain, save_figure
+from design.common.figures import ALARM, INK, canvas, explain, save_figure
+
+from .fibre_loss_figure import label_losses
 
 
 def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
@@ -49,15 +51,6 @@ def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
         axes.annotate(
             f"{row['mean_mm']:.2f}", (at + 0.3, row["mean_mm"]), color=INK, va="center", fontsize=10, weight="bold"
         )
-    counts = ["all fibres" if row["lost"] == 0 else f"{row['lost']} lost" for row in rows]
-    subsets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
-    axes.set_xticks(range(len(rows)), [f"{count}\n{subset}" for count, subset in zip(counts, subsets, strict=True)])
-    axes.set(
-        xlim=(-0.5, len(rows) - 0.3), ylim=(0, 1.08 * max(row["max_mm"] for row in rows)), ylabel="mean error (mm)"
-    )
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
-    axes.set_title(
-        f"One network, {document['test_presses']} presses never trained on\n", loc="left", color=INK, fontsize=11
-    )
-    explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
+    label_losses(axes, rows, f"One network, {document['test_presses']}")
+    axes.set(xlim=(-0.5, len(rows) - 0.3), ylim=(0, 1.08 * max(row["max_mm"] for row in rows)))
     save_figure(figure, path)

@@ -1,6 +1,6 @@
 """The figure of a study of lost fibres."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +30,8 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
             axes.bar(at + sideways, row["mean_mm"], 0.9 * _WIDTH, color=colour, alpha=0.35, label=None if at else way)
             axes.scatter(at + sideways + spread, sorted(means), s=9, color=colour, linewidths=0, zorder=3)
             axes.text(at + sideways, 0.03, f"{row['mean_mm']:.2f}", color=INK, fontsize=9, ha="center", va="bottom")
-    rows = next(iter(ways.values()))["errors"]
-    names = ["all fibres" if row["lost"] == 0 else f"{row['lost']} lost" for row in rows]
-    sets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
-    axes.set_xticks(range(len(rows)), [f"{name}\n{count}" for name, count in zip(names, sets, strict=True)])
-    axes.set_ylabel("mean error (mm)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False, loc="upper left")
-    axes.set_title(
-        f"Lost fibres, {document['test_presses']} presses never trained on\n", loc="left", color=INK, fontsize=11
-    )
-    explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
+    label_losses(axes, next(iter(ways.values()))["errors"], f"Lost fibres, {document['test_presses']}")
     means = [cell["mean_mm"] for way in ways.values() for each in way["maps"] for cell in each["by_place"]]
     for row, (way, found) in enumerate(ways.items()):
         panels = [figure.add_subplot(grid[1 + row, column], aspect="equal") for column in range(len(found["maps"]))]
@@ -48,6 +39,17 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
         panels[0].set_ylabel(way, fontsize=8, color=INK)
         figure.colorbar(pictures[0], ax=panels[-1], label="mm", shrink=0.9)
     save_figure(figure, path)
+
+
+def label_losses(axes: Any, rows: Sequence[Mapping[str, Any]], title: str) -> None:
+    """Say along and over `axes` what stands for the `rows` of errors, one a number of lost fibres, and their sets."""
+    names = ["all fibres" if row["lost"] == 0 else f"{row['lost']} lost" for row in rows]
+    sets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
+    axes.set_xticks(range(len(rows)), [f"{name}\n{count}" for name, count in zip(names, sets, strict=True)])
+    axes.set_ylabel("mean error (mm)")
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    axes.set_title(f"{title} presses never trained on\n", loc="left", color=INK, fontsize=11)
+    explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
 
 
 def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:

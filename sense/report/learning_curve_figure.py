@@ -21,16 +21,8 @@ def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
     errors = [2 * point["standard_error_mm"] for point in document["points"]]
     axes.errorbar(presses, means, errors, fmt="o", color=INK, markersize=5, linewidth=1.2, label="measured")
     reach = [[ahead["mean_mm"] - ahead["low_mm"]], [ahead["high_mm"] - ahead["mean_mm"]]]
-    axes.errorbar(
-        [ahead["presses"]],
-        [ahead["mean_mm"]],
-        reach,
-        fmt="D",
-        color=ALARM,
-        markersize=6,
-        linewidth=1.2,
-        label="expected",
-    )
+    expected = {"fmt": "D", "color": ALARM, "markersize": 6, "linewidth": 1.2, "label": "expected"}
+    axes.errorbar([ahead["presses"]], [ahead["mean_mm"]], reach, **expected)
     axes.set_xscale("log")
     ticks = [*presses.astype(int).tolist(), ahead["presses"]]
     axes.set_xticks(ticks, [str(tick) for tick in ticks])

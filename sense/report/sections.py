@@ -14,10 +14,8 @@ from .loss_chart import Errors, loss_chart
 
 STUDY = "padforge-study-"
 """Formats of studies begin with this."""
-
 _HARDEST = 10
 """So many sets of lost fibres are listed."""
-
 _COUNTED = ("one fibre", "two fibres", "three fibres")
 
 

@@ -14,16 +14,12 @@ Status = Literal["ok", "warn", "fail"]
 
 LOOK_S = 2.0
 """How long channels and states are looked at."""
-
 _DEAD_V = 0.02
 """A channel nearer than this to either end of the range is open, shorted or saturated."""
-
 _STUCK_V = 1e-6
 """An ADC that reads a fibre shows noise; a spread below this is a stuck channel."""
-
 _NOISY_V = 0.02
 _LATE_S = 0.1
-_SKEW_S = 0.005
 
 
 @dataclass(frozen=True)

@@ -73,9 +73,10 @@ class Limits:
         for axis, (low, high) in zip("xyz", self.box_mm, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise ValueError(f"box_mm: {axis} from {low} to {high}; expected two finite numbers, ascending")
-        for name in ("max_depth_mm", "max_speed_mm_s", "max_acceleration_mm_s2", "max_force_n", "max_state_age_s"):
-            _require_positive(name, getattr(self, name))
-        _require_positive("deadline_s", self.deadline_s)
+        speeds = ("max_speed_mm_s", "max_acceleration_mm_s2")
+        for name in ("max_depth_mm", *speeds, "max_force_n", "max_state_age_s", "deadline_s"):
+            if not (math.isfinite(value := getattr(self, name)) and value > 0):
+                raise ValueError(f"{name} is {value}; expected a finite number above 0")
         if not 0 <= self.max_tilt_deg <= 90:
             raise ValueError(f"max_tilt_deg is {self.max_tilt_deg}; allowed 0 to 90")
         if self.contact_mm is not None and not math.isfinite(self.contact_mm):
@@ -195,11 +196,6 @@ def _axis(rotation: Sequence[float]) -> Vector:
     x, y, z = (value / angle for value in rotation)
     sine, rest = math.sin(angle), 1 - math.cos(angle)
     return y * sine + x * z * rest, -x * sine + y * z * rest, math.cos(angle) + z * z * rest
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} is {value}; expected a finite number above 0")
 
 
 def _refuse(what: str, allowed: str) -> NoReturn:

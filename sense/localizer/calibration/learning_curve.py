@@ -84,7 +84,9 @@ def learning_curve(
         ],
         "fit": dict(zip(("floor_mm", "factor_mm", "exponent"), fit, strict=True)),
         "forecast": forecast,
-        "advice": _advice(sizes[-1], table[-1].mean(), forecast),
+        "advice": f"{forecast['presses'] - sizes[-1]} more presses to learn from, twice as many, would bring "
+        f"{table[-1].mean():.2f} mm to about {forecast['mean_mm']:.2f} mm "
+        f"({forecast['low_mm']:.2f} to {forecast['high_mm']:.2f} mm)",
         "settings": options.model_dump(),
         "provenance": made_by,
     }
@@ -163,13 +165,6 @@ def _forecast(
         "low_mm": float(now * min(low, ratio)),
         "high_mm": float(now * max(high, ratio)),
     }
-
-
-def _advice(presses: int, error_mm: float, forecast: dict[str, Any]) -> str:
-    return (
-        f"{forecast['presses'] - presses} more presses to learn from, twice as many, would bring {error_mm:.2f} mm to "
-        f"about {forecast['mean_mm']:.2f} mm ({forecast['low_mm']:.2f} to {forecast['high_mm']:.2f} mm)"
-    )
 
 
 def learning_curve_lines(document: dict[str, Any]) -> list[str]:

@@ -162,7 +162,8 @@ class Controller:
         while True:
             command = int(self.inputs["input_int_register_0"])
             if command == DRIFT:
-                self._drift()
+                self.motion.drift(self._doubles(0, 6), self._double(6), self._now)
+                self._signal(1)
             elif command == END:
                 self.stop_program()
                 return
@@ -177,10 +178,6 @@ class Controller:
 
     def _signal(self, what: int) -> None:
         self.outputs["output_int_register_0"] = what
-
-    def _drift(self) -> None:
-        self.motion.drift(self._doubles(0, 6), self._double(6), self._now)
-        self._signal(1)
 
     def _perform(self, command: int) -> Iterator[None]:
         if command == MOVE:

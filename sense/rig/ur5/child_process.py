@@ -209,15 +209,9 @@ class Child:
 
     def _row(self, reading: Reading) -> Row:
         emergency = bool(reading.safety & frames.EMERGENCY_BITS)
-        x, y, z, rx, ry, rz = reading.pose
+        x, y, z, *turn = reading.pose
         return Row(
-            time_s=reading.time_s,
-            x_mm=1e3 * x,
-            y_mm=1e3 * y,
-            z_mm=1e3 * z,
-            rx=rx,
-            ry=ry,
-            rz=rz,
+            *(reading.time_s, 1e3 * x, 1e3 * y, 1e3 * z, *turn),
             speed_mm_s=1e3 * reading.speed,
             force_n=float("nan") if reading.force_n is None else reading.force_n,
             protective_stop=bool(reading.safety & frames.PROTECTIVE_BITS) and not emergency,

@@ -120,7 +120,6 @@ class RtdeReader:
 
     def _reading(self, arrived: float, values: tuple[float, ...]) -> Reading:
         stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[15]
-        mode, runtime, safety, progress = (int(value) for value in values[19:])
         if not all(map(math.isfinite, values)):
             raise ValueError("the controller sent a state that holds NaN or infinity")
         skipped = 0 if self._stamp is None else max(0, round((stamp - self._stamp) * self.rate_hz) - 1)
@@ -131,10 +130,7 @@ class RtdeReader:
             pose=pose,
             speed=sum(value * value for value in speed) ** 0.5,
             force_n=force if self.version[0] >= FORCE_SERIES else None,
-            mode=mode,
-            runtime=runtime,
-            safety=safety,
-            progress=progress,
+            **dict(zip(("mode", "runtime", "safety", "progress"), map(int, values[19:]), strict=True)),
         )
 
 

@@ -82,17 +82,9 @@ def _errors(axes: Axes, label: str, rows: Sequence[Mapping[str, Any]]) -> None:
         own = [row for row in rows if row["denoise"] == name]
         heights = np.arange(len(schemes)) + 0.6 * ((at + 0.5) / len(filters) - 0.5)
         for part, face in (("", CURVES[at]), ("_last", "none")):
-            axes.errorbar(
-                [row[f"mean{part}_mm"] for row in own],
-                heights,
-                xerr=[row[f"std{part}_mm"] for row in own],
-                fmt="o",
-                color=CURVES[at],
-                markerfacecolor=face,
-                markersize=4.5,
-                elinewidth=1,
-                label=None if part else f"denoised: {name}",
-            )
+            means, stds = ([row[f"{what}{part}_mm"] for row in own] for what in ("mean", "std"))
+            dot: dict[str, Any] = {"fmt": "o", "color": CURVES[at], "markerfacecolor": face, "markersize": 4.5}
+            axes.errorbar(means, heights, xerr=stds, elinewidth=1, label=None if part else f"denoised: {name}", **dot)
     axes.set_yticks(range(len(schemes)), schemes)
     axes.set(ylim=(len(schemes) - 0.5, -0.5), xlim=(0, None), xlabel="mean error (mm)")
     axes.set_title(f"{label}, {rows[0]['kind']}", loc="left", color=INK, fontsize=10)

@@ -103,7 +103,7 @@ def drift_study(
     drawn = int(np.random.default_rng([6, seed]).integers(2**32))
     rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": drawn})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
-    sources |= {label: partial(_same, recording) for label, recording in recordings.items()}
+    sources |= {label: (lambda own=recording: own) for label, recording in recordings.items()}
     simulated = {*pads, *(label for label, own in recordings.items() if own.source.get("kind") == SIMULATED)}
     kinds = {label: SIMULATED if label in simulated else "recorded" for label in sources}
     known = {**dict.fromkeys(pads, presses), **{label: int(own.known.sum()) for label, own in recordings.items()}}
@@ -131,10 +131,6 @@ def drift_study(
     }
     conclude = partial(_conclude, dict(pads), kinds, settings)
     return Study("drift", "Denoising and drift compensation", settings, tasks, conclude, draw)
-
-
-def _same(recording: Recording) -> Recording:
-    return recording
 
 
 def _split(known: Indices, share: float, seed: int) -> Split:
