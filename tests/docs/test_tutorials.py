@@ -1,29 +1,44 @@
 """Tutorials do as they say.
 
 A comment `<!-- run -->` before a block of shell commands says that it is run here, after all such blocks above it and
-those of the tutorials before it. What it prints must be what the page shows below: text and whole numbers exactly,
-decimals too, or within the share that a comment like `<!-- run: decimals within 20 % -->` grants where they hang on the
-machine; the chances that it calls 1e8 may then differ as well. Seconds always may. With REWRITE_DOCS set in the
-environment the pages are rewritten by what is printed, to be looked at before they are kept.
+those of the first tutorial, which makes the pad. What it prints must be what the page shows below: text and whole
+numbers exactly, decimals too, or within the share that a comment like `<!-- run: decimals within 20 % -->` grants where
+they hang on the machine; the chances that it calls 1e8 may then differ as well. Seconds always may. With REWRITE_DOCS
+set in the environment the pages are rewritten by what is printed, to be looked at before they are kept.
 """
 
 import os
 import re
 import shutil
 import subprocess
-import sys
+import time
 from collections.abc import Iterator
+from contextlib import chdir
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
+from unittest.mock import patch
 
 import pytest
 
 from tests.docs.pages import BLOCK, ROOT, relative
+from tests.stress.door import call
 
 TUTORIALS = [ROOT / "docs" / f"tutorial-{stage}.md" for stage in ("design", "fabricate", "sense", "study")]
 REWRITE = "REWRITE_DOCS" in os.environ
 SECONDS = re.compile(r"(?<![\w.])\d+(\.\d+)? s\b")
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?")
+PROGRAM = """#!/bin/sh
+counter={0}
+printf '%s\\n' "$PWD" "$@" > "$counter/asking" && mv "$counter/asking" "$counter/asked"
+until [ -e "$counter/code" ]; do sleep 0.05; done
+cat "$counter/err" >&2
+cat "$counter/out"
+read -r code < "$counter/code"
+rm "$counter/code"
+exit "$code"
+"""
+"""What the shell finds as `padforge`: it asks this process, which has all libraries loaded, and says what it says."""
 OUTPUT = re.compile(r"\s*```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -77,47 +92,76 @@ def slack(number: str, share: float) -> float:
     return max(share * abs(float(number)), 1.001 * 10.0**-digits)
 
 
+@pytest.fixture(scope="session")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder in which the first tutorial was followed, on which the others build, and where the page was wrong."""
+    folder = tmp_path_factory.mktemp("designed")
+    return folder, follow(TUTORIALS[0], folder)
+
+
 @pytest.mark.skipif(not all(map(shutil.which, ("sh", "awk", "sed"))), reason="needs the tools of a Unix shell")
-def test_the_tutorials_do_as_they_say(tmp_path: Path) -> None:
-    program = tmp_path / "bin" / "padforge"
-    program.parent.mkdir()
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m padforge "$@"\n', encoding="utf-8")
-    program.chmod(0o755)
-    folder = tmp_path / "work"
-    folder.mkdir()
-    path = os.pathsep.join((str(program.parent), os.environ["PATH"]))
-    for page in TUTORIALS:
-        text = page.read_text(encoding="utf-8")
-        blocks = list(runs(text))
-        assert blocks, f"{relative(page)}: no block is run"
-        moved = 0
-        for block in blocks:
-            printed = run(block.commands, folder, path)
-            wrong = difference(block.shown, printed, block.share)
-            assert REWRITE or not wrong, f"{relative(page)}: {block.commands}printed {wrong}"
-            if wrong and block.begin >= 0:
-                begin, end = block.begin + moved, block.begin + moved + len(block.shown)
-                text = text[:begin] + printed.rstrip() + "\n" + text[end:]
-                moved += len(printed.rstrip()) + 1 - len(block.shown)
-        if REWRITE:
-            page.write_text(text, encoding="utf-8")
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_the_tutorials_do_as_they_say(page: Path, designed: tuple[Path, str], tmp_path: Path) -> None:
+    if page == TUTORIALS[0]:
+        wrong = designed[1]
+    else:
+        shutil.copytree(designed[0], tmp_path, dirs_exist_ok=True)
+        wrong = follow(page, tmp_path)
+    assert REWRITE or not wrong, wrong
 
 
-def run(commands: str, folder: Path, path: str) -> str:
+def follow(page: Path, folder: Path) -> str:
+    """Run the blocks of a page; where the first is not as the page says, empty if all are."""
+    text = page.read_text(encoding="utf-8")
+    blocks = list(runs(text))
+    assert blocks, f"{relative(page)}: no block is run"
+    moved = 0
+    for block in blocks:
+        printed = run(block.commands, folder)
+        wrong = difference(block.shown, printed, block.share)
+        if wrong and not REWRITE:
+            return f"{relative(page)}: {block.commands}printed {wrong}"
+        if wrong and block.begin >= 0:
+            begin, end = block.begin + moved, block.begin + moved + len(block.shown)
+            text = text[:begin] + printed.rstrip() + "\n" + text[end:]
+            moved += len(printed.rstrip()) + 1 - len(block.shown)
+    if REWRITE:
+        page.write_text(text, encoding="utf-8")
+    return ""
+
+
+def run(commands: str, folder: Path) -> str:
     """What shell commands print, errors included; they must succeed."""
-    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "", "COLUMNS": "80"}
-    result = subprocess.run(
-        ["sh", "-c", commands],
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert result.returncode == 0, f"{commands}{result.stdout}"
-    return result.stdout
+    with TemporaryDirectory() as name, (Path(name) / "printed").open("w+", encoding="utf-8") as printed:
+        (program := Path(name) / "padforge").write_text(PROGRAM.format(name), encoding="utf-8")
+        program.chmod(0o755)
+        environment = os.environ | {"PATH": os.pathsep.join((name, os.environ["PATH"])), "COLUMNS": "80"}
+        with patch.dict(os.environ, environment):
+            shell = subprocess.Popen(["sh", "-c", commands], cwd=folder, stdout=printed, stderr=subprocess.STDOUT)
+            try:
+                while shell.poll() is None:
+                    answer(Path(name))
+                    time.sleep(0.01)
+            finally:
+                shell.kill()
+                shell.wait()
+        text = Path(printed.name).read_text(encoding="utf-8")
+    assert shell.returncode == 0, f"{commands}{text}"
+    return text
+
+
+def answer(counter: Path) -> None:
+    """Run what the program in the shell was asked for, if anything, in this process."""
+    if not (counter / "asked").exists():
+        return
+    here, *words = (counter / "asked").read_text(encoding="utf-8").splitlines()
+    (counter / "asked").unlink()
+    with chdir(here):
+        ended = call(*words, limit_s=300)
+    (counter / "err").write_text(ended.err, encoding="utf-8")
+    (counter / "out").write_text(ended.out, encoding="utf-8")
+    (counter / "ending").write_text(f"{ended.code}\n", encoding="utf-8")
+    (counter / "ending").rename(counter / "code")
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def test_reports_on_changed_files(
         (folder / "report.html").unlink(missing_ok=True)
         with ends_in_time():
             try:
-                assert write_report(folder).read_text().endswith("</body></html>\n")
+                assert write_report(folder).read_text().endswith("</body>\n</html>\n")
             except InputError as error:
                 require_one_line(error)
                 assert not (folder / "report.html").exists()
