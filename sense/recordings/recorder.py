@@ -64,14 +64,11 @@ class Recorder:
         self._begin_with(path, BlockWriter(self._stream, fibres), 0)
 
     def _begin_with(self, path: Path, blocks: BlockWriter, noted: int) -> None:
-        self._path = path
-        self._blocks = blocks
-        self._fibres = blocks.fibres
+        self._path, self._blocks, self._fibres = path, blocks, blocks.fibres
         self._noted = noted  # bytes of the journal
         self._states: tuple[BlockWriter, BinaryIO] | None = None
         self._lines: list[str] = []
-        self._press = 0
-        self._down = False
+        self._press, self._down = 0, False
         self.done: set[int] = set()
         self.readings = 0
         self.last_s = -np.inf

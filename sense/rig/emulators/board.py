@@ -51,9 +51,7 @@ class EmulatedBoard:
         """
         import tty
 
-        self._source = source
-        self._supply_v = supply_v
-        self._skew_ppm = skew_ppm
+        self._source, self._supply_v, self._skew_ppm = source, supply_v, skew_ppm
         serial = b"emulated board".ljust(16, b"\0")
         self._identity = Identity(firmware, framing.BITS, MAX_CHANNELS, "padforge-due", serial)
         self._silent = silent
@@ -67,10 +65,8 @@ class EmulatedBoard:
         self._settings = BoardSettings(1_000_000, 0xFF, 1)
         self._started_s: float | None = None
         self._first = self._sequence = self._overruns = 0
-        self._overrun_asked = 0
-        self._garble = 0.0
-        self._stalled = self._halting = False
-        self._ending = False
+        self._overrun_asked, self._garble = 0, 0.0
+        self._stalled = self._halting = self._ending = False
         self._thread = threading.Thread(target=self._run, name=f"board at {self.port}", daemon=True)
 
     def __enter__(self) -> Self:
