@@ -19,7 +19,15 @@ from design.pad.morphology import Morphology
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND, sound
 from fabricate.checks.plan_checks import inspect
-from fabricate.mould import assembly
+from fabricate.mould.assembly import (
+    conductive_body,
+    conductive_plan,
+    lid_body,
+    lid_holes,
+    mould_body,
+    sizes,
+    valid_solid,
+)
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body
 from fabricate.report import laying_guide
@@ -91,7 +99,7 @@ def build(
         findings = inspect(plan, printed[0].vertices, printed[0].triangles)
         _require_sound(printed[0], findings)
         for body in printed[1:]:
-            holes = assembly.lid_holes(plan) if body.name == "lid" else 0
+            holes = lid_holes(plan) if body.name == "lid" else 0
             _require_sound(body, sound(body.vertices, body.triangles, genus=holes))
     writes = [*(write for body in printed for write in _solids(body, formats)), *_drawings(plan, findings, formats)]
     document = _document(plan, printed, findings, [name for name, _ in writes], formats, inputs)
@@ -105,11 +113,11 @@ def build(
 
 def _bodies(plan: Plan) -> list[tuple[str, Body]]:
     """What is printed, the mould first."""
-    bodies = [("mould", assembly.mould_body(plan))]
+    bodies = [("mould", mould_body(plan))]
     if plan.settings.mould.lid:
-        bodies.append(("lid", assembly.lid_body(plan)))
+        bodies.append(("lid", lid_body(plan)))
     if plan.settings.mould.conductive:
-        bodies.append(("conductive", assembly.conductive_body(assembly.conductive_plan(plan))))
+        bodies.append(("conductive", conductive_body(conductive_plan(plan))))
     return bodies
 
 
@@ -134,7 +142,7 @@ def _solids(body: Printed, formats: Sequence[str]) -> Iterator[Write]:
         yield f"{body.name}.3mf", partial(write_3mf, vertices=body.vertices, triangles=body.triangles)
     if "step" in formats:
         with profiling.stage("CAD solid"):
-            solid, volume = assembly.valid_solid(body.mesh, body.name), body.mesh.volume()
+            solid, volume = valid_solid(body.mesh, body.name), body.mesh.volume()
         if abs(solid.volume - volume) > _VOLUME_RATIO * volume:
             raise InputError(f"{body.name}: solid {solid.volume:.1f} mm³, mesh {volume:.1f}; nothing was written")
         yield f"{body.name}.step", partial(write_step, solid=solid)
@@ -169,7 +177,7 @@ def _document(
         "format": FORMAT,
         "files": list(files),
         "size_mm": size,
-        "sizes": assembly.sizes(plan),
+        "sizes": sizes(plan),
         "mould_volume_ml": round(printed[0].mesh.volume() / 1000, 4),
         "silicone_volume_ml": bench["silicone"]["volume_ml"],
         "findings": [finding.document() for finding in findings],
