@@ -12,7 +12,7 @@ def padforge(*arguments, cwd):
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
 
-def called(*arguments, cwd) -> Ended:
-    """What a command that refuses ends with, in this process."""
+def called(*arguments, cwd, limit_s=60) -> Ended:
+    """What a command ends with, in this process."""
     with chdir(cwd):
-        return call(*arguments, limit_s=60)
+        return call(*arguments, limit_s=limit_s)

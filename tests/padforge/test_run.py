@@ -14,7 +14,7 @@ import trimesh
 from safetensors.numpy import load_file
 
 import padforge as front_door
-from tests.padforge.program import padforge
+from tests.padforge.program import called, padforge
 
 SMALL = """
 [pad]
@@ -38,12 +38,12 @@ lost = 1
 def chain(tmp_path_factory):
     folder = tmp_path_factory.mktemp("chain")
     (folder / "pad.toml").write_text(SMALL)
-    return folder, padforge("run", cwd=folder)
+    return folder, called("run", cwd=folder, limit_s=300)
 
 
 def test_run_makes_everything(chain):
     folder, result = chain
-    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.code == 0, result.out + result.err
     out = folder / "out" / "pad"
     names = {path.name for path in out.iterdir()}
     assert names >= {
@@ -75,6 +75,7 @@ def test_the_report_is_one_page_with_its_pictures(chain):
 
 
 def test_running_again_gives_the_same_pad(chain):
+    """In a process of its own, as people run it."""
     folder, _ = chain
     before = (folder / "out/pad/morphology.json").read_bytes(), (folder / "out/pad/mould.stl").read_bytes()
     result = padforge("run", cwd=folder)
