@@ -103,7 +103,8 @@ def require_whole(folder: Path) -> None:
 
 
 def litter(folder: Path) -> list[str]:
-    return [name for name in contents(folder) if Path(name).name.startswith(".")]
+    """Names of unfinished things in a folder, which may go while it is looked through."""
+    return [name for _, inner, files in os.walk(folder) for name in (*inner, *files) if name.startswith(".")]
 
 
 @pytest.mark.parametrize(
