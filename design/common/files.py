@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import platform
+import secrets
 import stat
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,22 +38,13 @@ def atomic(path: Path) -> Iterator[Path]:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it is there and no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=UNFINISHED, suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        try:
+        temporary = path.with_name(f"{UNFINISHED}{secrets.token_hex(8)}{path.suffix}")
+        try:  # from before there is a file, so that no interrupt finds one that nobody clears up
+            temporary.touch(exist_ok=False)
             yield temporary
-            _widen_permissions(temporary)
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
-
-
-def _widen_permissions(path: Path) -> None:
-    """Give `path` the permissions an ordinary new file has; `mkstemp` makes it private to its owner."""
-    mask = os.umask(0)
-    os.umask(mask)
-    path.chmod(0o666 & ~mask)
 
 
 def write_text(path: Path, text: str) -> None:
