@@ -184,7 +184,7 @@ def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path):
     before = summary["benches"]
     for row in before["x"]["rows"]:
         row["seconds"], row["paces"] = 10 * before["x"]["pace_s"], 10.0  # some 2 ms
-    delays = iter([0.004] * 12)
+    delays = iter([60 * before["x"]["pace_s"]] * 12)  # several times as slow, whatever else the machine does meanwhile
 
     def disturbed():
         end = time.perf_counter() + next(delays, 0)
