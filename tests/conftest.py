@@ -19,7 +19,13 @@ if coverage is not None and coverage.Coverage.current() is not None:
     fresh = tempfile.TemporaryDirectory(prefix="padforge-coverage-")
     config.JIT_COVERAGE, config.CACHE_DIR = 1, fresh.name  # pyright: ignore[reportAttributeAccessIssue]
 
+RIG = Path(__file__).parent / "sense" / "rig"
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Rigs first: they wait for clocks and need few compiled kernels, which another process compiles meanwhile."""
+    items.sort(key=lambda item: RIG not in item.path.parents)
 
 
 @pytest.fixture(scope="session")

@@ -62,7 +62,7 @@ class KilledError(Exception):
 def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
     pad = PadSettings(grid=2)
-    settings = SMALL.model_copy(update={"method": method, "generations": 6, "steps": 60})
+    settings = SMALL.model_copy(update={"method": method})
     whole, kills = search(pad, settings=settings), 0
 
     def attempt():
