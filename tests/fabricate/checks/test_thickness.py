@@ -5,7 +5,6 @@ import pytest
 import shapely
 import trimesh
 from hypothesis import assume, given
-from hypothesis import settings as effort
 from hypothesis import strategies as st
 from manifold3d import CrossSection, Manifold, Mesh, OpType
 
@@ -28,6 +27,7 @@ from tests.fabricate.trays import (
     spanning,
     tray,
 )
+from tests.stress.clock import few
 
 
 class TestGood:
@@ -39,7 +39,7 @@ class TestGood:
         assert found["wall_thickness"].measured == pytest.approx(WALL, rel=0.03)
         assert found["floor_thickness"].measured == pytest.approx(FLOOR)
 
-    @effort(max_examples=60)
+    @few(25)
     @given(
         st.floats(0, 8),
         st.floats(0.8, 4),
