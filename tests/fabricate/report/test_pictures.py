@@ -1,3 +1,5 @@
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,12 @@ def finding(status, *places: tuple[float, float], name: str = "wall") -> Finding
     return Finding(name, status, 0.0, 1.0, "planted", places)
 
 
+APART = [(-6.0, 3.0), (0.0, 4.0), (7.0, 3.0)]
+UNMARKED = finding("pass", *APART), finding("fail")
+MARKED = finding("fail", (0, 0)), finding("warn", (6, -4), name="bend")
+EXCHANGED = finding("fail", (6, -4)), finding("warn", (0, 0), name="bend")
+
+
 def pixels(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         assert image.mode == "P"
@@ -34,9 +42,17 @@ def where(picture: np.ndarray, colour: str) -> np.ndarray:
     return np.abs(picture.astype(int) - list(bytes.fromhex(colour[1:]))).max(axis=2) <= 10
 
 
-def mould_picture(tmp_path: Path, *findings: Finding, plan: Plan = PLAN) -> np.ndarray:
-    draw_mould(plan, findings, tmp_path / "mould.png")
-    return pixels(tmp_path / "mould.png")
+@pytest.fixture(scope="module")
+def mould_picture(tmp_path_factory) -> Callable[..., np.ndarray]:
+    """What PLAN's mould looks like with findings; each picture is drawn once."""
+    path = tmp_path_factory.mktemp("pictures") / "mould.png"
+
+    @cache
+    def picture(*findings: Finding) -> np.ndarray:
+        draw_mould(PLAN, findings, path)
+        return pixels(path)
+
+    return picture
 
 
 def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
@@ -95,8 +111,8 @@ def test_heights_of_slivers_upright_faces_and_nothing():
     assert heights.max() <= 3
 
 
-def test_families_and_levels_have_colours_of_their_own(tmp_path):
-    picture = mould_picture(tmp_path)
+def test_families_and_levels_have_colours_of_their_own(mould_picture):
+    picture = mould_picture(*UNMARKED)
     for layer in layers(PLAN):
         assert where(picture, layer.colour).mean() > 1e-3
     assert {HORIZONTAL, VERTICAL} < {layer.colour for layer in layers(PLAN)}
@@ -104,32 +120,30 @@ def test_families_and_levels_have_colours_of_their_own(tmp_path):
     assert where(picture, FAINT).mean() > 0.03
 
 
-def test_marks_are_where_the_findings_are(tmp_path):
+def test_marks_are_where_the_findings_are(mould_picture):
     scale = 900 / (2 * PLAN.tray.bounds[2])  # pixels a mm
-    for status, colour in (("fail", ALARM), ("warn", CARE)):
-        first, second = (where(mould_picture(tmp_path, finding(status, place)), colour) for place in ((0, 0), (6, -4)))
+    for colour, ways in ((ALARM, 1), (CARE, -1)):  # what warns is where the other picture has what fails
+        first, second = (where(mould_picture(*marks), colour) for marks in (MARKED, EXCHANGED)[::ways])
         middles = [np.argwhere(one & ~other).mean(axis=0) for one, other in ((first, second), (second, first))]
         assert middles[1] - middles[0] == pytest.approx(np.array([4, 6]) * scale, abs=0.7)
 
 
-def test_every_place_that_fails_or_warns_is_marked_and_no_other(tmp_path):
+def test_every_place_that_fails_or_warns_is_marked_and_no_other(mould_picture):
     def marked(*findings: Finding) -> tuple[int, int]:
-        picture = mould_picture(tmp_path, *findings)
+        picture = mould_picture(*findings)
         return int(where(picture, ALARM).sum()), int(where(picture, CARE).sum())
 
-    apart = [(-6.0, 3.0), (0.0, 4.0), (7.0, 3.0)]
-    assert marked(finding("pass", *apart)) == (0, 0)
-    assert marked(finding("fail")) == (0, 0)
-    one, three = (marked(finding("fail", *apart[:count]))[0] for count in (1, 3))
+    assert marked(*UNMARKED) == (0, 0)
+    one, three = (marked(finding("fail", *APART[:count]))[0] for count in (1, 3))
     assert three == pytest.approx(2 * one, rel=0.15)  # one more is in the legend
-    assert all(count > 0 for count in marked(finding("fail", apart[0]), finding("warn", apart[1], name="bend")))
+    assert all(count > 0 for count in marked(*MARKED))
 
 
-def test_checks_have_marks_of_their_own(tmp_path):
+def test_checks_have_marks_of_their_own(mould_picture):
     place = (0.0, 4.0)
     both = [finding("fail", place), finding("fail", place, name="bend")]
     same = [finding("fail", place, place), finding("fail", name="bend")]
-    assert where(mould_picture(tmp_path, *both), ALARM).sum() > 1.3 * where(mould_picture(tmp_path, *same), ALARM).sum()
+    assert where(mould_picture(*both), ALARM).sum() > 1.3 * where(mould_picture(*same), ALARM).sum()
 
 
 def test_tracks_show_fibres_and_crossings_of_one_family(tmp_path):
@@ -156,14 +170,24 @@ def test_any_mesh_is_drawn_with_its_findings(tmp_path):
     assert not where(pixels(path), ALARM).any()
 
 
-def test_pictures_are_small_and_the_same_each_time(tmp_path, published):
+def test_pictures_are_small(tmp_path, published):
     plan = Plan(Morphology.load(published / "20para.mat"))
     findings = [finding("fail", *as_places(plan.pad.to_mm([c.place for c in plan.clashes])))]
-    for name in ("first", "second"):
-        draw_mould(plan, findings, tmp_path / f"mould-{name}")
-        draw_tracks(plan, tmp_path / f"tracks-{name}")
-        draw_findings(*mesh_of(plan), findings, tmp_path / f"mesh-{name}")
-    for kind in ("mould", "tracks", "mesh"):
-        first = (tmp_path / f"{kind}-first").read_bytes()
-        assert first == (tmp_path / f"{kind}-second").read_bytes()
-        assert len(first) < SMALL
+    draw_mould(plan, findings, tmp_path / "mould")
+    draw_tracks(plan, tmp_path / "tracks")
+    draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")
+    assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["mould", "tracks", "mesh"])
+def test_pictures_are_the_same_each_time(tmp_path, kind):
+    def draw(path: Path) -> bytes:
+        if kind == "mould":
+            draw_mould(PLAN, MARKED, path)
+        elif kind == "tracks":
+            draw_tracks(PLAN, path)
+        else:
+            draw_findings(*mesh_of(PLAN), MARKED, path)
+        return path.read_bytes()
+
+    assert draw(tmp_path / "first") == draw(tmp_path / "second")
