@@ -16,7 +16,7 @@ from fabricate.export import FORMATS, build
 from fabricate.mould.prisms import Body, Prism
 from tests.fabricate.planted import level_pad, with_settings
 
-PAD = Morphology.random(2, 3, seed=7)
+PAD = Morphology.random(1, 2, seed=7)
 
 
 FILES = {
@@ -90,7 +90,7 @@ def test_step_reads_back_as_the_same_solid(built):
 def test_the_document_has_what_a_lab_needs(built):
     _, document = built
     assert document["format"] == "padforge-fabrication/1"
-    side = 33.75 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
+    side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
     assert document["size_mm"] == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
     assert document["sizes"]["tray_mm"] == pytest.approx(side)
     assert {finding["name"] for finding in document["findings"]} >= {"watertight", "bed", "layers", "tray_wall"}
@@ -98,7 +98,7 @@ def test_the_document_has_what_a_lab_needs(built):
     assert len(document["crossings"]["table"]) == document["crossings"]["total"] >= PAD.grid**2
     first, second, x, y, *_ = document["crossings"]["table"][0]
     assert {first.split()[0], second.split()[0]} <= {"horizontal", "vertical"}
-    assert max(abs(x), abs(y)) < 33.75 / 2
+    assert max(abs(x), abs(y)) < 22.5 / 2
 
 
 def test_same_family_crossings_are_counted(tmp_path):
