@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from design.benchmarking import harness, suite
+from design.benchmarking import harness, suite, table
 from design.benchmarking.comparison import compared, comparison_lines, read_earlier, worsenings
 from design.benchmarking.harness import Bench, BenchRounds, BenchTrial, measure_round
 from design.benchmarking.suite import run_benches
@@ -33,6 +33,12 @@ def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
 def _quick(monkeypatch):
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     monkeypatch.setattr(suite.time, "sleep", lambda seconds: None)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Files without the figure, which takes longer than all that is timed."""
+    monkeypatch.setattr(table, "save_figure", lambda figure, path: None)
 
 
 def test_a_later_round_times_what_it_is_told_to_and_judges_once():
@@ -179,7 +185,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
         run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
 
 
-def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path):
+def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path, undrawn):
     summary, _ = run_benches([bench(work=lambda: time.perf_counter())], tmp_path, lambda step: None, {})
     before = summary["benches"]
     for row in before["x"]["rows"]:
@@ -196,7 +202,7 @@ def test_work_that_was_slow_only_for_a_while_raises_no_alarm(tmp_path):
     assert not any(delays)
 
 
-def test_work_that_has_become_slower_and_worse_is_found(tmp_path):
+def test_work_that_has_become_slower_and_worse_is_found(tmp_path, undrawn):
     def work(times):
         return lambda: sum(i * i for i in range(times * 10_000))
 
