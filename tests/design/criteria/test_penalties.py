@@ -70,7 +70,7 @@ def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
         RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70),
         0,
     )
-    for _ in range(60):
+    for _ in range(30):
         knots = Morphology.straight(4).knots
         inner = np.linspace(knots[:, 0], knots[:, -1], 7).transpose(1, 0, 2)[:, 1:-1]
         scatter = rng.uniform(0.02, 0.3)
@@ -80,7 +80,7 @@ def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
         if sum(found(pad, rules, margin=1.05).values()) == 0:
             passed += 1
             assert check_rules(pad, rules) == []
-    assert 5 < passed < 55
+    assert 5 < passed < 25
 
 
 def test_folds_that_come_near_each_other_are_pushed_apart():
