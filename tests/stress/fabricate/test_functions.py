@@ -251,7 +251,7 @@ _SPOILS: dict[str, Callable[..., tuple[Any, Any]]] = {
 }
 
 
-@settings(few(60), suppress_health_check=LAX)
+@settings(few(40), suppress_health_check=LAX)
 @given(meshes(), st.none() | st.integers(0, 2), st.sampled_from([False] * 20 + [True]))
 def test_a_broken_mesh_has_findings_or_one_line(mesh, genus, drawn):
     vertices, triangles = mesh

@@ -32,7 +32,7 @@ def check_mesh(path: Path) -> None:
     json.dumps([finding.document() for finding in findings], allow_nan=False)
 
 
-@few(60)
+@few(30)
 @given(st.sampled_from(KINDS[4:7]), st.sampled_from(KINDS), damages(), st.booleans())
 def test_damaged_meshes(folder: Path, name: str, other: str, damage: Callable[[bytes], bytes], swapped: bool):
     content = (folder / (other if swapped else name)).read_bytes()
