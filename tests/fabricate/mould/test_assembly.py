@@ -115,7 +115,7 @@ def test_random_moulds_are_closed(grid, knots, seed):
 )
 def test_all_ways_to_the_solid_agree(settings):
     tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
-    plan = Plan(Morphology.straight(1) if tapered else Morphology.random(2, 3, seed=5), settings)
+    plan = Plan(Morphology.straight(1) if tapered else Morphology.random(1, 3, seed=5), settings)
     body = mould_body(plan)
     assert_all_ways_agree(body)
     assert_one_closed_body(as_read(body))
