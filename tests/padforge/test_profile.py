@@ -120,8 +120,11 @@ def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     with profiling.profiled() as profile:
         first = search(*asked, run=SearchRun(keep_in=tmp_path / "search"))
     assert profile.counts["starts"] == [2, 2]
+    heard = []
+    resumed = SearchRun(lambda *step: heard.append(step), keep_in=tmp_path / "search", resume=True)
     with profiling.profiled() as profile:
-        again = search(*asked, run=SearchRun(keep_in=tmp_path / "search", resume=True))
+        again = search(*asked, run=resumed)
+    assert not heard
     assert profile.counts["starts"] == [0, 2]
     np.testing.assert_array_equal(first.morphology.knots, again.morphology.knots)
 
