@@ -30,15 +30,16 @@ RIG = RigSettings(
 
 @dataclass
 class Time:
-    """A clock that only goes on when someone sleeps."""
+    """A clock that only goes on when someone sleeps, and then by `least_s`: the longer, the fewer polls."""
 
     now: float = 100.0
+    least_s: float = 0.008
 
     def __call__(self) -> float:
         return self.now
 
     def sleep(self, seconds: float) -> None:
-        self.now += max(seconds, 1e-4)
+        self.now += max(seconds, self.least_s)
 
 
 @dataclass

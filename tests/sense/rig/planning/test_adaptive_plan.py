@@ -39,7 +39,7 @@ def test_a_place_just_chosen_is_not_chosen_again():
 
 def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
     """Two presses in three of those chosen lie in the half of the pad the localizer never saw."""
-    time = Time()
+    time = Time(least_s=0.02)
     arm = FakeArm(time)
     fast = {"readings_per_press": 24, "press_mm_s": 250, "clearance_mm": 5}
     options = RIG.model_copy(update={"presses": 5 * EVERY // 2, "plan": "adaptive", **fast})
