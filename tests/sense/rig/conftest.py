@@ -10,6 +10,7 @@ from typing import IO
 
 import pytest
 
+from sense.rig.emulators import whole_rig
 from sense.rig.emulators.ur import UrEmulator
 from sense.rig.emulators.ur_controller import Series
 from sense.rig.ur5.driver import UR5
@@ -44,6 +45,14 @@ def address() -> Iterator[str]:
         if time.monotonic() > end:
             pytest.fail(f"other processes have had the emulator's ports for {WAIT_S} s")
         time.sleep(0.1)
+
+
+@pytest.fixture(scope="module")
+def own_address(address: str) -> Iterator[None]:
+    """Whole rigs are emulated at the address."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_rig, "HOST", address)
+        yield
 
 
 @pytest.fixture(scope="module")
