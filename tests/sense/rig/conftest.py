@@ -79,8 +79,5 @@ def robot(robots: Robots, series: Series) -> UrEmulator:
 
 
 @pytest.fixture
-def arm(robot: UrEmulator, host: str) -> Iterator[UR5]:
-    arm = UR5(host)
-    arm.connect()
-    yield arm
-    arm.close()
+def arm(robots: Robots, robot: UrEmulator, host: str) -> UR5:
+    return robots.connected(host)

@@ -77,7 +77,7 @@ def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> floa
     return time.monotonic() - begun
 
 
-def test_two_seconds_without_a_gap_right_to_a_step_and_on_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_without_a_gap_right_to_a_step_and_on_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     board = EmulatedBoard(waves, skew_ppm=150)
     with board, closing(Arduino(board.port, 1000)) as converter:
@@ -85,9 +85,9 @@ def test_two_seconds_without_a_gap_right_to_a_step_and_on_time(monkeypatch: pyte
         assert said.items() >= {"name": "padforge-due", "firmware": "1.0.0", "channels": 8, "bits": 12}.items()
         assert said["rate_hz"] == pytest.approx(1000)
         begun = time.process_time(), time.monotonic()
-        samples = read_for(converter, 2.0)
+        samples = read_for(converter, 1.0)
         share = (time.process_time() - begun[0]) / (time.monotonic() - begun[1])
-        assert len(samples.times_s) > 1800
+        assert len(samples.times_s) > 900
         assert not samples.missing.any()
         check(samples, board, within_s=5e-3)
         assert share < 0.2  # the emulated board included
@@ -121,8 +121,8 @@ def test_a_sample_is_complete_a_period_after_the_one_before() -> None:
 def test_garbled_bytes_cost_samples_that_are_counted_and_never_give_a_wrong_one() -> None:
     board = EmulatedBoard(waves, seed=3)
     with connected(board) as converter:
-        board.garble(1e-3)
-        samples = read_for(converter, 1.5)
+        board.garble(2e-3)
+        samples = read_for(converter, 0.75)
         board.garble(0)
         samples = joined([samples, read_for(converter, 0.1)])
         index = check(samples, board)

@@ -60,7 +60,7 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     return np.array(errors), clock
 
 
-@settings(max_examples=25)
+@settings(max_examples=20)
 @given(
     rate=st.sampled_from([(1000.0, 16), (100.0, 2), (40.0, 1)]),
     skew=st.floats(-200e-6, 200e-6),

@@ -23,10 +23,11 @@ T = TypeVar("T")
 
 
 class Robots:
-    """One emulator at a time, kept while the next test wants the same."""
+    """One emulator at a time, kept while the next test wants the same, and the link to it while that is whole."""
 
     def __init__(self, host: str) -> None:
         self.host, self.series, self.robot = host, "", None
+        self.arm: UR5 | None = None
 
     def get(self, series: Series, **settings: Any) -> UrEmulator:
         if self.robot is None or settings or self.series != series:
@@ -34,7 +35,20 @@ class Robots:
             self.series, self.robot = series, UrEmulator(series, host=self.host, **settings).__enter__()
         return self.robot
 
+    def connected(self, host: str) -> UR5:
+        """The arm by one of its names, at rest."""
+        arm = self.arm = self.arm or UR5(host)
+        try:
+            if arm.state().moving:
+                arm.stop()
+        except RigFault:
+            arm.connect()
+        return arm
+
     def free(self) -> None:
+        if self.arm is not None:
+            self.arm.close()
+            self.arm = None
         if self.robot is not None:
             asked, self.series = self.robot.asked(), ""
             self.robot.__exit__()

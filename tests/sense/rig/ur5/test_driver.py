@@ -26,14 +26,14 @@ from tests.sense.rig.ur5.arms import (
 )
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
-BOTH = pytest.mark.parametrize("series", ["cb3", "e"])
+BOTH = pytest.mark.parametrize("series", ["cb3", "e"], scope="module")
 
 
 @BOTH
 def test_moves_arrive_and_no_state_is_missed(robot: UrEmulator, arm: UR5) -> None:
     go(arm, HOME)
     arm.drain()
-    places = np.random.default_rng(3).uniform((-150, -460, 150), (-90, -400, 210), (10, 3))
+    places = np.random.default_rng(3).uniform((-150, -460, 150), (-90, -400, 210), (4, 3))
     pieces = []
     for x, y, z in places.tolist():
         state = go(arm, (x, y, z, *HOME[3:]), 400)
@@ -51,8 +51,7 @@ def test_moves_arrive_and_no_state_is_missed(robot: UrEmulator, arm: UR5) -> Non
 
 
 @BOTH
-def test_what_the_arm_says_of_itself(robot: UrEmulator, host: str) -> None:
-    arm = UR5(host)
+def test_what_the_arm_says_of_itself(robot: UrEmulator, arm: UR5) -> None:
     about = within(LONGEST_CALL_S, arm.connect)
     assert about["rate_hz"] in (125, 500)
     assert about["model"] == "UR5"

@@ -26,8 +26,10 @@ from tests.sense.rig.ur5.arms import (
     stop,
     within,
 )
+from tests.stress.clock import few
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
+LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 
 def nothing(robot: UrEmulator) -> None:
@@ -54,8 +56,9 @@ FAULTS: dict[str, tuple[Callable[[UrEmulator], object], str, float, Callable[[Ur
 @pytest.mark.parametrize(
     ("series", "name"),
     [
+        ("e", "protective stop"),
+        *(pytest.param("e", name, marks=LONG) for name in ("links closed", "stream frozen")),
         *(("cb3", name) for name in FAULTS),
-        *(("e", name) for name in ("protective stop", "links closed", "stream frozen")),
     ],
 )
 def test_faults_during_a_move(robot: UrEmulator, arm: UR5, name: str) -> None:
@@ -116,7 +119,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize(("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), ("e", "SIGKILL")])
+@pytest.mark.parametrize(("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), pytest.param("e", "SIGKILL", marks=LONG)])
 def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)
     arm.close()
