@@ -78,9 +78,9 @@ def test_times_are_within_5_ms_from_the_first_and_half_a_ms_soon(
 
 def test_times_hold_for_hours_in_bounded_memory() -> None:
     """An hour, two under stress."""
-    errors, clock = run(Link(40.0, 4, min(few(1).max_examples, 2) * 3600.0, 200e-6, seed=1))
+    errors, clock = run(Link(40.0, 8, min(few(1).max_examples, 2) * 3600.0, 200e-6, seed=1))
     assert np.abs(errors).max() < 2e-3
-    assert np.abs(errors[1000:]).max() < 1e-3
+    assert np.abs(errors[500:]).max() < 1e-3
     assert len(clock._buckets) <= 60
 
 
@@ -119,6 +119,7 @@ def test_there_is_no_time_before_the_first_block() -> None:
         SampleClock(1e-3).times(0, 1)
 
 
+@few(40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
 def test_the_line_under_the_points_is_the_highest_at_their_middle(seed: int, count: int, size: float) -> None:
     """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""

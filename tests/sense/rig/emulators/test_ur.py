@@ -20,6 +20,7 @@ from sense.rig.emulators.ur import HOME, UrEmulator
 from sense.rig.emulators.ur_controller import Series
 from sense.rig.ur5 import rtde_frames as ur_frames
 from sense.rig.ur5.rtde_reader import HostClock, RtdeReader
+from tests.stress.clock import few
 
 START = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0])
 CYCLE_S = 0.008
@@ -40,6 +41,7 @@ def test_a_frame_without_room_for_its_header() -> None:
         list(ur_frames.Splitter().feed(b"\x00\x02U"))
 
 
+@few(40)
 @given(st.lists(st.floats(0, 0.5), min_size=50, max_size=50))
 def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
     clock, delays = HostClock(), [0.0, *delays]
@@ -68,13 +70,13 @@ class TestSockets:
     def test_a_reader_gets_every_state(self, address: str, series: Series, rate_hz: int) -> None:
         with UrEmulator(series, host=address) as robot:
             reader = RtdeReader(address, 1.0)
-            states = [reader.read(1.0) for _ in range(rate_hz)]
+            states = [reader.read(1.0) for _ in range(rate_hz // 2)]
             reader.close()
             assert reader.rate_hz == rate_hz
             assert sum(state.skipped for state in states) == 0
             assert {state.force_n for state in states} == {0.0 if series == "e" else None}
             times = np.array([state.time_s for state in states])
-            assert (np.diff(times[rate_hz // 2 :]) < 1.1 / rate_hz).all()
+            assert (np.diff(times[rate_hz // 4 :]) < 1.1 / rate_hz).all()
             np.testing.assert_allclose(robot.pose_at(times[-1])[0], HOME)
             np.testing.assert_allclose(states[-1].pose, START, atol=1e-12)
 

@@ -11,6 +11,7 @@ from sense.rig.emulators import ur_controller
 from sense.rig.emulators.ur_controller import Controller, SpringySurface
 from sense.rig.emulators.ur_motion import Line, Motion, Ramp
 from sense.rig.ur5 import rtde_frames as ur_frames
+from tests.stress.clock import few
 
 START = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0])
 CYCLE_S = 0.008
@@ -18,6 +19,7 @@ CYCLE_S = 0.008
 coordinates = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(np.array)
 
 
+@few(40)
 @given(coordinates, coordinates, st.floats(0.001, 2), st.floats(0.01, 20))
 def test_a_line_keeps_to_its_speed_and_acceleration(start, end, speed, acceleration) -> None:
     line = Line(start, end, speed, acceleration)
@@ -33,6 +35,7 @@ def test_a_line_keeps_to_its_speed_and_acceleration(start, end, speed, accelerat
         assert np.linalg.norm(np.diff(poses[:, part], axis=0), axis=1).max() <= speed * step * (1 + 1e-6) + 1e-9
 
 
+@few(40)
 @given(coordinates, coordinates, coordinates, st.floats(0.01, 20))
 def test_a_ramp_ends_with_its_velocity(start, before, after, acceleration) -> None:
     ramp = Ramp(start, before, after, acceleration)

@@ -22,6 +22,7 @@ from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
 from sense.settings import RigSettings
+from tests.stress.clock import few
 
 pytest.importorskip("rtde_control")
 
@@ -29,9 +30,10 @@ PAD = Morphology.straight(2)
 QUICK = {"rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5}
 FAST = {"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000}
 QUIET = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
-RIG = emulated_rig(RigSettings.model_validate({"presses": 8, **QUICK, **FAST, **QUIET}), PAD)
+RIG = emulated_rig(RigSettings.model_validate({"presses": 6, **QUICK, **FAST, **QUIET}), PAD)
 PLAN = planned(PAD, RIG, np.random.default_rng(0))
 SHORT = PressPlan(PLAN.places_mm[:4], PLAN.depths_mm[:4])
+LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 
 class Rig:
@@ -158,10 +160,19 @@ FAULTS = {
 
 
 @pytest.mark.usefixtures("soon_settled")
-def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(rig: Rig, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("protective", "drop", "freeze", "stall", "unplug"),
+        pytest.param(("emergency", "restart"), marks=LONG),
+    ],
+    ids=" ".join,
+)
+def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(rig: Rig, tmp_path: Path, names: tuple[str, ...]) -> None:
     """One after the other in one recording, which is resumed after each."""
     run = tmp_path / "run"
-    for presses, (name, (disturb, cause, cure)) in enumerate(FAULTS.items(), start=1):
+    for presses, name in enumerate(names, start=1):
+        disturb, cause, cure = FAULTS[name]
         fault, told, speed = rig.disturbed(run, disturb)
         assert fault.cause == cause, name
         assert "\n" not in str(fault)

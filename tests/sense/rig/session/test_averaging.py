@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 
 from sense.rig.devices import ConverterSamples
 from sense.rig.session.averaging import Averager
+from tests.stress.clock import few
 
 
 def samples(count: int, lost: set[int]) -> ConverterSamples:
@@ -13,6 +14,7 @@ def samples(count: int, lost: set[int]) -> ConverterSamples:
     return ConverterSamples(kept / 1000, np.column_stack([kept, -kept]).astype(float), missing)
 
 
+@few(40)
 @given(st.integers(1, 12), st.integers(1, 200), st.sets(st.integers(0, 199), max_size=60), st.data())
 def test_any_pieces_give_the_means_of_whole_stretches(ratio, count, lost, data):
     whole = samples(count, lost)

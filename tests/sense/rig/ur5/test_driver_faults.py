@@ -119,7 +119,9 @@ while True:
 """
 
 
-@pytest.mark.parametrize(("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), pytest.param("e", "SIGKILL", marks=LONG)])
+@pytest.mark.parametrize(
+    ("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), pytest.param("e", "SIGKILL", marks=LONG)]
+)
 def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)
     arm.close()
