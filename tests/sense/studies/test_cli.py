@@ -43,7 +43,7 @@ def test_mistakes_are_one_line_and_leave_nothing(
 
 def test_an_interrupt_ends_at_once_and_keeps_what_was_finished(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "padforge", "study", "robustness", "square", "--presses", "1024"]
+    command = [sys.executable, "-m", "padforge", "study", "robustness", "square@6", "--presses", "256"]
     study = subprocess.Popen(
         [*command, "--out", str(out)],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
