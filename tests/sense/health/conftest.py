@@ -12,10 +12,13 @@ from tests.sense.health.pads import PRESSES, learn
 
 @pytest.fixture(scope="session")
 def pad() -> Recording:
-    """PRESSES on a simulated pad of six fibres."""
-    return simulate(
-        Morphology.random(3, knots=3, seed=5), sense_settings.RigSettings(presses=PRESSES, seed=1, drift_mv=10)
+    """The first PRESSES on a simulated pad of six fibres."""
+    whole = simulate(
+        Morphology.random(3, knots=3, seed=5), sense_settings.RigSettings(presses=900, seed=1, drift_mv=10)
     )
+    end = int(whole.begun[PRESSES])
+    presses = {name: getattr(whole, name)[:PRESSES] for name in ("presses_mm", "begun", "lifted")}
+    return Recording(whole.readings[:end], whole.times_s[:end], **presses)
 
 
 @pytest.fixture(scope="session")

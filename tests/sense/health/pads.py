@@ -13,7 +13,7 @@ from sense.health.learning import fit_health_model
 from sense.health.monitor import FibreFault, examine
 
 Array = NDArray[np.float64]
-LEARNT, PRESSES, BAD_FROM = 600, 900, 660
+LEARNT, PRESSES, BAD_FROM = 600, 760, 660
 
 
 def learn(readings: Array, pad: Recording, presses: int = LEARNT) -> HealthModel:

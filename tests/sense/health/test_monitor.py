@@ -136,12 +136,12 @@ def test_findings_are_told_in_one_line_each() -> None:
 def test_on_the_published_recording_faults_are_named_and_health_is_not(published: Path) -> None:
     pad = open_recording(published / "para5_long_first4500.mat")
     model = learn(pad.readings, pad, presses=1000)
-    end = pad.begun[1400]
-    short = Recording(pad.readings[:end], pad.times_s[:end], pad.presses_mm[:1400], pad.begun[:1400], pad.lifted[:1400])
+    end = pad.begun[1362]
+    short = Recording(pad.readings[:end], pad.times_s[:end], pad.presses_mm[:1362], pad.begun[:1362], pad.lifted[:1362])
     assert later(model, short.readings, short, first=1000) == []
     for fault, within in ((stuck, 20), (swapped, 20), (offset, 20), (weak, 60)):
         readings = short.readings.copy()
         fault(readings, int(short.begun[1300]), np.random.default_rng(0))
-        found = later(model, readings, short, first=1240)[0]
+        found = later(model, readings, short, first=1280)[0]
         assert set(found.fibres) <= ({1, 4} if fault is swapped else {1})
-        assert 60 <= found.press <= 60 + within
+        assert 20 <= found.press <= 20 + within
