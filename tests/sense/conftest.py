@@ -9,13 +9,21 @@ from sense import Localizer, Recording, calibrate
 from sense import settings as sense_settings
 from sense.recordings.simulation import simulate
 
-QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=100, batch=64)
+QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)
 
 
 @pytest.fixture(scope="session")
 def recording() -> Recording:
     """300 presses on a pad whose fibres wind."""
     return simulate(Morphology.random(2, knots=3, seed=5), sense_settings.RigSettings(presses=300, seed=1))
+
+
+@pytest.fixture(scope="session")
+def brief(recording: Recording) -> Recording:
+    """Its first 40 presses."""
+    end = int(recording.begun[40])
+    presses = {name: getattr(recording, name)[:40] for name in ("presses_mm", "begun", "lifted")}
+    return Recording(recording.readings[:end], recording.times_s[:end], **presses)
 
 
 @pytest.fixture(scope="session")

@@ -33,11 +33,8 @@ def live(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], mo
     return run
 
 
-def test_a_recording_is_shown(live, recording: Recording, tmp_path: Path) -> None:
-    end = int(recording.begun[40])
-    names = ("presses_mm", "begun", "lifted")
-    presses = {name: getattr(recording, name)[:40] for name in names}
-    Recording(recording.readings[:end], recording.times_s[:end], **presses).save(tmp_path / "short", {})
+def test_a_recording_is_shown(live, brief: Recording, tmp_path: Path) -> None:
+    brief.save(tmp_path / "short", {})
     replay = ("--replay", str(tmp_path / "short"), "--speed", "1e6")
     code, out, err = live(*replay, "--json")
     assert code == 0

@@ -41,18 +41,18 @@ def still(monkeypatch: pytest.MonkeyPatch) -> Time:
     return time
 
 
-def test_a_replay_gives_every_reading_once_when_it_is_due(recording: Recording, still: Time) -> None:
-    source = replayed(recording, 10.0)
-    assert (source.fibres, source.rate_hz) == (recording.fibres, recording.rate_hz)
+def test_a_replay_gives_every_reading_once_when_it_is_due(brief: Recording, still: Time) -> None:
+    source = replayed(brief, 10.0)
+    assert (source.fibres, source.rate_hz) == (brief.fibres, brief.rate_hz)
     times, readings = [], []
     for times_s, block in source.blocks:
         if len(times_s):
-            late_s = (still.now_s - 100.0) * 10 - (times_s[-1] - recording.times_s[0])
-            assert 0 <= late_s < 10 * (0.01 + 1e-6) + 1.3 / recording.rate_hz
+            late_s = (still.now_s - 100.0) * 10 - (times_s[-1] - brief.times_s[0])
+            assert 0 <= late_s < 10 * (0.01 + 1e-6) + 1.3 / brief.rate_hz
         times.append(times_s)
         readings.append(block)
-    np.testing.assert_array_equal(np.concatenate(times), recording.times_s)
-    np.testing.assert_array_equal(np.concatenate(readings), recording.readings)
+    np.testing.assert_array_equal(np.concatenate(times), brief.times_s)
+    np.testing.assert_array_equal(np.concatenate(readings), brief.readings)
     assert max(map(len, times)) <= 64
 
 
