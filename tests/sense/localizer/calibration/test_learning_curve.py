@@ -1,13 +1,18 @@
 """Learning curves: the power law is found again, forecasts follow, and broken off it ends at once."""
 
 import json
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import padforge
 from design.common.errors import InputError
 from sense import Recording
 from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
@@ -34,10 +39,20 @@ def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
     assert min(fit) >= 0
 
 
-def test_what_more_presses_would_bring_is_said(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sense.localizer.calibration.learning_curve.DRAWS", 40)
-    document = learning_curve(recording, QUICK)
-    assert document == learning_curve(recording, QUICK)
+@pytest.fixture(scope="module", autouse=True)
+def few_draws() -> Iterator[None]:
+    """Few resamplings."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("sense.localizer.calibration.learning_curve.DRAWS", 40)
+        yield
+
+
+@pytest.fixture(scope="module")
+def document(recording: Recording) -> dict[str, Any]:
+    return learning_curve(recording, QUICK)
+
+
+def test_what_more_presses_would_bring_is_said(document: dict[str, Any]) -> None:
     assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
     ahead = document["forecast"]
     assert ahead["presses"] == 510
@@ -45,6 +60,26 @@ def test_what_more_presses_would_bring_is_said(recording: Recording, monkeypatch
     assert "255 more presses" in document["advice"]
     assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
     json.dumps(document, allow_nan=False)
+
+
+def test_the_command_finds_the_same_and_writes_a_document_and_a_figure(
+    recording: Recording,
+    document: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recording.save(tmp_path / "rec", {})
+    monkeypatch.chdir(tmp_path)
+    Path("pad.toml").write_text("[localizer]\nhidden = 24\nlayers = 1\nepochs = 2\nbatch = 64\n")
+    monkeypatch.setattr(sys, "argv", ["padforge", "sense", "learning-curve", "rec", "--out", "out", "--json"])
+    with pytest.raises(SystemExit) as caught:
+        padforge.main()
+    assert not caught.value.code
+    found = json.loads(capsys.readouterr().out)
+    assert found == json.loads(Path("out/learning_curve.json").read_text())
+    assert found | {"provenance": None} == json.loads(json.dumps(document)) | {"provenance": None}
+    assert Path("out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
