@@ -180,7 +180,7 @@ def test_errors_by_place_make_up_the_mean(calibrated: tuple[Localizer, dict]) ->
 
 def test_a_short_training_on_the_published_recording_is_already_near(published: Path) -> None:
     recording = import_mat(published / "para5_long_first4500.mat")
-    _, document = calibrate(recording, Options(members=1, hidden=96, epochs=15, lost=1))
+    _, document = calibrate(recording, Options(members=1, hidden=64, epochs=8, lost=1))
     assert document["test_presses"] == 675
     assert document["errors"][0]["mean_mm"] < 2.4
 
