@@ -1,8 +1,13 @@
 from pathlib import Path
 
+import pytest
 
-def test_the_model_given_is_never_written_over_unasked(few) -> None:
+from sense.localizer.calibration import fine_tuning
+
+
+def test_the_model_given_is_never_written_over_unasked(few, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its folder may be that of the new recording too."""
+    monkeypatch.setattr(fine_tuning, "STEPS", 15)
     few("record", "--presses", "20", "--seed", "2", "--out", "model/later")
     before = {path.name: path.read_bytes() for path in Path("model").iterdir() if path.is_file()}
     code, out, err = few("recalibrate", "--model", "./model", "model/later")
