@@ -20,6 +20,12 @@ CONTACTS = [
 ]
 
 
+def straight_axes(grid):
+    """Travel and cross (2M, 3) of straight fibres with a knot in the middle: a search has at least one."""
+    ends = np.array(fibre_axes(Morphology.straight(grid))[:2])[:, 0]
+    return [torch.tensor(np.insert(axis, 1, axis.mean(axis=1), axis=1), requires_grad=True) for axis in ends]
+
+
 def torch_signals(travel, cross, presses, contact):
     return ExactSignals.apply(travel, cross, pchip_slopes(travel, cross), presses, contact)
 
@@ -57,8 +63,7 @@ def test_the_torch_function_gives_the_exact_signals():
 
 
 def test_an_untouched_fibre_has_no_gradient_and_grazing_stays_finite():
-    axes = fibre_axes(Morphology.straight(3))
-    travel, cross = (torch.tensor(axis[0], requires_grad=True) for axis in axes[:2])
+    travel, cross = straight_axes(3)
     grazing = np.array([[2.0, 2.0 - 0.6], [2.0, 2.0 - 0.6 + 1e-12]])
     torch_signals(travel, cross, grazing, Contact(sides=None)).sum().backward()
     assert cross.grad is not None
@@ -74,7 +79,7 @@ def test_a_fibre_that_grazes_a_circle_changes_its_signal_by_no_more_than_it_woul
         (radius * np.sqrt(1 - 0.021**2), -2 * np.sqrt(1 - 0.021**2) / 0.021),
         (radius * (1 - 1e-9), -2 / 0.02),
     ):
-        travel, cross = (torch.tensor(axis[0], requires_grad=True) for axis in fibre_axes(Morphology.straight(2))[:2])
+        travel, cross = straight_axes(2)
         torch_signals(travel, cross, np.array([[1.5, 1 - height]]), contact)[0, 0].backward()
         assert cross.grad is not None
         assert cross.grad[0].sum().item() == pytest.approx(expected, rel=1e-4)
