@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Morphology, flatten
 from design.pad.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
 from design.pad.curves import beziers, slope_beziers
+from tests.stress.clock import few
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 seeds = st.integers(0, 2**32 - 1)
@@ -70,6 +71,7 @@ def test_windows_count_the_corners_at_both_their_ends(steps, quarters):
     assert bend_radius(points, headings, quarters / 4)[0] == pytest.approx(window / most if most else np.inf)
 
 
+@few(40)
 @given(seeds, st.integers(1, 20), st.sampled_from([0.05, 0.3, 2.0]))
 def test_the_bend_radius_is_that_of_every_window_tried(seed, knots, window):
     pad = Morphology.random(2, knots, seed)
@@ -96,6 +98,7 @@ def test_a_circle_through_knots_has_its_radius(radius):
     assert bend_radius(points, headings, radius / 2)[0] == pytest.approx(radius, rel=5e-3)
 
 
+@few(50)
 @given(seeds, st.integers(0, 20), st.sampled_from([0.5, 0.02]))
 def test_traced_points_lie_on_the_curve_with_its_headings(seed, knots, step):
     pad = Morphology.random(1, knots, seed)
@@ -136,14 +139,15 @@ def assert_nearest(found, tried, gap, step):
         assert found[0] - 1e-9 <= tried <= found[0] + step
 
 
+@few(20)
 @given(seeds, st.integers(1, 12), st.sampled_from([0.1, 0.4]))
-@settings(max_examples=40)
 def test_the_fold_gap_is_that_of_all_points_tried(seed, knots, gap):
     pad = Morphology.random(1, knots, seed)
     line = flatten(pad, 1e-3)[0]
     assert_nearest(fold_gap(line, gap), folds_tried(line, gap, gap / 20), gap, gap / 20)
 
 
+@few(40)
 @given(st.lists(st.tuples(st.floats(0.01, 1), st.floats(-1.5, 1.5)), min_size=1, max_size=8), st.floats(0.1, 1))
 def test_the_fold_gap_of_long_straight_branches(steps, gap):
     length, heading = np.array(steps).T
