@@ -9,10 +9,11 @@ from hypothesis.extra import numpy as hnp
 from design.common.errors import InputError
 from sense.processing.filters import running_median, total_variation
 from sense.processing.stream_filters import RunningMedian, TotalVariation
+from tests.stress.clock import few
 
 VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))
-RECORDINGS = hnp.arrays(np.float64, st.tuples(st.integers(0, 60), st.integers(1, 3)), elements=VALUES)
-CUTS = st.lists(st.integers(0, 60), max_size=8).map(sorted)
+RECORDINGS = hnp.arrays(np.float64, st.tuples(st.integers(0, 40), st.integers(1, 2)), elements=VALUES)
+CUTS = st.lists(st.integers(0, 40), max_size=6).map(sorted)
 LAMS = st.sampled_from([0.3, 1.0, 2.3, 4.0, 30.0, 1e6])
 FIDELITY = st.sampled_from(["robust", "squares"])
 
@@ -21,18 +22,21 @@ def streamed(stream, readings, cuts=()):
     return np.concatenate([*(stream.feed(block) for block in np.split(readings, cuts)), stream.finish()])
 
 
+@few(50)
 @given(RECORDINGS, CUTS, LAMS, FIDELITY)
 def test_total_variation_of_blocks_is_that_of_the_whole(y, cuts, lam, fidelity):
     x = streamed(TotalVariation(y.shape[1], lam, fidelity), y, cuts)
     np.testing.assert_array_equal(x, total_variation(y, lam, fidelity))
 
 
+@few(50)
 @given(RECORDINGS, CUTS, st.sampled_from([1, 3, 7, 99]), st.booleans())
 def test_running_median_of_blocks_is_that_of_the_whole(y, cuts, width, causal):
     x = streamed(RunningMedian(y.shape[1], width, causal), y, cuts)
     np.testing.assert_array_equal(x, running_median(y, width, causal=causal))
 
 
+@few(50)
 @given(RECORDINGS, RECORDINGS, LAMS, FIDELITY)
 def test_what_is_given_stands_whatever_follows(y, follows, lam, fidelity):
     given = TotalVariation(y.shape[1], lam, fidelity).feed(y)
@@ -40,6 +44,7 @@ def test_what_is_given_stands_whatever_follows(y, follows, lam, fidelity):
     np.testing.assert_array_equal(given, total_variation(np.concatenate([y, follows]), lam, fidelity)[: len(given)])
 
 
+@few(50)
 @given(RECORDINGS, LAMS, FIDELITY)
 def test_what_is_held_back_could_still_change(y, lam, fidelity):
     """Nothing waits longer than it must: of what is held, the first value does depend on what follows."""
@@ -52,6 +57,7 @@ def test_what_is_held_back_could_still_change(y, lam, fidelity):
             assert first[0] > first[1]
 
 
+@few(50)
 @given(RECORDINGS, LAMS, FIDELITY)
 def test_latest_is_the_causal_value(y, lam, fidelity):
     stream = TotalVariation(y.shape[1], lam, fidelity)
@@ -73,6 +79,7 @@ def test_at_the_cap_a_channel_is_decided_as_if_it_ended():
         np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), expected)
 
 
+@few(50)
 @given(RECORDINGS, CUTS, LAMS, FIDELITY, st.integers(1, 12))
 def test_at_the_cap_the_size_of_blocks_makes_no_difference(y, cuts, lam, fidelity, most):
     x = streamed(TotalVariation(y.shape[1], lam, fidelity, most), y, cuts)
