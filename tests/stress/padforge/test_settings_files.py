@@ -242,8 +242,8 @@ def test_a_whole_run_with_extreme_settings_is_checked_in_time(folder: Path, tabl
             require_one_line(error)
 
 
-@few(40)
-@given(extremes(("pad", "rules", "contact")), st.integers(1, 4), st.integers(0, 8), st.integers(0, 2**32 - 1))
+@few(30)
+@given(extremes(("pad", "rules", "contact")), st.integers(1, 3), st.integers(0, 6), st.integers(0, 2**32 - 1))
 def test_rules_at_their_extremes(tables: dict[str, dict[str, Any]], grid: int, knots: int, seed: int):
     spec = Spec(tables)
     pad = Morphology.random(grid, knots, seed, spec.section(PadSettings).pitch_mm)
@@ -255,7 +255,7 @@ def test_rules_at_their_extremes(tables: dict[str, dict[str, Any]], grid: int, k
 
 
 @few(10)
-@given(extremes(("pad", "rules", "mould", "printer")), st.integers(1, 3), st.integers(0, 3), st.integers(0, 2**32 - 1))
+@given(extremes(("pad", "rules", "mould", "printer")), st.integers(1, 2), st.integers(0, 2), st.integers(0, 2**32 - 1))
 def test_a_mould_at_the_extremes(tables: dict[str, dict[str, Any]], grid: int, knots: int, seed: int):
     spec = Spec(tables)
     pad = Morphology.random(grid, knots, seed, spec.section(PadSettings).pitch_mm)
