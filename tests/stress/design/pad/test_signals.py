@@ -95,6 +95,7 @@ def sampled(pad: Morphology, fibre: int, contact: Contact, press: Array, count: 
     axis = 0 if fibre < pad.grid else 1
     knots = pad.knots[fibre]
     t = np.linspace(0, pad.grid + 1, count)
+    t = t[np.abs(t - press[axis]) <= contact.radius + 1e-3]  # all that it can reach
     v = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])(t)
     dt, dv = np.diff(t), np.diff(v)
     middle = np.stack([t[1:] + t[:-1], v[1:] + v[:-1]][:: 1 if axis == 0 else -1], axis=1) / 2 - press
