@@ -35,7 +35,7 @@ def begun(tmp_path_factory) -> dict[str, bytes]:
     return found
 
 
-@few(40)
+@few(20)
 @given(st.sampled_from(["descent", "genetic"]), st.data())
 def test_damaged_checkpoints(folder: Path, begun: dict[str, bytes], method: str, data: st.DataObject):
     kept = folder / "search"

@@ -24,10 +24,10 @@ from tests.stress.design.pad.test_signals import KINDS
 from tests.stress.values import LAX, pads, seeds, wild_knots
 
 
-@settings(few(60), suppress_health_check=LAX)
+@settings(few(30), suppress_health_check=LAX)
 @given(st.data())
 def test_curves_keep_to_their_knots(data):
-    pad = data.draw(pads((1, 4), (0, 12)))
+    pad = data.draw(pads((1, 3), (0, 12)))
     d, spans, bends = slopes(pad), beziers(pad), slope_beziers(pad)
     assert np.isfinite(d).all()
     assert np.isfinite(spans).all()
@@ -49,7 +49,7 @@ def test_curves_keep_to_their_knots(data):
     assert (long <= whole_lengths(pad, Contact()) * (1 + 1e-4)).all()
 
 
-@settings(few(30), suppress_health_check=LAX)
+@settings(few(20), suppress_health_check=LAX)
 @given(st.data())
 def test_every_horizontal_crosses_every_vertical_somewhere(data):
     pad = data.draw(pads((1, 3), (0, 8)))
@@ -64,7 +64,7 @@ def test_every_horizontal_crosses_every_vertical_somewhere(data):
     assert ((angles >= 0) & (angles <= 90)).all()
 
 
-@settings(few(30), suppress_health_check=LAX)
+@settings(few(20), suppress_health_check=LAX)
 @given(st.data())
 def test_bends_and_folds_of_any_curve(data):
     pad = data.draw(pads((1, 2), (0, 8)))
