@@ -104,7 +104,7 @@ def _numbers(document: Any) -> list[float]:
     return [float(document)] if isinstance(document, int | float) else []
 
 
-@few(40)
+@few(20)
 @given(seed=seeds)
 def test_the_worst_recordings_are_located_examined_and_evaluated(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -170,8 +170,8 @@ def test_health_is_learnt_from_the_worst_or_refused(
         )
         model.save(tmp_path_factory.getbasetemp())
         assert sense.HealthModel.load(tmp_path_factory.getbasetemp()).dead == model.dead
-        for finding in sense.examine(model, readings, one.times_s, one.begun, one.lifted):
-            assert 0 <= finding.since <= finding.press < 320
+        for finding in sense.examine(model, readings, one.times_s, one.begun[::4], one.lifted[::4]):
+            assert 0 <= finding.since <= finding.press < 80
             assert not set(finding.fibres) & set(model.dead)
 
     right_or_refused(work, 30)
@@ -240,12 +240,12 @@ def test_inputs_of_presses_scale_with_volts_and_keep_fibres_apart(features: str,
 
 
 def test_very_many_presses_take_memory_in_proportion() -> None:
-    """Ten readings each, of two fibres; what is made of them takes no more than some such tables."""
+    """Ten readings each, of one fibre; what is made of them takes no more than some such tables."""
     import resource
 
     presses = 1_000_000 if few(1).max_examples > 1 else 50_000
     rng = np.random.default_rng(0)
-    readings = 1.8 + 0.01 * rng.standard_normal((10 * presses, 2))
+    readings = 1.8 + 0.01 * rng.standard_normal((10 * presses, 1))
     begun = 10 * np.arange(presses) + 5
     one = sense.Recording(readings, np.arange(10.0 * presses) / 100, rng.uniform(-1, 1, (presses, 2)), begun, begun + 5)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
