@@ -23,11 +23,14 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals a
 
 LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
+FORMATS = "stl,3mf,svg,dxf" + (",png" if few(1).max_examples > 1 else "")
+"""All are written in one way; pictures take half of the time."""
+
 COMMANDS = {
     "design": ("design", "--out", "pad"),
     "genetic": ("design", "--method", "genetic", "--out", "pad"),
     "show": ("design", "show", "made/morphology.json", "--out", "pad/plan.png"),
-    "fabricate": ("fabricate", "made/morphology.json", "--formats", "stl,3mf,svg,dxf,png", "--out", "pad"),
+    "fabricate": ("fabricate", "made/morphology.json", "--formats", FORMATS, "--out", "pad"),
     "picture": ("fabricate", "check", "made/morphology.json", "--picture", "pad/found.png"),
     "init": ("init", "pad/new.toml"),
     "report": ("report", "pad"),
@@ -111,7 +114,7 @@ def litter(folder: Path) -> list[str]:
     ("name", "limit"),
     [
         ("fabricate", 2000),
-        ("record", 0),
+        pytest.param("record", 0, marks=LONG),  # `tests/stress/sense/cli` has it, in no process of its own
         *(
             pytest.param(name, limit, marks=LONG)
             for name in ("design", "picture", "show", "report")
@@ -133,7 +136,9 @@ def test_a_full_disk_leaves_old_files_and_no_litter(room: Path, name: str, limit
 
 
 @pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write everywhere")
-@pytest.mark.parametrize("name", ["fabricate", "init", pytest.param("design", marks=LONG), "record"])
+@pytest.mark.parametrize(
+    "name", ["fabricate", "init", pytest.param("design", marks=LONG), pytest.param("record", marks=LONG)]
+)
 def test_a_closed_folder_is_one_line(room: Path, name: str):
     (room / "pad").chmod(0o555)
     before = contents(room)
