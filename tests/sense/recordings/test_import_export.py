@@ -189,7 +189,7 @@ def test_files_of_another_kind_are_one_line_and_no_recording(tmp_path: Path, end
         assert not (tmp_path / "out").exists()
 
 
-@few(40)
+@few(20)
 @given(content=st.binary(max_size=300))
 def test_bytes_at_random_are_an_input_error_and_nothing_else(tmp_path_factory, content: bytes) -> None:
     folder = tmp_path_factory.mktemp("noise")

@@ -56,7 +56,7 @@ def test_plans_of_any_kind(tmp_path_factory: pytest.TempPathFactory, seed: int) 
 
 
 @pytest.mark.parametrize("name", ["plain.mat", "packed.mat"])
-@few(40)
+@few(20)
 @given(seed=seeds)
 def test_a_mat_with_bytes_changed(tmp_path_factory: pytest.TempPathFactory, name: str, seed: int) -> None:
     rng, tmp = np.random.default_rng(seed), tmp_path_factory.getbasetemp()
@@ -65,7 +65,7 @@ def test_a_mat_with_bytes_changed(tmp_path_factory: pytest.TempPathFactory, name
     sound(right_or_refused(lambda: sense.import_mat(path)))
 
 
-@few(30)
+@few(20)
 @given(seed=seeds)
 def test_hdf5_with_bytes_changed(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng, tmp = np.random.default_rng(seed), tmp_path_factory.getbasetemp()
