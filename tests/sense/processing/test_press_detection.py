@@ -27,6 +27,7 @@ from tests.sense.processing.spoiled_readings import (
     swapped,
     torn,
 )
+from tests.stress.clock import few
 
 RATE_HZ = 14.0
 EARLY = 3
@@ -157,6 +158,7 @@ def quiet(fibres: int, sd: float, step: float, seed: int) -> np.ndarray:
     return np.rint(readings / step) * step if step else readings
 
 
+@few(50)
 @given(
     fibres=st.sampled_from([1, 2, 6, 100]),
     sd=st.sampled_from([0.0, 0.1 * COUNT, 0.3 * COUNT, COUNT, 0.1]),
@@ -202,15 +204,16 @@ def test_a_recording_that_begins_under_a_press_is_set_right(recording: Recording
     assert false <= 0.05
 
 
-@given(cuts=st.lists(st.integers(0, 4000), max_size=20))
+@few(50)
+@given(cuts=st.lists(st.integers(0, 2000), max_size=20))
 def test_it_does_not_matter_how_readings_are_cut(recording: Recording, cuts: list[int]) -> None:
-    readings, times = recording.readings[:4000], recording.times_s[:4000]
+    readings, times = recording.readings[:2000], recording.times_s[:2000]
     finder = Finder(recording.fibres)
-    edges = [0, *sorted(cuts), 4000]
+    edges = [0, *sorted(cuts), 2000]
     told = [event for first, end in pairwise(edges) for event in finder.feed(times[first:end], readings[first:end])]
     touched, released = find_presses(readings, times)
     assert [event.reading for event in told if event.down] == touched.tolist()
-    assert [event.reading for event in told if not event.down] == released[released < 4000].tolist()
+    assert [event.reading for event in told if not event.down] == released[released < 2000].tolist()
     assert [event.down for event in told] == [True, False] * (len(told) // 2) + [True] * (len(told) % 2)
 
 
