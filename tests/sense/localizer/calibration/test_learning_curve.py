@@ -40,10 +40,11 @@ def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_draws() -> Iterator[None]:
-    """Few resamplings."""
+def quick() -> Iterator[None]:
+    """Few resamplings, and a coarse map of the answers."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("sense.localizer.calibration.learning_curve.DRAWS", 40)
+        patched.setattr("sense.localizer.response_model.BUMPS", 7)
         yield
 
 
@@ -90,7 +91,7 @@ def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
 
 
 def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
-    long, heard = QUICK.model_copy(update={"epochs": 100_000}), []
+    long, heard = QUICK.model_copy(update={"epochs": 1000}), []
 
     def interrupted(done: int, total: int) -> None:
         heard.append(done / total)
