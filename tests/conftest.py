@@ -1,11 +1,15 @@
 """Fixtures shared by all tests."""
 
+import os
 import sys
 import tempfile
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# a worker a core leaves nothing for the threads that numpy would take besides; to be said before it is imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 settings.register_profile("padforge", deadline=None, derandomize=True)
 settings.register_profile("stress", deadline=None, max_examples=1000, print_blob=True)

@@ -110,6 +110,8 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
     settings = content["K"][0, 0]
     contact = Contact(radius=float(settings["object_size"].item()), sides=int(settings["str_shp"].item()))
     places, expected = reals("loc_all", content["loc_all"][:presses], FARTHEST), content["sens_raw_all"][:presses]
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise InputError(f"loc_all has shape {content['loc_all'].shape}, expected (Q, 2)")
     samples = whole("fineness", int(settings["fineness"].item()), 2, MOST_SAMPLES)
     travel, cross = axes(knots[None])
     misfits = []

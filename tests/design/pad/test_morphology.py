@@ -153,6 +153,8 @@ def test_tiles_beyond_reason_are_refused(times):
         {"K": {"str_shp": 30, "fineness": 100}},
         {"K": {"object_size": -1, "str_shp": 30, "fineness": 100}},
         {"sens_raw_all": np.ones((5, 7))},
+        {"loc_all": np.ones((2, 2, 8))},
+        {"loc_all": ""},
         {"K": 3},
     ],
 )
