@@ -22,9 +22,9 @@ def small(**options) -> Study:
     return robustness_study(PADS, lost=2, hidden=10, presses=144, test=300, **options)
 
 
-def least(pads: Mapping[str, Morphology], **options) -> Study:
+def least(pads: Mapping[str, Morphology], test: int = 20, contact: Contact | None = None) -> Study:
     """Two tasks a pad, of hardly any work."""
-    return robustness_study(pads, lost=1, hidden=4, presses=16, **{"test": 20} | options)
+    return robustness_study(pads, lost=1, hidden=4, presses=16, test=test, contact=contact)
 
 
 @pytest.fixture(scope="module")
