@@ -29,7 +29,7 @@ PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Rigs first: they wait for clocks and need few compiled kernels, which another process compiles meanwhile."""
-    items.sort(key=lambda item: RIG not in item.path.parents)
+    items.sort(key=lambda item: RIG not in item.path.parents or item.path.parent.name == "planning")
 
 
 @pytest.fixture(scope="session")

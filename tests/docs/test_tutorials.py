@@ -23,7 +23,7 @@ import pytest
 
 from sense.health import fibre_prediction
 from tests.docs.pages import BLOCK, ROOT, relative
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.door import call
 
 TUTORIALS = [ROOT / "docs" / f"tutorial-{stage}.md" for stage in ("design", "fabricate", "sense", "study")]

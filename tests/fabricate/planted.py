@@ -3,15 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings
 from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
-from tests.stress.clock import few
-
-LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 
 def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:

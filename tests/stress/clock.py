@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import hypothesis
 from numba.core import event
 
 LIMIT_S = 10
@@ -57,11 +56,3 @@ def ends_in_time(limit_s: float = LIMIT_S) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-
-
-def few(examples: int) -> hypothesis.settings:
-    """Settings of a test that tries `examples` cases in everyday runs, and as many as the profile says under stress."""
-    default = hypothesis.settings.default
-    assert default is not None
-    stressed = default.max_examples >= hypothesis.settings.get_profile("stress").max_examples
-    return hypothesis.settings(max_examples=default.max_examples if stressed else examples)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from design import Contact, InputError, Morphology
 from design.pad.knots import assemble
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 
 Array = NDArray[np.float64]
 LAX = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much, HealthCheck.large_base_example]

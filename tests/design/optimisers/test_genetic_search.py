@@ -7,6 +7,7 @@ from design.criteria.published_objective import published_objective
 from design.optimisers.genetic_search import GeneticSearch
 from design.optimisers.problem import SearchProblem
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from tests.helpers.effort import LONG
 
 PAD, CONTACT = PadSettings(grid=3), Contact()
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
@@ -82,7 +83,7 @@ def test_the_smallest_pads_with_the_smallest_populations_are_bred_too(grid):
     assert found.pitch_mm == 20
 
 
-@pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), (20, 0.1040)])
+@pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), pytest.param(20, 0.1040, marks=LONG)])
 def test_a_whole_search_reaches_the_published_objective(knots, bar):
     breeding = GeneticSearch(
         SearchProblem(PadSettings(), (CONTACT,), SearchSettings(method="genetic", knots=knots), RulesSettings())

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from design import Morphology, flatten
 from design.pad.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
 from design.pad.curves import beziers, slope_beziers
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 seeds = st.integers(0, 2**32 - 1)

@@ -11,7 +11,7 @@ from design import Morphology, crossings, flatten
 from design.criteria.differentiable import pchip_sample
 from design.pad.curves import beziers, crossing_angles, lengths, slopes
 from design.pad.kernels.pchip import sample_curves
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 pads = st.builds(
     Morphology.random, st.integers(1, 3), st.integers(0, 10), st.integers(0, 2**32 - 1).map(np.random.default_rng)

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from design import InputError, Morphology
 from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 INDENTERS = [Indenter("sphere", 0.7), Indenter("cone", angle_deg=30), Indenter("flat", 0.45)]
 

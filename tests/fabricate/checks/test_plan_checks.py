@@ -8,7 +8,8 @@ from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.plan_checks import _thinner, check, check_plan
 from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, FabricationSettings
-from tests.fabricate.planted import LONG, level_pad, with_settings
+from tests.fabricate.planted import level_pad, with_settings
+from tests.helpers.effort import LONG
 
 
 def found(pad: Morphology, name: str, settings: FabricationSettings = DEFAULTS) -> Finding:

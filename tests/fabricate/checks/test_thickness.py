@@ -27,7 +27,7 @@ from tests.fabricate.trays import (
     spanning,
     tray,
 )
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 
 class TestGood:

@@ -24,7 +24,8 @@ from fabricate.mould.cad_solid import faceted_solid
 from fabricate.mould.mesh import arrays, mesh
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body, Prism
-from tests.fabricate.planted import LONG, with_settings
+from tests.fabricate.planted import with_settings
+from tests.helpers.effort import LONG
 
 EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}
 

@@ -11,7 +11,7 @@ from sense import open_recording
 from sense.processing.benchmark import fibre, linear_program, objective
 from sense.processing.filters import running_median, stretches, total_variation
 from sense.processing.stream_filters import TotalVariation
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 STEP_V = 3.3 / 1023
 LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])

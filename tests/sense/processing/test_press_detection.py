@@ -14,6 +14,7 @@ from sense import Recording, RigSettings, import_mat, simulate
 from sense.processing.kernels import level_tracking
 from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder, Presses, as_commanded, find_presses
 from sense.recordings.pad_model import Divider
+from tests.helpers.effort import few
 from tests.sense.processing.spoiled_readings import (
     breaking,
     dead,
@@ -27,7 +28,6 @@ from tests.sense.processing.spoiled_readings import (
     swapped,
     torn,
 )
-from tests.stress.clock import few
 
 RATE_HZ = 14.0
 EARLY = 3

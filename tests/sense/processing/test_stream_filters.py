@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from design.common.errors import InputError
 from sense.processing.filters import running_median, total_variation
 from sense.processing.stream_filters import RunningMedian, TotalVariation
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))
 RECORDINGS = hnp.arrays(np.float64, st.tuples(st.integers(0, 40), st.integers(1, 2)), elements=VALUES)

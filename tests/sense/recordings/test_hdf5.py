@@ -8,22 +8,26 @@ from sense import RigSettings, open_recording, simulate
 from sense.cli.main import sense
 from sense.recordings.hdf5 import export_hdf5, import_hdf5
 
-RECORDING = simulate(Morphology.straight(2), RigSettings(presses=8))
+
+@pytest.fixture(scope="module")
+def eight():
+    """A recording of eight presses."""
+    return simulate(Morphology.straight(2), RigSettings(presses=8))
 
 
-def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path):
-    export_hdf5(RECORDING, tmp_path / "a.h5")
-    export_hdf5(RECORDING, tmp_path / "b.h5")
+def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path, eight):
+    export_hdf5(eight, tmp_path / "a.h5")
+    export_hdf5(eight, tmp_path / "b.h5")
     again = import_hdf5(tmp_path / "a.h5")
-    assert again == RECORDING
-    assert again.source == RECORDING.source
+    assert again == eight
+    assert again.source == eight.source
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-    assert open_recording(tmp_path / "a.h5") == RECORDING
+    assert open_recording(tmp_path / "a.h5") == eight
 
 
 @pytest.mark.parametrize("keep", [0, 10, 500, -1])
-def test_a_torn_file_is_one_clear_line(tmp_path, keep):
-    export_hdf5(RECORDING, tmp_path / "a.h5")
+def test_a_torn_file_is_one_clear_line(tmp_path, keep, eight):
+    export_hdf5(eight, tmp_path / "a.h5")
     content = (tmp_path / "a.h5").read_bytes()
     (tmp_path / "torn.h5").write_bytes(content[:keep])
     with pytest.raises(InputError, match=r"torn\.h5") as refusal:
@@ -84,11 +88,11 @@ def test_datasets_that_do_not_fit_are_one_clear_line(tmp_path, change, reason):
 
 
 @pytest.mark.parametrize("suffix", ["h5", "csv"])
-def test_export_and_import_by_command(tmp_path, suffix):
-    RECORDING.save(tmp_path / "run", {})
+def test_export_and_import_by_command(tmp_path, suffix, eight):
+    eight.save(tmp_path / "run", {})
     file = tmp_path / f"out.{suffix}"
     result = CliRunner().invoke(sense, ["export", str(tmp_path / "run"), str(file)])
     assert result.exit_code == 0, result.output
     result = CliRunner().invoke(sense, ["import", str(file), "--out", str(tmp_path / "again")])
     assert result.exit_code == 0, result.output
-    assert open_recording(tmp_path / "again") == RECORDING
+    assert open_recording(tmp_path / "again") == eight

@@ -14,7 +14,7 @@ from design.common.errors import InputError
 from sense import Recording, export_csv, import_csv, import_mat, open_recording
 from sense.cli.main import sense
 from sense.recordings.import_export import export_file
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 MAT = "para5_long_first4500.mat"
 

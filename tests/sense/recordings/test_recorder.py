@@ -12,7 +12,7 @@ from sense.recordings.block_file import block_dtype
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import JOURNAL, READINGS, STATES, Recorder
 from sense.recordings.recording import Recording
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 FIBRES = 3
 

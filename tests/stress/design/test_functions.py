@@ -30,7 +30,8 @@ from design.evaluation.localisation_error import localisation_error
 from design.optimisers.search import SearchRun, search
 from design.report.plan_drawing import draw_plan
 from design.settings import PadSettings, RulesSettings, SearchSettings
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.values import LAX, call_spoiled, contacts, pads, presses
 
 Arguments = dict[str, Any]

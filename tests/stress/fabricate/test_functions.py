@@ -27,7 +27,8 @@ from fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
 from fabricate.checks.plan_checks import meshed
 from fabricate.mesh_files import read_mesh, write_3mf, write_stl
 from fabricate.report.pictures import draw_findings
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.values import LAX, Array, call_spoiled, pads
 
 Arguments = dict[str, Any]

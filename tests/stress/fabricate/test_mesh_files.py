@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from design.common.errors import InputError
 from fabricate.checks.mesh_checks import inspect_mesh
 from fabricate.mesh_files import read_mesh
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.damage import damages
 from tests.stress.design.pad.test_morphology_files import KINDS
 from tests.stress.door import require_one_line

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.door import SPECIAL, Workshop
 
 LONG = "x" * 300

@@ -16,12 +16,11 @@ import pytest
 from design.common.files import atomic, write_json
 from design.pad.morphology import Morphology
 from fabricate.mesh_files import read_mesh
-from tests.stress.clock import few
+from tests.helpers.effort import LONG, few
 from tests.stress.door import CHEAP, contents
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")
 
-LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 FORMATS = "stl,3mf,svg" + (",dxf,png" if few(1).max_examples > 1 else "")
 """All are written in one way; what draws the others takes half of the time to load."""

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from design.common.errors import InputError
 from padforge import write_report
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.damage import damages, dump, replacements
 from tests.stress.door import require_one_line
 

@@ -18,7 +18,8 @@ from design.settings import Contact, PadSettings, RulesSettings
 from fabricate import settings as fabricate
 from fabricate.checks import plan_checks as printability
 from padforge import _check_ahead, _sections
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.door import require_one_line
 
 MODELS = _sections()

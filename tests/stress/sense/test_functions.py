@@ -11,7 +11,7 @@ import sense
 from design import Morphology
 from sense import settings as sense_settings
 from sense.rig.planning.press_plan import PressPlan
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.sense.cases import (
     EXTREMES,
     ODD,

@@ -16,11 +16,10 @@ from scipy.optimize import brentq
 from design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
 from design.pad.contact import signals_and_spans
 from design.pad.knots import assemble
-from tests.stress.clock import few
+from tests.helpers.effort import LONG, few
 
 WEIGHTS: tuple[Literal["uniform", "inverse_square", "inverse"], ...] = ("uniform", "inverse_square", "inverse")
 LENGTHS: tuple[Literal["manhattan", "euclidean"], ...] = ("manhattan", "euclidean")
-LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 
 def root(function, low, high):

@@ -8,7 +8,7 @@ import pytest
 from sense.rig.arduino.driver import Assembler
 from sense.rig.arduino.framing import Block, BoardSettings, Decoder, encode
 from sense.rig.devices import RigFault
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 STEP_V = 3.3 / 4095
 SETTINGS = BoardSettings(1_000_000, 0xFF, 1)

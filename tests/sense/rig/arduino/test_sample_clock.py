@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 
 from sense.rig.arduino import sample_clock as clock
 from sense.rig.arduino.sample_clock import SampleClock
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 SETTLE_S = 0.5
 

@@ -13,7 +13,7 @@ import padforge
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recording import Recording
 from sense.rig.ur5.rtde_frames import RTDE_PORT
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 pytest.importorskip("rtde_control")
 

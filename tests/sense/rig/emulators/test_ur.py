@@ -20,7 +20,7 @@ from sense.rig.emulators.ur import HOME, UrEmulator
 from sense.rig.emulators.ur_controller import Series
 from sense.rig.ur5 import rtde_frames as ur_frames
 from sense.rig.ur5.rtde_reader import HostClock, RtdeReader
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 START = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0])
 CYCLE_S = 0.008

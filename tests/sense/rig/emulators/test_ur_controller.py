@@ -11,7 +11,7 @@ from sense.rig.emulators import ur_controller
 from sense.rig.emulators.ur_controller import Controller, SpringySurface
 from sense.rig.emulators.ur_motion import Line, Motion, Ramp
 from sense.rig.ur5 import rtde_frames as ur_frames
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 START = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0])
 CYCLE_S = 0.008

@@ -22,7 +22,7 @@ from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
 from sense.settings import RigSettings
-from tests.stress.clock import few
+from tests.helpers.effort import LONG
 
 pytest.importorskip("rtde_control")
 
@@ -33,7 +33,6 @@ QUIET = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
 RIG = emulated_rig(RigSettings.model_validate({"presses": 6, **QUICK, **FAST, **QUIET}), PAD)
 PLAN = planned(PAD, RIG, np.random.default_rng(0))
 SHORT = PressPlan(PLAN.places_mm[:4], PLAN.depths_mm[:4])
-LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 
 class Rig:

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from sense.rig.devices import ConverterSamples
 from sense.rig.session.averaging import Averager
-from tests.stress.clock import few
+from tests.helpers.effort import few
 
 
 def samples(count: int, lost: set[int]) -> ConverterSamples:

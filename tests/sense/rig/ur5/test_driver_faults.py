@@ -14,6 +14,7 @@ from sense.rig.emulators.ur import HOME, UrEmulator
 from sense.rig.safety import wait_until_still
 from sense.rig.ur5 import link as ur5_link
 from sense.rig.ur5.driver import UR5
+from tests.helpers.effort import LONG
 from tests.sense.rig.ur5.arms import (
     LIMITS,
     LONGEST_CALL_S,
@@ -26,10 +27,8 @@ from tests.sense.rig.ur5.arms import (
     stop,
     within,
 )
-from tests.stress.clock import few
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
-LONG = pytest.mark.skipif(few(1).max_examples == 1, reason="takes long; --hypothesis-profile=stress runs it")
 
 
 def nothing(robot: UrEmulator) -> None:

@@ -13,7 +13,8 @@ from design.common.checkpoints import Checkpoints
 from design.common.errors import InputError
 from design.optimisers.search import SearchRun, search
 from design.settings import Contact
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.damage import PAD, RULES, SEARCH, damages, replacements
 from tests.stress.door import require_one_line
 

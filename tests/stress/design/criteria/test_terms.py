@@ -21,7 +21,8 @@ from design.criteria.published_objective import published_terms
 from design.optimisers.parametrization import Fibres
 from design.pad.contact import fibre_axes
 from design.settings import PadSettings, RulesSettings
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.values import LAX, contacts, pads, seeds
 
 

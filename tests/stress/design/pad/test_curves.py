@@ -18,7 +18,8 @@ from design.pad.bending import bend_radius, fold_gap, traced_curve
 from design.pad.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
 from design.pad.knots import assemble
 from design.settings import RulesSettings
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import transposed, whole_lengths
 from tests.stress.design.pad.test_signals import KINDS
 from tests.stress.values import LAX, pads, seeds, wild_knots

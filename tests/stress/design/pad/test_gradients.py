@@ -15,7 +15,8 @@ from design.pad.kernels.exact_gradient import signals_gradient
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.press import family_strays
 from design.pad.kernels.roots import SCRATCH, roots_in_unit
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import transposed
 from tests.stress.values import LAX, Array, contacts, pads, presses, seeds
 

@@ -17,7 +17,8 @@ from design.common.errors import InputError
 from design.criteria.rules import check_rules
 from design.pad.morphology import Morphology
 from design.settings import RulesSettings
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.damage import ARRAYS, damages, dump, published, replacements
 from tests.stress.door import require_one_line
 

@@ -19,7 +19,8 @@ from design import (
 )
 from design.criteria.published_objective import published_terms
 from design.pad.contact import fibre_axes
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import mirrored, transposed, whole_lengths
 from tests.stress.values import LAX, Array, contacts, pads, presses, seeds, wild_knots
 

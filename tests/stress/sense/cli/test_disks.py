@@ -16,7 +16,7 @@ import padforge
 import sense
 from design import Morphology
 from sense.settings import RigSettings
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.sense.cases import TINY, made
 from tests.stress.sense.children import in_child
 

@@ -12,7 +12,7 @@ from hypothesis import given
 
 import padforge
 import sense
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.sense.cases import TINY, learnt, made, recorded, right_or_refused, seeds, watched
 from tests.stress.sense.spoiling import SMALL, dumped, edited, files_of, flipped, put, run_directory
 

@@ -13,7 +13,8 @@ from design.common.errors import InputError
 from sense.localizer.features import FEATURES, press_inputs
 from sense.localizer.normalization import Normalization
 from sense.localizer.response_model import ResponseModel
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.sense.cases import RATE_HZ, TINY, learnt, made, recorded, right_or_refused, seeds, watched
 
 

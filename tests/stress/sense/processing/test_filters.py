@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 
 import sense
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.sense.cases import EXTREMES, RATE_HZ, made, right_or_refused, seeds
 from tests.stress.sense.localizer.test_worst_recordings import _faulty
 

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sense
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.sense.cases import made, right_or_refused
 from tests.stress.sense.children import in_child
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 
 import sense
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.sense.cases import right_or_refused, seeds
 from tests.stress.sense.spoiling import SMALL, dumped, edited, flipped, put, run_directory
 

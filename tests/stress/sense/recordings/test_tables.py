@@ -12,7 +12,7 @@ from hypothesis import given
 import sense
 from sense.recordings.hdf5 import export_hdf5, import_hdf5
 from sense.rig.planning.press_plan import read_plan
-from tests.stress.clock import few
+from tests.helpers.effort import few
 from tests.stress.sense.cases import made, right_or_refused, seeds
 from tests.stress.sense.children import in_child
 from tests.stress.sense.spoiling import SMALL, _table, flipped

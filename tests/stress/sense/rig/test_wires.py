@@ -14,7 +14,8 @@ from sense.rig.arduino import framing
 from sense.rig.ur5 import messages as ur5_wire
 from sense.rig.ur5 import rtde_frames as ur_frames
 from sense.rig.ur5.rtde_reader import VARIABLES, RtdeReader
-from tests.stress.clock import ends_in_time, few
+from tests.helpers.effort import few
+from tests.stress.clock import ends_in_time
 from tests.stress.sense.cases import seeds
 
 SETTINGS = framing.BoardSettings(1_000_000, 0b1111, 4)
