@@ -46,20 +46,16 @@ def test_rules_that_cannot_hold_are_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("rules", "resists", "repairs"),
+    ("rules", "resists"),
     [
-        ({"min_gap_mm": 30.0}, "min_gap_mm", 100),
-        (
-            {"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0},
-            "border_mm",
-            gradient_search.REPAIR_STEPS,
-        ),
-        ({"max_crossings": 3}, "max_crossings", 100),
-        ({"border_mm": 500.0}, "border_mm", 100),
+        ({"min_gap_mm": 30.0}, "min_gap_mm"),
+        ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, "border_mm"),
+        ({"max_crossings": 3}, "max_crossings"),
+        ({"border_mm": 500.0}, "border_mm"),
     ],
 )
-def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists, repairs, monkeypatch):
-    monkeypatch.setattr(gradient_search, "REPAIR_STEPS", repairs)
+def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists, monkeypatch):
+    monkeypatch.setattr(gradient_search, "REPAIR_STEPS", 100)
     found = search(PadSettings(grid=2), settings=SMALL, rules=RulesSettings(**rules))
     assert resists in {violation.rule for violation in found.violations}
     assert all(np.isfinite(violation.measured) for violation in found.violations)

@@ -25,7 +25,7 @@ grid = 2
 [search]
 knots = 3
 starts = 2
-steps = 100
+steps = 75
 lost = 1
 [rules]
 enforce = false
@@ -121,7 +121,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys
 def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
     """Its only one: another is started in its place, and goes on."""
     distributed = pytest.importorskip("distributed")
-    pad, settings = PadSettings(grid=2), SearchSettings(knots=3, starts=2, steps=60, lost=1)
+    pad, settings = PadSettings(grid=2), SearchSettings(knots=3, starts=2, steps=40, lost=1)
     rules = RulesSettings(enforce=False)
     here = search(pad, settings=settings, rules=rules)
     with (
