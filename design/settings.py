@@ -1,5 +1,6 @@
 """The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
 
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, field_validator
@@ -29,6 +30,18 @@ Sides = Annotated[
 ]
 
 
+Point = tuple[Annotated[float, Field(ge=0, le=1e4)], Annotated[float, Field(ge=-1e3, le=1e3)]]
+
+
+def _points(value: object) -> object:
+    """Lists, as files have them, as the tuples that a frozen model holds."""
+    return tuple(_tuple(point) for point in value) if isinstance(value, list | tuple) else value
+
+
+def _tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
 class Contact(Settings):
     """`[contact]`: what a press deforms, a regular polygon or circle around its centre, and how a fibre answers.
 
@@ -41,6 +54,8 @@ class Contact(Settings):
         weight: "uniform" (1), "inverse_square" (1 / (K + d^2)) or "inverse" (1 / max(d, K / 100), which is the
             paper's 1 / d kept finite within a hundredth of the radius).
         length: "manhattan" (|dx| + |dy|, as the published code has it) or "euclidean".
+        reach: a measured contact, in place of radius, sides and weight: points (distance, weight) from distance 0 to
+            where the weight is 0 and stays so, joined by a cubic spline over d^2. A weight may be below 0.
     """
 
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units")
@@ -51,10 +66,21 @@ class Contact(Settings):
     length: Literal["manhattan", "euclidean"] = Field(
         default="manhattan", description="length of a fibre element: |dx| + |dy| as published, or euclidean"
     )
+    reach: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
+        default=(), description="measured weight by distance, [[0, 1], ..., [d, 0]], in place of the three above"
+    )
 
-
-def _tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
+    @field_validator("reach")
+    @classmethod
+    def _ends_in_nothing(cls, reach: tuple[Point, ...]) -> tuple[Point, ...]:
+        if not reach:
+            return reach
+        distances, weights = zip(*reach, strict=True)
+        if len(reach) < 3 or distances[0] != 0 or any(a >= b for a, b in pairwise(distances)):
+            raise ValueError("it must be of 3 points or more, whose distances ascend from 0")
+        if weights[-1] != 0 or not any(weights):
+            raise ValueError("the last weight must be 0, and some other one not")
+        return reach
 
 
 Share = Annotated[float, Field(ge=0, le=1e6)]

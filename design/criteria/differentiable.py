@@ -14,6 +14,9 @@ from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.press import family_strays
 from design.settings import Contact
 
+MEASURED_PRECISION = 5e-5
+"""To which signals of a measured reach are integrated in a search: far within what was measured, and in less time."""
+
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
     """PCHIP slopes (..., n) of values v at ascending t, both (..., n); differentiable almost everywhere.
@@ -83,7 +86,8 @@ class ExactSignals(torch.autograd.Function):
     def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Any, contact: Contact) -> Tensor:
         """Signals (2M, Q) in grid units."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        shape, strays, none = press_shape(contact), family_strays(v[None]), np.empty(0, np.int64)
+        shape = press_shape(contact, MEASURED_PRECISION if contact.reach else None)
+        strays, none = family_strays(v[None]), np.empty(0, np.int64)
         ctx.inputs = (t, v, d, strays[0], presses, shape)
         out = np.zeros(len(presses) * len(t))
         begin, end = 0, len(presses)

@@ -136,10 +136,24 @@ def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
     return travel, cross, knots.shape[:-3]
 
 
-def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, float, int, int]:
-    """A contact as the kernels take it: chains and extents in the frame of each family, radius, weight, length."""
-    chains, reach = press.frames(contact.radius, contact.sides)
-    return chains, reach, contact.radius, _WEIGHTS[contact.weight], _LENGTHS[contact.length]
+Law = tuple[float, int, int, Array, float]
+"""What `press.weigh` goes by: radius, weight, length, profile and precision."""
+
+
+def press_shape(contact: Contact, precision: float | None = None) -> tuple[tuple[Array, Array], Array, Law]:
+    """A contact as the kernels take it: chains and extents in the frame of each family, and the law of its weight."""
+    length = _LENGTHS[contact.length]
+    if contact.reach:
+        end = contact.reach[-1][0]
+        return *press.frames(end, None), (
+            end,
+            press.PROFILE,
+            length,
+            press.profile_of(contact.reach),
+            precision or press.PROFILE_PRECISION,
+        )
+    law = contact.radius, _WEIGHTS[contact.weight], length, press.NO_PROFILE, precision or press.PRECISION
+    return *press.frames(contact.radius, contact.sides), law
 
 
 def signals_quantized(

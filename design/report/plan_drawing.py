@@ -54,8 +54,17 @@ def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation]
 
 
 def _contact_shape(contact: Contact, pitch_mm: float) -> Circle | Polygon:
-    radius = contact.radius * pitch_mm
-    if contact.sides is None:
+    radius = (_half_width(contact.reach) if contact.reach else contact.radius) * pitch_mm
+    if contact.reach or contact.sides is None:
         return Circle((0, 0), radius, color=INK, alpha=0.15, linewidth=0)
     angle = 2 * np.pi * np.arange(contact.sides) / contact.sides
     return Polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]), color=INK, alpha=0.15, linewidth=0)
+
+
+def _half_width(reach: Sequence[tuple[float, float]]) -> float:
+    """The greatest distance at which a measured weight is half of its largest, along straight lines, grid units."""
+    distance, weight = np.abs(np.array(reach)).T
+    half = weight.max() / 2
+    last = int(np.flatnonzero(weight >= half)[-1])  # the last point of all is 0
+    share = (weight[last] - half) / (weight[last] - weight[last + 1])
+    return float(distance[last] + share * (distance[last + 1] - distance[last]))

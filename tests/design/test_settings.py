@@ -33,6 +33,9 @@ def test_the_written_defaults_read_back_as_the_defaults():
         ({"pad": {"grid": "4"}}, PadSettings, r"\[pad\] grid: got '4', .*integer"),
         ({"contact": {"sides": 2}}, Contact, r"\[contact\] sides: got 2"),
         ({"contact": {"weight": "cubic"}}, Contact, r"\[contact\] weight: got 'cubic', .*inverse_square"),
+        ({"contact": {"reach": [[0, 1], [1, 0]]}}, Contact, r"\[contact\] reach: got .*3 points or more"),
+        ({"contact": {"reach": [[0, 1], [1, 0.5], [1, 0]]}}, Contact, r"\[contact\] reach: .*distances ascend from 0"),
+        ({"contact": {"reach": [[0, 1], [1, 0.5], [2, 0.1]]}}, Contact, r"\[contact\] reach: .*last weight must be 0"),
         ({"search": {"method": "luck"}}, SearchSettings, r"\[search\] method: got 'luck', .*descent"),
         ({"rules": 3}, RulesSettings, r"rules is 3, expected a section \[rules\]"),
     ],
@@ -46,6 +49,11 @@ def test_refusals_name_the_key_the_value_and_what_is_allowed(tables, model, mess
 def test_a_circle_is_written_and_read_as_a_word():
     assert Spec({"contact": {"sides": "circle"}}).section(Contact).sides is None
     assert Contact(sides=None).model_dump()["sides"] == "circle"
+
+
+def test_a_measured_reach_is_read_from_a_table_of_points():
+    points = [[0, 1], [0.5, 0.4], [1.25, 0]]
+    assert Spec({"contact": {"reach": points}}).section(Contact).reach == ((0.0, 1.0), (0.5, 0.4), (1.25, 0.0))
 
 
 def test_overrides_win_over_the_file():
@@ -74,7 +82,13 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
         "fibre_diameter_mm": 0.3,
         "deep_family": "horizontal",
     }
-    assert Contact().model_dump() == {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan"}
+    assert Contact().model_dump() == {
+        "radius": 0.6,
+        "sides": 30,
+        "weight": "uniform",
+        "length": "manhattan",
+        "reach": (),
+    }
     assert RulesSettings().model_dump() == {
         "enforce": True,
         "min_bend_radius_mm": 1.0,

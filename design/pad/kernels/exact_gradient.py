@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from .exact_signals import local_cubic, make_scratch, stretches_inside
-from .press import EPS, INVERSE, MANHATTAN, UNIFORM, in_frame, touched_range, weigh
+from .press import EPS, INVERSE, INVERSE_SQUARE, MANHATTAN, UNIFORM, in_frame, profile_piece, touched_range, weigh
 from .quadrature import HALVINGS, across, kronrod, precise
 
 GRAZING = 0.02
@@ -57,28 +57,33 @@ def _normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, floa
 
 
 @njit(cache=True, error_model="numpy")
-def _weight_rate(square: float, radius: float, weight: int) -> float:
+def _weight_rate(square: float, law: Any) -> float:
     """Derivative of `weigh` by the squared distance."""
+    radius, weight, _, profile, _ = law
     if weight == UNIFORM:
         return 0.0
     if weight == INVERSE:
         return -0.5 * square**-1.5 if square > (radius / 100) ** 2 else 0.0
-    return -1 / (radius + square) ** 2
+    if weight == INVERSE_SQUARE:
+        return -1 / (radius + square) ** 2
+    piece = profile[profile_piece(square, profile)]
+    x = square - piece[0]
+    return piece[2] + x * (2 * piece[3] + 3 * x * piece[4])
 
 
 @njit(cache=True, error_model="numpy")
 def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, work: Any, out: Any) -> None:
     """Add to out (6,) what the end at s of a stretch contributes; sign is 1 for its last end and -1 for its first."""
-    (chains, _, radius, weight, length), (span, place, rate) = shape, work
+    (chains, _, law), (span, place, rate) = shape, work
     t, v = span[0] + span[1] * s, across(span, s)
     along_t, along_v = span[1], span[3] + s * (2 * span[4] + 3 * s * span[5])
-    nt, nv = _normal(t, v, chains, radius)
+    nt, nv = _normal(t, v, chains, law[0])
     through = nt * along_t + nv * along_v
     least = GRAZING * math.hypot(nt, nv) * math.hypot(along_t, along_v)
     if abs(through) < least:
         through = least if through > 0 else -least
-    run = along_t + abs(along_v) if length == MANHATTAN else math.hypot(along_t, along_v)
-    value = sign * weigh(t * t + v * v, radius, weight) * run
+    run = along_t + abs(along_v) if law[2] == MANHATTAN else math.hypot(along_t, along_v)
+    value = sign * weigh(t * t + v * v, law) * run
     _variations(s + s0, span[1], d0, d1, place, rate)
     for x in range(6):
         out[x] -= value * (nt * place[x, 0] + nv * place[x, 1]) / through
@@ -87,8 +92,9 @@ def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, wor
 @njit(cache=True, error_model="numpy")
 def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any) -> None:
     """Add to out (6,) the integral over [a, b]: a closed form, or quadrature on the pieces that suit the signal."""
-    (_, _, radius, weight, length), (span, place, rate) = shape, work
-    if weight == UNIFORM and length == MANHATTAN:
+    law, (span, place, rate) = shape[2], work
+    is_manhattan = law[2] == MANHATTAN
+    if law[1] == UNIFORM and is_manhattan:
         rising = 1.0 if across(span, b) >= across(span, a) else -1.0
         for sign, s in ((1.0, b), (-1.0, a)):
             _variations(s + s0, span[1], d0, d1, place, rate)
@@ -100,7 +106,7 @@ def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work
     while top >= 0:
         low, high = stack[top]
         pieces += 1
-        if top < HALVINGS and not precise(kronrod(span, low, high, radius, weight, length)[1], pieces):
+        if top < HALVINGS and not precise(kronrod(span, low, high, law)[1], pieces, law):
             stack[top, 1] = 0.5 * (low + high)
             top += 1
             stack[top, 0], stack[top, 1] = 0.5 * (low + high), high
@@ -112,10 +118,10 @@ def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work
             t, v = span[0] + span[1] * s, across(span, s)
             along = span[3] + s * (2 * span[4] + 3 * s * span[5])
             square = t * t + v * v
-            run = span[1] + abs(along) if length == MANHATTAN else math.hypot(span[1], along)
-            w, w_rate = weigh(square, radius, weight), _weight_rate(square, radius, weight)
-            run_t = 1.0 if length == MANHATTAN else span[1] / run
-            run_v = math.copysign(1.0, along) if length == MANHATTAN else along / run
+            run = span[1] + abs(along) if is_manhattan else math.hypot(span[1], along)
+            w, w_rate = weigh(square, law), _weight_rate(square, law)
+            run_t = 1.0 if is_manhattan else span[1] / run
+            run_v = math.copysign(1.0, along) if is_manhattan else along / run
             _variations(s + s0, span[1], d0, d1, place, rate)
             for x in range(6):
                 moved = t * place[x, 0] + v * place[x, 1]
@@ -131,7 +137,7 @@ def _span(
     Args:
         shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `_variations`, all overwritten.
     """
-    span, chains, radius = work[0], shape[0], shape[2]
+    span, chains, radius = work[0], shape[0], shape[2][0]
     tolerance = 4 * EPS * (abs(cv) + radius)
     s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
@@ -153,9 +159,7 @@ def signals_gradient(
     upstream: Any,
     chains: tuple[Any, Any],
     reach: Any,
-    radius: float,
-    weight: int,
-    length: int,
+    law: Any,
 ) -> Any:
     """Gradient (3, 2M, n) of sum(upstream * signals) by knots' travel and cross coordinates and slopes, one pad.
 
@@ -171,8 +175,8 @@ def signals_gradient(
     for q in range(len(presses)):
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = in_frame((chains, reach, radius, weight, length), family)
-            tolerance = 4 * EPS * (abs(cv) + radius)
+            shape = in_frame((chains, reach, law), family)
+            tolerance = 4 * EPS * (abs(cv) + law[0])
             low, high = cv + reach[family, 2] - tolerance, cv + reach[family, 3] + tolerance
             first, last = touched_range(cv, reach[family], strays[family], grid)
             for f in range(family * grid + first, family * grid + last):

@@ -72,6 +72,14 @@ def _keep(stretches: Any, count: int, begin: float, end: float) -> int:
 def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> int:
     """`stretches_inside` of a circle."""
     roots, work, p, _, stretches = scratch
+    # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
+    t0, t1, v0, v1 = span[0] + span[1] * a, span[0] + span[1] * b, across(span, a), across(span, b)
+    far_t, far_v = max(abs(t0), abs(t1)), max(abs(v0), abs(v1))
+    if far_t * far_t + far_v * far_v < radius * radius:
+        return _keep(stretches, 0, a, b)
+    near_t, near_v = max(t0, -t1, 0.0), max(min(v0, v1), -max(v0, v1), 0.0)
+    if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
+        return 0
     count = circle_roots(span, a, b, radius, roots, 0, work, p)
     found, begin = 0, a
     for i in range(count + 1):
@@ -154,17 +162,17 @@ def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, 
 
 
 @njit(cache=True, error_model="numpy")
-def _stretch_signal(span: Any, a: float, b: float, radius: float, weight: int, length: int, scratch: Any) -> float:
+def _stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Signal of a stretch inside the press; the 1/d weight has a kink where it is cut off, which is split at."""
     roots, work, p, stack, _ = scratch
-    if weight != INVERSE:
-        return length_element(span, a, b, radius, weight, length, stack)
-    count = circle_roots(span, a, b, radius / 100, roots, 0, work, p)
+    if law[1] != INVERSE:
+        return length_element(span, a, b, law, stack)
+    count = circle_roots(span, a, b, law[0] / 100, roots, 0, work, p)
     total, begin = 0.0, a
     for i in range(count):
-        total += length_element(span, begin, roots[i], radius, weight, length, stack)
+        total += length_element(span, begin, roots[i], law, stack)
         begin = roots[i]
-    return total + length_element(span, begin, b, radius, weight, length, stack)
+    return total + length_element(span, begin, b, law, stack)
 
 
 @njit(cache=True, error_model="numpy")
@@ -197,8 +205,8 @@ def fibre_signal(
         t, v, d: (n,) knots and slopes. shape: of `in_frame`; its extents (5,) are least and greatest t, least and
             greatest v, radius of the circle inside.
     """
-    chains, reach, radius, weight, length = shape
-    n = len(t)
+    chains, reach, law = shape
+    radius, n = law[0], len(t)
     begin, end = ct + reach[0], ct + reach[1]
     if end <= t[0] or begin >= t[n - 1]:
         return 0.0, 0
@@ -209,7 +217,7 @@ def fibre_signal(
         if min(v[j], v[j + 1]) <= cv + reach[3] + tolerance and max(v[j], v[j + 1]) >= cv + reach[2] - tolerance:
             s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
             for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
-                total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], radius, weight, length, scratch)
+                total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], law, scratch)
             visited += 1
         j += 1
     return total, visited
@@ -233,9 +241,7 @@ def exact_signals(
     presses: Any,
     chains: tuple[Any, Any],
     reach: Any,
-    radius: float,
-    weight: int,
-    length: int,
+    law: Any,
     begin: int,
     end: int,
     starts: Any,
@@ -247,7 +253,7 @@ def exact_signals(
     Args:
         travel, cross, slope: (P, 2M, n) knots and slopes. strays: (P, 2) of `family_strays`.
         presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
-        chains: two (3, B), reach: (2, 5): the shape in the frame of each family.
+        chains: two (3, B), reach: (2, 5): the shape in the frame of each family. law: of `weigh`.
         starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
             `signal`; or empty for dense signals (P Q 2M,), zeros before.
     """
@@ -260,7 +266,7 @@ def exact_signals(
         slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = in_frame((chains, reach, radius, weight, length), family)
+            shape = in_frame((chains, reach, law), family)
             first, last = touched_range(cv, reach[family], strays[p, family], grid)
             for f in range(family * grid + first, family * grid + last):
                 t, v, d = travel[p, f], cross[p, f], slope[p, f]

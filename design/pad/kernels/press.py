@@ -14,18 +14,58 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 EPS = 2.0**-52
-UNIFORM, INVERSE_SQUARE, INVERSE = 0, 1, 2
+UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
+NO_PROFILE = np.empty((0, 5))
+PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
+"""To which a piece is integrated where it is no closed form, as a share; of a profile, as a share at weight 1."""
 
 
 @njit(cache=True, error_model="numpy")
-def weigh(square: float, radius: float, weight: int) -> float:
-    """Weight of a fibre element at squared distance `square` from the press centre."""
+def weigh(square: float, law: Any) -> float:
+    """Weight of a fibre element at squared distance `square` from the press centre.
+
+    Args:
+        law: radius, weight, length, profile (B, 5) and precision of a contact: each row of a profile holds a squared
+            distance and the powers of a cubic in what `square` is beyond it, up to the next row's.
+    """
+    radius, weight, _, profile, _ = law
     if weight == UNIFORM:
         return 1.0
     if weight == INVERSE_SQUARE:
         return 1 / (radius + square)
-    return 1 / max(math.sqrt(square), radius / 100)
+    if weight == INVERSE:
+        return 1 / max(math.sqrt(square), radius / 100)
+    piece = profile[profile_piece(square, profile)]
+    x = square - piece[0]
+    return piece[1] + x * (piece[2] + x * (piece[3] + x * piece[4]))
+
+
+@njit(cache=True, error_model="numpy")
+def profile_piece(square: float, profile: Any) -> int:
+    """The row of a profile that holds at squared distance `square`."""
+    low, high = 0, len(profile)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if profile[middle, 0] <= square:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@lru_cache(maxsize=64)
+def profile_of(reach: tuple[tuple[float, float], ...]) -> Array:
+    """The profile (B, 5) of `weigh` through points (distance, weight), the last of weight 0.
+
+    A cubic spline over the squared distance, so that it is smooth at the centre as well, which meets 0 without a kink
+    at its end.
+    """
+    from scipy.interpolate import CubicSpline
+
+    distance, weight = np.array(reach).T
+    spline = CubicSpline(distance**2, weight, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
+    return np.column_stack([spline.x[:-1], spline.c[::-1].T])
 
 
 @lru_cache(maxsize=64)
@@ -56,9 +96,9 @@ def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array
 
 @njit(cache=True, error_model="numpy")
 def in_frame(shape: Any, family: int) -> Any:
-    """A shape (chains and extents in both frames, radius, weight, length) in the frame of one family."""
-    chains, reach, radius, weight, length = shape
-    return (chains[0] if family == 0 else chains[1]), reach[family], radius, weight, length
+    """A shape (chains and extents in both frames, law of `weigh`) in the frame of one family."""
+    chains, reach, law = shape
+    return (chains[0] if family == 0 else chains[1]), reach[family], law
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

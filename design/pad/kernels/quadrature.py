@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .press import MANHATTAN, UNIFORM, weigh
+from .press import MANHATTAN, PROFILE, UNIFORM, weigh
 
 # G7-K15 nodes and weights on [-1, 1], positive half, the centre last; Gauss weights for every second node
 NODES = np.array(
@@ -45,7 +45,6 @@ GAUSS = np.array(
         0.417959183673469387755102040816327,
     ]
 )
-PRECISION = 1e-11
 HALVINGS = 48
 PIECES, PATIENCE = 500, 100
 """Beyond PIECES, what counts as precise doubles with every PATIENCE more: where rounding is all that is left, halving
@@ -59,42 +58,48 @@ def across(span: Any, s: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _density(span: Any, s: float, radius: float, weight: int, length: int) -> float:
+def _density(span: Any, s: float, law: Any) -> float:
     """Weighted length per unit of s."""
     rise = span[3] + s * (2 * span[4] + 3 * s * span[5])
-    run = span[1] + abs(rise) if length == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
-    if weight == UNIFORM:
+    run = span[1] + abs(rise) if law[2] == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
+    if law[1] == UNIFORM:
         return run
     t, v = span[0] + span[1] * s, across(span, s)
-    return run * weigh(t * t + v * v, radius, weight)
+    return run * weigh(t * t + v * v, law)
 
 
 @njit(cache=True, error_model="numpy")
-def kronrod(span: Any, a: float, b: float, radius: float, weight: int, length: int) -> tuple[float, float]:
-    """15-point Kronrod integral over [a, b] and its error estimate (difference to 7-point Gauss, sharpened)."""
+def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
+    """15-point Kronrod integral over [a, b] and its error estimate (difference to 7-point Gauss, sharpened).
+
+    The estimate is a share of the integral, but for a profile, whose weights may cancel, of what it would be at weight
+    1; there it is the plain difference, as sharpening holds for smooth functions only, and splines bend at their knots.
+    """
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
-    centre = _density(span, middle, radius, weight, length)
+    centre = _density(span, middle, law)
     fine, coarse = KRONROD[7] * centre, GAUSS[3] * centre
     for i in range(7):
         x = half * NODES[i]
-        pair = _density(span, middle - x, radius, weight, length) + _density(span, middle + x, radius, weight, length)
+        pair = _density(span, middle - x, law) + _density(span, middle + x, law)
         fine += KRONROD[i] * pair
         if i % 2 == 1:
             coarse += GAUSS[i // 2] * pair
+    if law[1] == PROFILE:
+        return fine * half, abs(fine - coarse) / span[1]
     gap = abs(fine - coarse) / fine if fine > 0 else 0.0
     return fine * half, min(1.0, (200 * gap) ** 1.5)
 
 
 @njit(cache=True, error_model="numpy")
-def precise(error: float, pieces: int) -> bool:
+def precise(error: float, pieces: int, law: Any) -> bool:
     """Whether a piece need not be halved, the `pieces`-th that is looked at."""
-    return error <= PRECISION * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
+    return error <= law[4] * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
 
 
 @njit(cache=True, error_model="numpy")
-def length_element(span: Any, a: float, b: float, radius: float, weight: int, length: int, stack: Any) -> float:
+def length_element(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
     """Integral of the density over a stretch [a, b] that lies wholly inside the press."""
-    if weight == UNIFORM and length == MANHATTAN:
+    if law[1] == UNIFORM and law[2] == MANHATTAN:
         mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
         return (b - a) * (span[1] + abs(mean_rise))
     total, pieces = 0.0, 0
@@ -102,9 +107,9 @@ def length_element(span: Any, a: float, b: float, radius: float, weight: int, le
     top = 0
     while top >= 0:
         low, high = stack[top]
-        part, error = kronrod(span, low, high, radius, weight, length)
+        part, error = kronrod(span, low, high, law)
         pieces += 1
-        if precise(error, pieces) or top >= HALVINGS:
+        if precise(error, pieces, law) or top >= HALVINGS:
             total += part
             top -= 1
         else:

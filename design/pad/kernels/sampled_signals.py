@@ -80,16 +80,16 @@ def _uniform_sum(
 @njit(cache=True, error_model="numpy")
 def _stretch_sum(curve: Any, runs: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any) -> float:
     """Sum over the samples [low, high) that start inside the press at (ct, cv)."""
-    chains, reach, radius, weight, _ = shape
-    outer, inner = radius * radius, reach[4] * reach[4]
-    if weight == UNIFORM:
+    chains, reach, law = shape
+    outer, inner = law[0] * law[0], reach[4] * reach[4]
+    if law[1] == UNIFORM:
         return _uniform_sum(curve, runs, low, high, step, ct, cv, chains, outer, inner)
     total = 0.0
     for i in range(low, high):
         dt, dv = i * step - ct, curve[i] - cv
         square = dt * dt + dv * dv
         if square <= inner or (square <= outer and _between_chains(dt, dv, chains)):
-            total += runs[i] * weigh(square, radius, weight)
+            total += runs[i] * weigh(square, law)
     return total
 
 
@@ -104,7 +104,7 @@ def fibre_quantized(t: Any, v: Any, curve: Any, step: float, presses: Any, famil
         t, v: (n,) knots. curve: samples of the fibre at 0, step, ... shape: of `in_frame`; its extents (5,) are least
             and greatest t, least and greatest v, radius of the circle inside.
     """
-    reach, length = shape[1], shape[4]
+    reach, length = shape[1], shape[2][2]
     n, segments = len(t), len(curve) - 1
     runs = np.empty(segments)
     here, ahead = curve[:-1], curve[1:]

@@ -5,9 +5,11 @@ import pytest
 import torch
 
 from design import Contact, Morphology, signals
+from design.criteria import differentiable
 from design.criteria.differentiable import ExactSignals, pchip_slopes
 from design.pad.contact import fibre_axes
 
+REACH = ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0))
 CONTACTS = [
     Contact(),
     Contact(sides=None),
@@ -17,6 +19,8 @@ CONTACTS = [
     Contact(sides=None, weight="inverse_square", length="euclidean"),
     Contact(weight="inverse"),
     Contact(sides=None, weight="inverse", length="euclidean"),
+    Contact(reach=REACH),
+    Contact(reach=REACH, length="euclidean"),
 ]
 
 
@@ -49,8 +53,10 @@ def taylor_ratio(contact, seed):
     return left[0] / left[1]
 
 
-@pytest.mark.parametrize("contact", CONTACTS, ids=lambda c: f"{c.sides}-{c.weight}-{c.length}")
-def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(contact):
+@pytest.mark.parametrize("contact", CONTACTS, ids=lambda c: f"{len(c.reach) or c.sides}-{c.weight}-{c.length}")
+def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(contact, monkeypatch):
+    # these steps are smaller than what a search needs to see
+    monkeypatch.setattr(differentiable, "MEASURED_PRECISION", None)
     assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
 
 

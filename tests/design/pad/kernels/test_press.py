@@ -1,18 +1,26 @@
 """Which fibres a press can touch, and what an element in it weighs, against plain ways to say it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 
 from design import Morphology
 from design.pad.contact import fibre_axes
 from design.pad.kernels.press import (
     INVERSE,
     INVERSE_SQUARE,
+    MANHATTAN,
+    NO_PROFILE,
+    PRECISION,
+    PROFILE,
     UNIFORM,
     count_touched,
     family_strays,
+    profile_of,
     touched_range,
     weigh,
 )
@@ -66,6 +74,17 @@ def test_strays_are_the_farthest_that_fibres_of_a_family_leave_their_levels():
 @pytest.mark.parametrize(("d", "inverse"), [(2.0, 0.5), (0.25, 4.0), (0.006, 1 / 0.006), (0.004, 200.0), (0.0, 200.0)])
 def test_weights_of_an_element(d, inverse):
     radius = 0.5
-    assert weigh(d**2, radius, UNIFORM) == 1
-    assert weigh(d**2, radius, INVERSE_SQUARE) == pytest.approx(1 / (radius + d**2))
-    assert weigh(d**2, radius, INVERSE) == pytest.approx(inverse)
+    expected = {UNIFORM: 1, INVERSE_SQUARE: 1 / (radius + d**2), INVERSE: inverse}
+    for weight, value in expected.items():
+        assert weigh(d**2, (radius, weight, MANHATTAN, NO_PROFILE, PRECISION)) == pytest.approx(value)
+
+
+def test_a_profile_goes_through_its_points_and_ends_without_a_kink():
+    reach = ((0.0, 1.0), (0.4, 0.7), (0.8, -0.1), (1.5, 0.0))
+    law = 1.5, PROFILE, MANHATTAN, profile_of(reach), PRECISION
+    assert [weigh(d**2, law) for d, _ in reach] == pytest.approx([weight for _, weight in reach], abs=1e-12)
+    line = np.linspace(0, 1.5, 400)
+    ends: Any = ((2, 0), (1, 0))
+    spline = CubicSpline(np.square([d for d, _ in reach]), [w for _, w in reach], bc_type=ends)
+    np.testing.assert_allclose([weigh(d**2, law) for d in line], spline(line**2), atol=1e-12)
+    assert abs(weigh((1.5 - 1e-5) ** 2, law)) < 1e-8

@@ -18,7 +18,8 @@ from design import (
     signals_sparse,
 )
 from design.criteria.published_objective import published_terms
-from design.pad.contact import fibre_axes
+from design.pad.contact import fibre_axes, press_shape
+from design.pad.kernels.press import weigh
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import mirrored, transposed, whole_lengths
@@ -59,6 +60,26 @@ def test_signals_lie_between_nothing_and_the_whole_fibre(data):
     if inside and contact.weight == "uniform" and contact.length == "manhattan":  # all of the pad is pressed
         near = (np.abs(np.asarray(places, float).reshape(-1, 2)) <= pad.grid + 1).all(axis=1)
         np.testing.assert_allclose(found[near], np.broadcast_to(most, found[near].shape), rtol=1e-7)
+
+
+@settings(few(40), suppress_health_check=LAX)
+@given(st.data())
+def test_signals_of_any_measured_reach_lie_within_the_whole_fibre_at_its_heaviest(data):
+    pad, rng = data.draw(pads((1, 2), (0, 6))), np.random.default_rng(data.draw(seeds()))
+    distances = np.cumsum(rng.choice([1e-3, 0.1, 0.5, 3.0], data.draw(st.integers(2, 12))))
+    weights = np.append(rng.uniform(-1, 1, len(distances)), 0.0)
+    contact = Contact(
+        reach=tuple(zip([0.0, *distances.tolist()], weights.tolist(), strict=True)),
+        length=data.draw(st.sampled_from(["manhattan", "euclidean"])),
+    )
+    places = data.draw(presses(pad))
+    with ends_in_time():
+        found = signals(pad, places, contact)
+    _, _, law = press_shape(contact)
+    near = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise([0.0, *distances])])
+    heaviest = max(abs(weigh(d * d, law)) for d in near)
+    assert np.isfinite(found).all()
+    assert (np.abs(found) <= whole_lengths(pad, contact) * heaviest * 1.01 + 1e-9).all()
 
 
 @settings(few(50), suppress_health_check=LAX)
