@@ -53,7 +53,7 @@ def simulate(pad: Morphology, rig: RigSettings | None = None, contact: Contact |
         source={
             "kind": "simulated",
             "rig": rig.model_dump(mode="json"),
-            "contact": contact.model_dump(),
+            "contact": contact.model_dump(mode="json"),
             "morphology": {"pitch_mm": pad.pitch_mm, "knots": pad.knots.tolist()},
         },
     )
