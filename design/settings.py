@@ -67,7 +67,7 @@ class Contact(Settings):
         default="manhattan", description="length of a fibre element: |dx| + |dy| as published, or euclidean"
     )
     reach: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
-        default=(), description="measured weight by distance, [[0, 1], ..., [d, 0]], in place of the three above"
+        default=(), description="measured weight by distance, [[0, 1], ..., [d, 0]], for radius, sides and weight"
     )
 
     @field_validator("reach")

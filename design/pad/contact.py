@@ -136,23 +136,14 @@ def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
     return travel, cross, knots.shape[:-3]
 
 
-Law = tuple[float, int, int, Array, float]
-"""What `press.weigh` goes by: radius, weight, length, profile and precision."""
-
-
-def press_shape(contact: Contact, precision: float | None = None) -> tuple[tuple[Array, Array], Array, Law]:
+def press_shape(contact: Contact, precision: float | None = None) -> tuple[tuple[Array, Array], Array, press.Law]:
     """A contact as the kernels take it: chains and extents in the frame of each family, and the law of its weight."""
     length = _LENGTHS[contact.length]
     if contact.reach:
-        end = contact.reach[-1][0]
-        return *press.frames(end, None), (
-            end,
-            press.PROFILE,
-            length,
-            press.profile_of(contact.reach),
-            precision or press.PROFILE_PRECISION,
-        )
-    law = contact.radius, _WEIGHTS[contact.weight], length, press.NO_PROFILE, precision or press.PRECISION
+        end, profile = contact.reach[-1][0], press.profile_of(contact.reach)
+        law = press.Law(end, press.PROFILE, length, profile, precision or press.PROFILE_PRECISION)
+        return *press.frames(end, None), law
+    law = press.Law(contact.radius, _WEIGHTS[contact.weight], length, precision=precision or press.PRECISION)
     return *press.frames(contact.radius, contact.sides), law
 
 

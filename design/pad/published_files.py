@@ -16,7 +16,7 @@ from design.common.errors import InputError, reals, whole
 from design.common.files import read_bytes
 from design.settings import Contact
 
-from .kernels.press import INVERSE_SQUARE, MANHATTAN, NO_PROFILE, PRECISION, UNIFORM, frames
+from .kernels.press import INVERSE_SQUARE, MANHATTAN, UNIFORM, Law, frames
 from .kernels.sampled_signals import quantized_signals
 from .knots import FARTHEST, Array, assemble, axes, of_parameters
 
@@ -117,7 +117,7 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
     misfits = []
     for weight in (UNIFORM, INVERSE_SQUARE):
         found = np.zeros((1, len(places), len(knots)))
-        shape = (*frames(contact.radius, contact.sides), (contact.radius, weight, MANHATTAN, NO_PROFILE, PRECISION))
+        shape = (*frames(contact.radius, contact.sides), Law(contact.radius, weight, MANHATTAN))
         quantized_signals(travel, cross, places, shape, samples, 0, len(knots), found)
         misfits.append(float(np.abs(found[0] - expected).max()))
     return min(misfits)

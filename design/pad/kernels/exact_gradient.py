@@ -59,7 +59,7 @@ def _normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, floa
 @njit(cache=True, error_model="numpy")
 def _weight_rate(square: float, law: Any) -> float:
     """Derivative of `weigh` by the squared distance."""
-    radius, weight, _, profile, _ = law
+    radius, weight, profile = law.radius, law.weight, law.profile
     if weight == UNIFORM:
         return 0.0
     if weight == INVERSE:
@@ -77,12 +77,12 @@ def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, wor
     (chains, _, law), (span, place, rate) = shape, work
     t, v = span[0] + span[1] * s, across(span, s)
     along_t, along_v = span[1], span[3] + s * (2 * span[4] + 3 * s * span[5])
-    nt, nv = _normal(t, v, chains, law[0])
+    nt, nv = _normal(t, v, chains, law.radius)
     through = nt * along_t + nv * along_v
     least = GRAZING * math.hypot(nt, nv) * math.hypot(along_t, along_v)
     if abs(through) < least:
         through = least if through > 0 else -least
-    run = along_t + abs(along_v) if law[2] == MANHATTAN else math.hypot(along_t, along_v)
+    run = along_t + abs(along_v) if law.length == MANHATTAN else math.hypot(along_t, along_v)
     value = sign * weigh(t * t + v * v, law) * run
     _variations(s + s0, span[1], d0, d1, place, rate)
     for x in range(6):
@@ -93,8 +93,8 @@ def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, wor
 def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any) -> None:
     """Add to out (6,) the integral over [a, b]: a closed form, or quadrature on the pieces that suit the signal."""
     law, (span, place, rate) = shape[2], work
-    is_manhattan = law[2] == MANHATTAN
-    if law[1] == UNIFORM and is_manhattan:
+    is_manhattan = law.length == MANHATTAN
+    if law.weight == UNIFORM and is_manhattan:
         rising = 1.0 if across(span, b) >= across(span, a) else -1.0
         for sign, s in ((1.0, b), (-1.0, a)):
             _variations(s + s0, span[1], d0, d1, place, rate)
@@ -137,7 +137,7 @@ def _span(
     Args:
         shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `_variations`, all overwritten.
     """
-    span, chains, radius = work[0], shape[0], shape[2][0]
+    span, chains, radius = work[0], shape[0], shape[2].radius
     tolerance = 4 * EPS * (abs(cv) + radius)
     s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
@@ -176,7 +176,7 @@ def signals_gradient(
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
             shape = in_frame((chains, reach, law), family)
-            tolerance = 4 * EPS * (abs(cv) + law[0])
+            tolerance = 4 * EPS * (abs(cv) + law.radius)
             low, high = cv + reach[family, 2] - tolerance, cv + reach[family, 3] + tolerance
             first, last = touched_range(cv, reach[family], strays[family], grid)
             for f in range(family * grid + first, family * grid + last):

@@ -165,9 +165,9 @@ def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, 
 def _stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Signal of a stretch inside the press; the 1/d weight has a kink where it is cut off, which is split at."""
     roots, work, p, stack, _ = scratch
-    if law[1] != INVERSE:
+    if law.weight != INVERSE:
         return length_element(span, a, b, law, stack)
-    count = circle_roots(span, a, b, law[0] / 100, roots, 0, work, p)
+    count = circle_roots(span, a, b, law.radius / 100, roots, 0, work, p)
     total, begin = 0.0, a
     for i in range(count):
         total += length_element(span, begin, roots[i], law, stack)
@@ -206,7 +206,7 @@ def fibre_signal(
             greatest v, radius of the circle inside.
     """
     chains, reach, law = shape
-    radius, n = law[0], len(t)
+    radius, n = law.radius, len(t)
     begin, end = ct + reach[0], ct + reach[1]
     if end <= t[0] or begin >= t[n - 1]:
         return 0.0, 0
@@ -253,7 +253,7 @@ def exact_signals(
     Args:
         travel, cross, slope: (P, 2M, n) knots and slopes. strays: (P, 2) of `family_strays`.
         presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
-        chains: two (3, B), reach: (2, 5): the shape in the frame of each family. law: of `weigh`.
+        chains: two (3, B), reach: (2, 5): the shape in the frame of each family. law: a `Law`.
         starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
             `signal`; or empty for dense signals (P Q 2M,), zeros before.
     """

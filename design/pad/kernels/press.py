@@ -5,7 +5,7 @@ These are an index range, since a family's fibres keep to their levels within it
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,15 +21,27 @@ PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
 """To which a piece is integrated where it is no closed form, as a share; of a profile, as a share at weight 1."""
 
 
+class Law(NamedTuple):
+    """What a fibre element in a press counts.
+
+    Attributes:
+        radius: of the shape, or where a profile ends. weight, length: UNIFORM, ...; MANHATTAN, ...
+        profile: (B, 5), each row a squared distance and the powers of a cubic in what lies beyond it, up to the next
+            row's; NO_PROFILE for a weight with a formula.
+        precision: to which it is integrated.
+    """
+
+    radius: float
+    weight: int
+    length: int
+    profile: Array = NO_PROFILE
+    precision: float = PRECISION
+
+
 @njit(cache=True, error_model="numpy")
 def weigh(square: float, law: Any) -> float:
-    """Weight of a fibre element at squared distance `square` from the press centre.
-
-    Args:
-        law: radius, weight, length, profile (B, 5) and precision of a contact: each row of a profile holds a squared
-            distance and the powers of a cubic in what `square` is beyond it, up to the next row's.
-    """
-    radius, weight, _, profile, _ = law
+    """Weight of a fibre element at squared distance `square` from the press centre, by a `Law`."""
+    radius, weight, profile = law.radius, law.weight, law.profile
     if weight == UNIFORM:
         return 1.0
     if weight == INVERSE_SQUARE:
@@ -96,7 +108,7 @@ def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array
 
 @njit(cache=True, error_model="numpy")
 def in_frame(shape: Any, family: int) -> Any:
-    """A shape (chains and extents in both frames, law of `weigh`) in the frame of one family."""
+    """A shape (chains and extents in both frames, law) in the frame of one family."""
     chains, reach, law = shape
     return (chains[0] if family == 0 else chains[1]), reach[family], law
 

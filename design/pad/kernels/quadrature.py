@@ -61,8 +61,8 @@ def across(span: Any, s: float) -> float:
 def _density(span: Any, s: float, law: Any) -> float:
     """Weighted length per unit of s."""
     rise = span[3] + s * (2 * span[4] + 3 * s * span[5])
-    run = span[1] + abs(rise) if law[2] == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
-    if law[1] == UNIFORM:
+    run = span[1] + abs(rise) if law.length == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
+    if law.weight == UNIFORM:
         return run
     t, v = span[0] + span[1] * s, across(span, s)
     return run * weigh(t * t + v * v, law)
@@ -84,8 +84,9 @@ def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
         fine += KRONROD[i] * pair
         if i % 2 == 1:
             coarse += GAUSS[i // 2] * pair
-    if law[1] == PROFILE:
-        return fine * half, abs(fine - coarse) / span[1]
+    if law.weight == PROFILE:
+        run = span[1] + abs(across(span, b) - across(span, a)) / (b - a)  # spans are monotone
+        return fine * half, abs(fine - coarse) / run
     gap = abs(fine - coarse) / fine if fine > 0 else 0.0
     return fine * half, min(1.0, (200 * gap) ** 1.5)
 
@@ -93,13 +94,13 @@ def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
 @njit(cache=True, error_model="numpy")
 def precise(error: float, pieces: int, law: Any) -> bool:
     """Whether a piece need not be halved, the `pieces`-th that is looked at."""
-    return error <= law[4] * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
+    return error <= law.precision * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
 
 
 @njit(cache=True, error_model="numpy")
 def length_element(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
     """Integral of the density over a stretch [a, b] that lies wholly inside the press."""
-    if law[1] == UNIFORM and law[2] == MANHATTAN:
+    if law.weight == UNIFORM and law.length == MANHATTAN:
         mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
         return (b - a) * (span[1] + abs(mean_rise))
     total, pieces = 0.0, 0

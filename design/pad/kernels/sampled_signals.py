@@ -81,8 +81,8 @@ def _uniform_sum(
 def _stretch_sum(curve: Any, runs: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any) -> float:
     """Sum over the samples [low, high) that start inside the press at (ct, cv)."""
     chains, reach, law = shape
-    outer, inner = law[0] * law[0], reach[4] * reach[4]
-    if law[1] == UNIFORM:
+    outer, inner = law.radius * law.radius, reach[4] * reach[4]
+    if law.weight == UNIFORM:
         return _uniform_sum(curve, runs, low, high, step, ct, cv, chains, outer, inner)
     total = 0.0
     for i in range(low, high):
@@ -104,7 +104,7 @@ def fibre_quantized(t: Any, v: Any, curve: Any, step: float, presses: Any, famil
         t, v: (n,) knots. curve: samples of the fibre at 0, step, ... shape: of `in_frame`; its extents (5,) are least
             and greatest t, least and greatest v, radius of the circle inside.
     """
-    reach, length = shape[1], shape[2][2]
+    reach, length = shape[1], shape[2].length
     n, segments = len(t), len(curve) - 1
     runs = np.empty(segments)
     here, ahead = curve[:-1], curve[1:]

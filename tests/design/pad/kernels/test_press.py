@@ -14,10 +14,9 @@ from design.pad.kernels.press import (
     INVERSE,
     INVERSE_SQUARE,
     MANHATTAN,
-    NO_PROFILE,
-    PRECISION,
     PROFILE,
     UNIFORM,
+    Law,
     count_touched,
     family_strays,
     profile_of,
@@ -76,12 +75,12 @@ def test_weights_of_an_element(d, inverse):
     radius = 0.5
     expected = {UNIFORM: 1, INVERSE_SQUARE: 1 / (radius + d**2), INVERSE: inverse}
     for weight, value in expected.items():
-        assert weigh(d**2, (radius, weight, MANHATTAN, NO_PROFILE, PRECISION)) == pytest.approx(value)
+        assert weigh(d**2, Law(radius, weight, MANHATTAN)) == pytest.approx(value)
 
 
 def test_a_profile_goes_through_its_points_and_ends_without_a_kink():
     reach = ((0.0, 1.0), (0.4, 0.7), (0.8, -0.1), (1.5, 0.0))
-    law = 1.5, PROFILE, MANHATTAN, profile_of(reach), PRECISION
+    law = Law(1.5, PROFILE, MANHATTAN, profile_of(reach))
     assert [weigh(d**2, law) for d, _ in reach] == pytest.approx([weight for _, weight in reach], abs=1e-12)
     line = np.linspace(0, 1.5, 400)
     ends: Any = ((2, 0), (1, 0))
