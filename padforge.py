@@ -61,7 +61,7 @@ BENCHES = {
     "objective": "design.criteria.benchmark:BENCH",
     "search": "design.optimisers.benchmark:BENCH",
     "networks": "design.evaluation.benchmark:BENCH",
-    "filter": "sense.processing.benchmark:BENCH",
+    "filter": "sense.recordings.processing.benchmark:BENCH",
     "localizer": "sense.localizer.calibration.benchmark:BENCH",
     "mould": "fabricate.mould.benchmark:BENCH",
 }

@@ -13,11 +13,12 @@ from .optimisers.search import search as search
 from .pad.contact import signals as signals
 from .pad.contact import signals_quantized as signals_quantized
 from .pad.contact import signals_sparse as signals_sparse
-from .pad.curves import crossings as crossings
-from .pad.curves import flatten as flatten
+from .pad.courses.curves import crossings as crossings
+from .pad.courses.curves import flatten as flatten
 from .pad.indentation import Indenter as Indenter
 from .pad.indentation import indented_signals as indented_signals
 from .pad.morphology import Morphology as Morphology
+from .pad.twin import Twin as Twin
 from .report.plan_drawing import draw_plan as draw_plan
 from .settings import Contact as Contact
 from .settings import PadSettings as PadSettings

@@ -9,8 +9,8 @@ import numpy as np
 import shapely
 
 from design.common.errors import instance
-from design.pad.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
-from design.pad.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
+from design.pad.courses.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
+from design.pad.courses.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import RulesSettings

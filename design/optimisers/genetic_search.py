@@ -14,7 +14,7 @@ from pymoo.operators.sampling.rnd import FloatRandomSampling
 
 from design.common.checkpoints import State
 from design.criteria.published_objective import published_terms
-from design.pad.curves import refine
+from design.pad.courses.curves import refine
 from design.pad.knots import MARGIN, Array, assemble
 from design.pad.morphology import Morphology
 

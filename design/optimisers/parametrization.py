@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from design.pad.curves import refine
+from design.pad.courses.curves import refine
 from design.pad.knots import MARGIN, Array, assemble
 from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings

@@ -138,26 +138,43 @@ class Morphology:
                 raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         document = read_json(path, FORMAT)
         try:
+            return cls.of_document(document)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "Morphology":
+        """From what `document` gave.
+
+        Raises:
+            InputError: something is missing, or breaks the rules of the class.
+        """
+        try:
             knots = np.array(document["knots"], dtype=np.float64)
             pad = cls(knots, float(document["pitch_mm"]), document.get("provenance", {}))
+        except InputError:
+            raise
         except (KeyError, TypeError, OverflowError) as error:
-            raise InputError(f"{path}: no valid morphology ({error!r})") from error
+            raise InputError(f"no valid morphology ({error!r})") from error
         except ValueError as error:
-            raise InputError(f"{path}: {error}") from error
+            raise InputError(error) from error
         if document.get("grid", pad.grid) != pad.grid:
-            raise InputError(f"{path}: grid is {document['grid']}, but there are {len(knots)} fibres")
+            raise InputError(f"grid is {document['grid']}, but there are {len(knots)} fibres")
         return pad
 
-    def save(self, path: str | Path) -> None:
-        """Write a `morphology.json`, atomically; reading it back gives the same knots to the last bit."""
-        document = {
+    def document(self) -> dict[str, Any]:
+        """All of it as JSON."""
+        return {
             "format": FORMAT,
             "grid": self.grid,
             "pitch_mm": self.pitch_mm,
             "knots": self.knots.tolist(),
             "provenance": dict(self.provenance),
         }
-        write_json(as_path("path", path), document)
+
+    def save(self, path: str | Path) -> None:
+        """Write a `morphology.json`, atomically; reading it back gives the same knots to the last bit."""
+        write_json(as_path("path", path), self.document())
 
     def to_mm(self, places: ArrayLike) -> Array:
         """Grid units to mm with the origin at the pad's centre, the frame presses are recorded in."""

@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from design.common.errors import InputError, instance, shown
 from design.common.figures import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
 from design.criteria.rules import Violation
-from design.pad.curves import crossings, flatten
+from design.pad.courses.curves import crossings, flatten
 from design.pad.morphology import Morphology
 from design.settings import Contact
 

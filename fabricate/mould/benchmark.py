@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from design.benchmarking.harness import Bench, BenchTrial
-from design.pad.curves import flatten
+from design.pad.courses.curves import flatten
 from design.pad.morphology import Morphology
 from fabricate.settings import DEFAULTS, MouldSettings
 

@@ -13,7 +13,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError, instance
-from design.pad.curves import Crossing, crossings, flatten
+from design.pad.courses.curves import Crossing, crossings, flatten
 from design.pad.morphology import Morphology
 from fabricate.settings import DEFAULTS, FabricationSettings
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from design.pad.curves import lengths
+from design.pad.courses.curves import lengths
 from fabricate.mould.plan import Plan, overlap
 
 from .fibre_layers import fibre_name, layers

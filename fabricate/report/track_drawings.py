@@ -17,7 +17,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from design.pad.curves import beziers
+from design.pad.courses.curves import beziers
 from design.pad.knots import Array
 from fabricate.mould.plan import Plan, polygon_rings
 

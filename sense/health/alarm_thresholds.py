@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 from .fault_likelihoods import HYPOTHESES
 

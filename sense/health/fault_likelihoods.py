@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from sense.processing.limits import LEAST_SPREAD_V, Array, Mask
+from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 from .fibre_prediction import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
 

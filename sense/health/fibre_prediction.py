@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import expit
 
 from design.common.computing import one_torch_thread
-from sense.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
+from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
 from .trained_model import average_in, one_cycle
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from design.common.errors import InputError
 from design.common.files import read_json
 from design.common.settings import validated
-from sense.processing.limits import Array, Indices, as_numbers, stream_of
+from sense.recordings.processing.limits import Array, Indices, as_numbers, stream_of
 from sense.recordings.recording import rate_of
 
 from .alarm_thresholds import Tail

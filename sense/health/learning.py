@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from design.common.errors import InputError, instance, real
-from sense.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
+from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 from sense.recordings.recording import Recording, rate_of
 
 from .alarm_thresholds import Tail
@@ -36,7 +36,7 @@ def learn_health(
     Raises:
         InputError: too few presses, or no living fibre.
     """
-    from sense.processing.press_alignment import as_detected  # compiled, which takes a moment to load
+    from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
     learnt = np.ones(len(recording.presses_mm), dtype=bool)
     learnt[list(held_back)] = False

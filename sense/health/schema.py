@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
 from design.common.settings import Settings
-from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
+from sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
 
 from .fault_likelihoods import HYPOTHESES, LIBRARY, STEPS
 from .fibre_prediction import COMPONENTS, HIDDEN, INPUTS, MEMBERS, TARGETS, TRACE

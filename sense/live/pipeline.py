@@ -19,8 +19,8 @@ from sense.health.trained_model import refuse_other_pad
 from sense.localizer.features import REST, bridged, press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.normalization import Scaled
-from sense.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
-from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+from sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
+from sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
 
 from .press_buffer import DONE, NEEDS, Press, Ring
 

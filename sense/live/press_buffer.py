@@ -7,7 +7,7 @@ import numpy as np
 
 from sense.health.fibre_prediction import RELEASED
 from sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 HISTORY = SLOW[-1]
 """Readings before a press that its localizer looks at, as far as there are so many."""

@@ -11,7 +11,7 @@ from design import Contact, Morphology
 from design.common.errors import InputError, real
 from design.common.files import read_json
 from design.common.settings import validated
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.recording import Recording
 from sense.rig.devices import Converter

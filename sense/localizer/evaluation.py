@@ -8,7 +8,7 @@ import numpy as np
 
 from design.common.errors import InputError, instance, shown, whole
 from design.criteria.fibre_loss import lost_subsets
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .features import bridged, window_inputs

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sense.processing.limits import Array, Indices, Mask
+from sense.recordings.processing.limits import Array, Indices, Mask
 
 Window = tuple[int, int]
 

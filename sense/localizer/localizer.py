@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from design.common.errors import InputError, instance, shown
 from design.common.files import read_json
 from sense.health.trained_model import files_of, refuse_other_pad
-from sense.processing.limits import Array, Floats, Mask
+from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
 
 from .features import SIZES, Inputs, press_inputs

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erf
 
 from design.common.errors import InputError
-from sense.processing.limits import Floats, Mask
+from sense.recordings.processing.limits import Floats, Mask
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 4) and

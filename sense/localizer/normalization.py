@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from design.common.errors import InputError
-from sense.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
+from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
 from .features import Inputs
 from .response_model import STEPS, ResponseModel, settled

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sense.processing.limits import LEAST_SPREAD_V, Array, Mask
+from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 BUMPS = 21
 """Bumps along a side of the pad."""

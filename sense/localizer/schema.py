@@ -8,7 +8,7 @@ from pydantic import Field, JsonValue, ValidationError
 
 from design.common.errors import InputError
 from design.common.settings import Settings
-from sense.processing.limits import LEAST_SPREAD_V, MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
+from sense.recordings.processing.limits import LEAST_SPREAD_V, MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
 from sense.settings import Features, Method, Split
 
 from .features import PASTS, SIZES

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
-from sense.processing.limits import MAX_BYTES, Array, Mask
+from sense.recordings.processing.limits import MAX_BYTES, Array, Mask
 
 _MAGIC = b"PFB1"
 _UNIT = 256

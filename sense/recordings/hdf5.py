@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError
 from design.common.files import atomic, require_file, writing
-from sense.processing.limits import MAX_BYTES, MAX_VALUES
+from sense.recordings.processing.limits import MAX_BYTES, MAX_VALUES
 
 from .recording import Recording
 

@@ -18,7 +18,7 @@ import numpy as np
 from design.common.errors import InputError
 from design.common.files import atomic, writing
 from design.pad.published_files import load_mat
-from sense.processing.limits import MAX_FIBRES, Array
+from sense.recordings.processing.limits import MAX_FIBRES, Array
 
 from .csv_table import read_csv
 from .recording import Recording
@@ -109,7 +109,7 @@ def import_csv(path: str | Path) -> Recording:
 
 def _found(readings: Array, times_s: Array, source: dict[str, str]) -> Recording:
     """A recording of the presses that the readings show, their places unknown."""
-    from sense.processing.press_detection import as_commanded, find_presses
+    from sense.recordings.processing.press_detection import as_commanded, find_presses
 
     first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
     Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)

@@ -8,7 +8,7 @@ from typing import Any
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
-from sense.processing.limits import MAX_INDEX, MAX_MM
+from sense.recordings.processing.limits import MAX_INDEX, MAX_MM
 
 
 def read_journal(path: Path) -> dict[int, tuple[float, float, int, int]]:

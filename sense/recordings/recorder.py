@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, shown, whole
 from design.common.files import lock, read_json, refuse_unwritable, write_json, writing
-from sense.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
+from sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, write_at
 from .press_journal import cut_torn_line, read_journal

@@ -13,8 +13,8 @@ import numpy as np
 
 from design.common.errors import InputError, shown
 from design.common.files import read_json, writing
-from sense.processing import limits
-from sense.processing.limits import Array, Indices, Mask
+from sense.recordings.processing import limits
+from sense.recordings.processing.limits import Array, Indices, Mask
 
 from .block_file import read_blocks
 from .press_journal import read_journal

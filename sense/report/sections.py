@@ -8,7 +8,7 @@ from typing import Any
 from design.common.errors import InputError
 from design.common.files import read_bytes
 from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
-from sense.processing.limits import MAX_FIBRES
+from sense.recordings.processing.limits import MAX_FIBRES
 
 from .loss_chart import Errors, loss_chart
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from design.common.errors import Fault
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 
 Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""

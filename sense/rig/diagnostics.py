@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 from .devices import Arm, Converter, RigFault
 

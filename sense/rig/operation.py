@@ -18,7 +18,7 @@ from design.settings import Contact
 from sense.localizer.localizer import Localizer
 from sense.recordings.recorder import refuse_existing
 from sense.recordings.recording import Recording
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 from sense.settings import RigSettings
 
 from .devices import Arm, Converter

@@ -16,7 +16,7 @@ from design.evaluation.localisation_error import Loss, PressSets, batches
 from design.pad.contact import signals, signals_quantized
 from design.pad.morphology import Morphology
 from design.settings import Contact
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 from .pads import described
 from .study import Findings, Study, Task

@@ -23,7 +23,7 @@ from design.evaluation.levenberg_marquardt import fit
 from design.evaluation.localisation_error import fresh_presses, training_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 from .pads import described
 from .study import Findings, Study, Task

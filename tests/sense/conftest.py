@@ -7,7 +7,7 @@ import pytest
 from design import Morphology
 from sense import Localizer, Recording, calibrate
 from sense import settings as sense_settings
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 
 QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)
 
@@ -43,3 +43,10 @@ def model(recording: Recording, localizer: Localizer, tmp_path_factory: pytest.T
     localizer.save(folder)
     recording.save(folder / "recording", {})
     return folder
+
+
+@pytest.fixture
+def folder(recording: Recording, tmp_path: Path) -> Path:
+    """The run directory of a recording."""
+    recording.save(tmp_path / "run", {"command": "test"})
+    return tmp_path / "run"

@@ -80,6 +80,15 @@ def profile_of(reach: tuple[tuple[float, float], ...]) -> Array:
     return np.column_stack([spline.x[:-1], spline.c[::-1].T])
 
 
+def profile_weights(profile: Array, end: float, distance: Array) -> Array:
+    """What a profile, as `profile_of` gives it, weighs at distances of any shape; 0 from `end` on."""
+    square = distance**2
+    piece = np.searchsorted(profile[:, 0], square, side="right") - 1
+    x, c0, c1, c2, c3 = profile[piece].T
+    above = square - x.T
+    return np.where(distance < end, c0.T + above * (c1.T + above * (c2.T + above * c3.T)), 0.0)
+
+
 @lru_cache(maxsize=64)
 def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
     """The press's shape in the frame of each family: chains (3, B) of breakpoints t, upper v, lower v; extents (2, 5).

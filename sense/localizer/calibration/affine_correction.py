@@ -11,7 +11,7 @@ import numpy as np
 
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Localizer
-from sense.processing.limits import Array, Floats
+from sense.recordings.processing.limits import Array, Floats
 
 GAIN, TURN, SHIFT = 0.2, 0.05, 0.1
 """Spreads expected: of the logarithm of a gain, of the angle (radians) and the stretch, of the shift (spans)."""

@@ -17,9 +17,9 @@ from sense import settings
 from sense.localizer.features import press_inputs
 from sense.localizer.network import Weights, forward, masked, pooled
 from sense.localizer.normalization import Normalization
-from sense.processing.limits import Array, Floats, Mask
+from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 
 from .published_training import HIDDEN
 

@@ -17,7 +17,7 @@ from sense.localizer.features import press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.network import refuse_unsound
 from sense.localizer.normalization import Normalization, Scaled
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 LEAST_TRAINING = 3
@@ -97,7 +97,7 @@ def learn(
     raw = press_inputs(recording.readings, *edges, options.features)
     shown_raw, shown_mm, held_mm = raw[taught], recording.presses_mm[taught], recording.presses_mm[checked]
     if options.method == "masked":
-        from sense.processing.press_alignment import as_detected  # compiled, which takes a moment to load
+        from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
         again = as_detected(recording.readings, recording.times_s, *edges)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]

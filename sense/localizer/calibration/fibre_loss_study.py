@@ -22,7 +22,7 @@ from design.criteria.fibre_loss import lost_subsets
 from sense import settings
 from sense.localizer.evaluation import by_place, errors_by_loss, held_back
 from sense.localizer.localizer import Found, Localizer
-from sense.processing.limits import MAX_FIBRES, Array, Indices
+from sense.recordings.processing.limits import MAX_FIBRES, Array, Indices
 from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses

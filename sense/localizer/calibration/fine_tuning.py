@@ -15,7 +15,7 @@ from torch import Tensor
 from design.common.computing import one_torch_thread
 from sense.health.trained_model import one_cycle
 from sense.localizer.network import Weights
-from sense.processing.limits import Floats
+from sense.recordings.processing.limits import Floats
 
 from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, looked_up, masked
 

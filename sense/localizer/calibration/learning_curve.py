@@ -17,7 +17,7 @@ from design.common.files import provenance
 from design.common.settings import or_default
 from sense import settings
 from sense.localizer.evaluation import distances
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses

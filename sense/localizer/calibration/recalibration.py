@@ -19,7 +19,7 @@ from design.criteria.fibre_loss import lost_subsets
 from sense.localizer.evaluation import conformal, distances, error_row
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Found, Localizer
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .affine_correction import fit_correction

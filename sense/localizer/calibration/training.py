@@ -23,7 +23,7 @@ from design.common.computing import one_torch_thread, run_tasks
 from sense import settings
 from sense.health.trained_model import average_in, one_cycle
 from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Weights
-from sense.processing.limits import Floats, Mask
+from sense.recordings.processing.limits import Floats, Mask
 
 MOST_STEPS = 11_000
 """Steps of training at most: with moved presses, the length of the recording does not matter beyond."""

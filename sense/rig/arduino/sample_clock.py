@@ -10,7 +10,7 @@ from collections import deque
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 Point = tuple[float, float]
 

@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 from sense.rig.arduino import framing
 from sense.rig.arduino.framing import FULL_SCALE, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Status
 

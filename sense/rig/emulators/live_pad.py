@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from design import Contact, Morphology, signals
-from sense.processing.limits import Array
-from sense.recordings.pad_model import TRAVEL_S, LivePad
-from sense.recordings.simulation import random_places
+from sense.recordings.processing.limits import Array
+from sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
+from sense.recordings.simulation.published_protocol import random_places
 from sense.rig.devices import ConverterSamples, RigFault
 from sense.settings import RigSettings
 

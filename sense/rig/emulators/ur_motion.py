@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 
 class Path(Protocol):

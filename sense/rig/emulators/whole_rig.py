@@ -6,8 +6,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from design import Contact, Morphology, signals
-from sense.processing.limits import Array
-from sense.recordings.pad_model import LivePad
+from sense.recordings.processing.limits import Array
+from sense.recordings.simulation.pad_model import LivePad
 from sense.rig.arduino.driver import Arduino
 from sense.rig.session.pad_frame import Frame
 from sense.rig.ur5.driver import UR5

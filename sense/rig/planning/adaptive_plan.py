@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from sense.localizer.localizer import Localizer
 from sense.localizer.locating import locate
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
 
 from .press_plan import PressPlan

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
-from sense.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
 from sense.recordings.csv_table import read_csv
+from sense.recordings.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
 from sense.settings import RigSettings
 
 COLUMNS = ("x_mm", "y_mm", "depth_mm")

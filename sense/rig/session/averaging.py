@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.rig.devices import ConverterSamples
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import Recorder
 from sense.rig.devices import Arm, Converter, Pose, RigFault
 from sense.rig.planning.press_plan import PressPlan

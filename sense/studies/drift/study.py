@@ -23,10 +23,10 @@ from sense.localizer.calibration.calibration import split_presses
 from sense.localizer.evaluation import distances
 from sense.localizer.evaluation import idle_share as recorded_idle_share
 from sense.localizer.features import bridged, press_inputs
-from sense.processing.filters import running_median, total_variation
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.filters import running_median, total_variation
+from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 from sense.settings import RigSettings
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task

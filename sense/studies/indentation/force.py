@@ -13,7 +13,7 @@ from design.common.figures import CURVES, FAINT, INK, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from design.pad.morphology import Morphology
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
 

@@ -15,7 +15,7 @@ from design.pad.contact import signals
 from design.pad.indentation import Indenter, indented_signals
 from design.pad.morphology import Morphology
 from design.settings import Contact
-from sense.processing.limits import Array, Indices
+from sense.recordings.processing.limits import Array, Indices
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 
 LABELLED = "fixed labels"
 

@@ -12,7 +12,7 @@ from design.common.figures import CURVES, INK, draw_confusions, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.studies.indentation.force import COUNTS, readings
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task

@@ -10,7 +10,7 @@ from design.criteria.differentiable import span_samples
 from design.criteria.penalties import penalties
 from design.criteria.rules import check_rules
 from design.pad.contact import fibre_axes
-from design.pad.curves import crossings, lengths
+from design.pad.courses.curves import crossings, lengths
 from design.settings import PadSettings, RulesSettings
 
 NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0, border_mm=0, max_length_mm=1e6)

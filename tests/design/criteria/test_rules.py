@@ -6,7 +6,7 @@ from scipy.interpolate import PchipInterpolator
 
 from design import InputError, Morphology, Spec, crossings
 from design.criteria.rules import check_rules
-from design.pad.curves import crossing_angles
+from design.pad.courses.curves import crossing_angles
 from design.settings import RulesSettings
 
 NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from design import Morphology
 from design.criteria.rules import check_rules
 from design.optimisers.parametrization import Fibres, border_of, first_course
-from design.pad.curves import refine
+from design.pad.courses.curves import refine
 from design.settings import PadSettings, RulesSettings
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
-from design.pad.curves import Crossing
+from design.pad.courses.curves import Crossing
 from design.pad.morphology import Morphology
 from fabricate.mould.depth_levels import fibre_levels
 from fabricate.mould.plan import COVER_MM, Plan

@@ -11,7 +11,7 @@ from design import Morphology
 from sense import Recording
 from sense.cli.live import view_lines
 from sense.live.page_server import LivePage
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 from sense.rig.devices import ConverterSamples, RigFault
 from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.settings import RigSettings

@@ -6,7 +6,7 @@ from design import Morphology
 from sense import Recording
 from sense import settings as sense_settings
 from sense.health.health_model import HealthModel
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 from tests.sense.health.pads import PRESSES, learn
 
 

@@ -12,7 +12,7 @@ from sense.health.health_model import COMMANDED, DETECTED
 from sense.health.learning import dead_fibres, fit_health_model
 from sense.health.monitor import Monitor, examine
 from sense.health.schema import LEAST_PRESSES
-from sense.processing.limits import LEAST_SPREAD_V
+from sense.recordings.processing.limits import LEAST_SPREAD_V
 from tests.sense.health.pads import BAD_FROM, later, learn, noisy, weak
 
 

@@ -19,7 +19,7 @@ from sense.live.press_buffer import HISTORY, SLACK, Press, Ring
 from sense.localizer.features import press_inputs
 from sense.localizer.network import OUTPUTS
 from sense.localizer.normalization import Normalization
-from sense.processing.press_detection import Event
+from sense.recordings.processing.press_detection import Event
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -12,7 +12,7 @@ from design import Morphology
 from design.common.errors import InputError
 from sense import Recording
 from sense.live.sources import connected, replayed, simulated
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 from sense.rig.arduino.driver import Arduino
 from sense.rig.devices import ConverterSamples, RigFault
 from sense.rig.emulators.board import EmulatedBoard

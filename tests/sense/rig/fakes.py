@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design import Contact, Morphology
-from sense.recordings.pad_model import LivePad
 from sense.recordings.recorder import STATE_COLUMNS
+from sense.recordings.simulation.pad_model import LivePad
 from sense.rig.devices import ArmState, ConverterSamples, Pose, RigFault
 from sense.rig.session.pad_frame import Frame
 from sense.settings import RigSettings

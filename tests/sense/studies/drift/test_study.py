@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from design import InputError, Morphology
 from sense import Recording, open_recording
-from sense.recordings.simulation import simulate
+from sense.recordings.simulation.published_protocol import simulate
 from sense.settings import RigSettings
 from sense.studies.drift import study as drift
 from sense.studies.drift.study import (

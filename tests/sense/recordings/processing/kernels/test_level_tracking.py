@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from sense.processing.kernels import level_tracking, pad_state
+from sense.recordings.processing.kernels import level_tracking, pad_state
 
 FIBRES = 3
 LOOK_S, FADE_S, GAP_S, MEMORY_S, NOISE_S = 0.03, 2.5, 1.0, 1.0, 10.0

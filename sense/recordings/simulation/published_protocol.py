@@ -5,11 +5,11 @@ import numpy as np
 from design import Contact, Morphology, signals
 from design.common.errors import MOST_VALUES, InputError, instance, whole
 from design.common.settings import or_default
-from sense.processing.limits import MAX_FIBRES, Array
+from sense.recordings.processing.limits import MAX_FIBRES, Array
+from sense.recordings.recording import Recording
 from sense.settings import RigSettings
 
 from .pad_model import Cycle, read_pad
-from .recording import Recording
 
 JITTER = 0.1
 """Spread of the interval between readings, share of its mean: the loop of the recording is no clock."""

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from design import Contact, Morphology, signals, signals_quantized
 from sense import RigSettings, simulate
-from sense.recordings.pad_model import (
+from sense.recordings.simulation.pad_model import (
     ADC_STEPS,
     SUPPLY_V,
     Answer,

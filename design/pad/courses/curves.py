@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, real
 from design.pad.kernels.pchip import pchip_slopes
-
-from .knots import Array, assemble
-from .morphology import Morphology
+from design.pad.knots import Array, assemble
+from design.pad.morphology import Morphology
 
 MOST_POINTS = 10**7
 """Most points the curves of a pad are flattened to."""

@@ -8,9 +8,9 @@ from hypothesis.extra import numpy as hnp
 
 from design.common.errors import InputError
 from sense import open_recording
-from sense.processing.benchmark import fibre, linear_program, objective
-from sense.processing.filters import running_median, stretches, total_variation
-from sense.processing.stream_filters import TotalVariation
+from sense.recordings.processing.benchmark import fibre, linear_program, objective
+from sense.recordings.processing.filters import running_median, stretches, total_variation
+from sense.recordings.processing.stream_filters import TotalVariation
 from tests.helpers.effort import few
 
 STEP_V = 3.3 / 1023

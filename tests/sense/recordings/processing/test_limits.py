@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from design.common.errors import InputError
-from sense.processing.limits import MAX_INDEX, as_numbers, refuse_beyond
+from sense.recordings.processing.limits import MAX_INDEX, as_numbers, refuse_beyond
 
 
 def test_what_lies_beyond_is_named_with_its_row_and_the_limit() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from design import Contact, Morphology, signals
-from sense.processing.limits import Array
+from sense.recordings.processing.limits import Array
 from sense.settings import RigSettings
 
 SUPPLY_V = 3.3

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from design.common.errors import InputError
-from sense.processing.filters import running_median, total_variation
-from sense.processing.stream_filters import RunningMedian, TotalVariation
+from sense.recordings.processing.filters import running_median, total_variation
+from sense.recordings.processing.stream_filters import RunningMedian, TotalVariation
 from tests.helpers.effort import few
 
 VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))

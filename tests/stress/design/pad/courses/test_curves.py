@@ -14,8 +14,8 @@ from design import (
     flatten,
 )
 from design.criteria.rules import check_rules
-from design.pad.bending import bend_radius, fold_gap, traced_curve
-from design.pad.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
+from design.pad.courses.bending import bend_radius, fold_gap, traced_curve
+from design.pad.courses.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
 from design.pad.knots import assemble
 from design.settings import RulesSettings
 from tests.helpers.effort import few

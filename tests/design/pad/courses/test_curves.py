@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 
 from design import Morphology, crossings, flatten
 from design.criteria.differentiable import pchip_sample
-from design.pad.curves import beziers, crossing_angles, lengths, slopes
+from design.pad.courses.curves import beziers, crossing_angles, lengths, slopes
 from design.pad.kernels.pchip import sample_curves
 from tests.helpers.effort import few
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.processing.kernels import interval_heap
+from sense.recordings.processing.kernels import interval_heap
 
 
 @given(

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sense.processing.kernels import pad_state, press_detection
+from sense.recordings.processing.kernels import pad_state, press_detection
 
 
 def pressed(**values: object) -> np.ndarray:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from sense.processing.kernels import clipping, total_variation_l1
+from sense.recordings.processing.kernels import clipping, total_variation_l1
 
 
 def test_the_staircase_keeps_its_height_exactly():

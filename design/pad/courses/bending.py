@@ -7,8 +7,9 @@ angle either side of 0 and it never meets itself.
 import numpy as np
 import shapely
 
+from design.pad.knots import Array
+
 from .curves import cubic, quadratic
-from .knots import Array
 
 FOLD = np.pi / 2
 """Points of a fibre that lie `FOLD` gaps apart along it, half a turn of a circle one gap wide, are to keep that gap."""

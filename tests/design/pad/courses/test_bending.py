@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Morphology, flatten
-from design.pad.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
-from design.pad.curves import beziers, slope_beziers
+from design.pad.courses.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
+from design.pad.courses.curves import beziers, slope_beziers
 from tests.helpers.effort import few
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])

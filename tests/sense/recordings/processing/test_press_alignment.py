@@ -3,7 +3,7 @@
 import numpy as np
 
 from sense import Recording
-from sense.processing.press_alignment import as_detected
+from sense.recordings.processing.press_alignment import as_detected
 
 
 def test_found_presses_are_near_the_commanded_ones(recording: Recording) -> None:

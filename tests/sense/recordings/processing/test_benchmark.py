@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from design.benchmarking import harness
-from sense.processing import benchmark as bench_filter
-from sense.processing.benchmark import fibre, iterated, linear_program, objective
-from sense.processing.filters import total_variation
+from sense.recordings.processing import benchmark as bench_filter
+from sense.recordings.processing.benchmark import fibre, iterated, linear_program, objective
+from sense.recordings.processing.filters import total_variation
 
 
 def test_the_other_ways_find_the_same_minimum():

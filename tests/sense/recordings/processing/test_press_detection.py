@@ -11,11 +11,18 @@ from hypothesis import strategies as st
 from design import Morphology
 from design.common.errors import InputError
 from sense import Recording, RigSettings, import_mat, simulate
-from sense.processing.kernels import level_tracking
-from sense.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder, Presses, as_commanded, find_presses
-from sense.recordings.pad_model import Divider
+from sense.recordings.processing.kernels import level_tracking
+from sense.recordings.processing.press_detection import (
+    SENT_DOWN_S,
+    SENT_UP_S,
+    Finder,
+    Presses,
+    as_commanded,
+    find_presses,
+)
+from sense.recordings.simulation.pad_model import Divider
 from tests.helpers.effort import few
-from tests.sense.processing.spoiled_readings import (
+from tests.sense.recordings.processing.spoiled_readings import (
     breaking,
     dead,
     growing_noisy,

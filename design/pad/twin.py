@@ -1,0 +1,221 @@
+"""The twin of a printed pad: how it was laid and wired, and what a press really does to it, as presses have shown.
+
+`padforge sense identify` finds one from a recording; searches design for its reach, simulations answer like it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from design.common.errors import InputError, instance, mapping, real, reals, shown, whole
+from design.common.errors import path as as_path
+from design.common.files import read_json, write_json
+from design.settings import Contact
+
+from .contact import as_presses
+from .kernels.press import profile_of, profile_weights
+from .knots import Array
+from .morphology import Morphology
+
+FORMAT = "padforge-twin/1"
+MOST_VOLTS, MOST_MM = 1e3, 1e4
+MOST_CHANNELS, MOST_POINTS = 1024, 64
+LONGEST = 0.02
+"""Longest element by which a laid fibre is summed, grid units."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How a pad lay under the arm: a press at p mm was made at scale turn(mirror(p)) + shift of the plan.
+
+    Attributes:
+        mirrored: whether x counts the other way, as it does on a casting that was turned over.
+        turn_deg: counter-clockwise. shift_mm: from the pad's middle. scale: mm of the plan for a mm of the arm, > 0.
+    """
+
+    mirrored: bool = False
+    turn_deg: float = 0.0
+    shift_mm: tuple[float, float] = (0.0, 0.0)
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        instance("mirrored", self.mirrored, bool)
+        object.__setattr__(self, "turn_deg", real("turn_deg", self.turn_deg, -360, 360))
+        shift = reals("shift_mm", self.shift_mm, MOST_MM)
+        if shift.shape != (2,):
+            raise InputError(f"shift_mm is {shown(self.shift_mm)}, expected two numbers")
+        object.__setattr__(self, "shift_mm", tuple(shift.tolist()))
+        object.__setattr__(self, "scale", real("scale", self.scale, 0.1, 10))
+
+    def to_plan(self, places_mm: Array) -> Array:
+        """(Q, 2) mm as the arm counts to (Q, 2) mm on the plan, both from the middle."""
+        return self.scale * self.turned(places_mm) + self.shift_mm
+
+    def turned(self, places_mm: Array) -> Array:
+        """(Q, 2) mm as the arm counts, mirrored and turned."""
+        cos, sin = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
+        mirrored = places_mm * ([-1.0, 1.0] if self.mirrored else [1.0, 1.0])
+        return mirrored @ np.array([[cos, sin], [-sin, cos]])
+
+
+@dataclass(frozen=True)
+class TwinChannel:
+    """What a channel of the recording reads.
+
+    Attributes:
+        channel: from 0. fibre: which one it reads, from 0 as in the knots; None where no fibre explains it.
+        gain_v: V for a grid unit of fibre right under the press; below 0 where a press lowers the reading.
+        noise_v: standard deviation of a response that neither place nor history explains, V.
+        explained: share of the variance of responses on presses held out; 0 where there is no fibre.
+    """
+
+    channel: int
+    fibre: int | None
+    gain_v: float
+    noise_v: float
+    explained: float
+
+    def __post_init__(self) -> None:
+        whole("channel", self.channel, 0, MOST_CHANNELS)
+        if self.fibre is not None:
+            whole("fibre", self.fibre, 0, MOST_CHANNELS)
+        for name, least in (("gain_v", -MOST_VOLTS), ("noise_v", 0.0)):
+            object.__setattr__(self, name, real(name, getattr(self, name), least, MOST_VOLTS))
+        object.__setattr__(self, "explained", real("explained", self.explained, -1e9, 1))
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A printed pad as presses have shown it.
+
+    Attributes:
+        morphology: as it was planned. channels: one for each channel of the recording. frame: how it lay.
+        distance_mm, weight: (n,) how a fibre element answers a press at that distance, 1 at its largest, 0 at the end.
+        laid_mm: for each fibre of the plan its course as laid, (P, 2) mm on the plan from its middle; None where no
+            channel reads it.
+        noise: standard deviation of a response that neither place nor history explains, share of full scale.
+        sensed_mm: width and height of what was pressed, along the axes of the plan.
+        presses: learnt from. provenance: free JSON.
+
+    Raises:
+        InputError: what does not fit together, or is out of range.
+    """
+
+    morphology: Morphology
+    channels: tuple[TwinChannel, ...]
+    frame: Frame
+    distance_mm: Array
+    weight: Array
+    laid_mm: tuple[Array | None, ...]
+    noise: float
+    sensed_mm: tuple[float, float]
+    presses: int
+    provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
+
+    def __post_init__(self) -> None:
+        fibres = len(instance("morphology", self.morphology, Morphology).knots)
+        _refuse_wiring([channel.fibre for channel in self.channels if channel.fibre is not None], fibres)
+        object.__setattr__(self, "distance_mm", reals("distance_mm", self.distance_mm, MOST_MM))
+        object.__setattr__(self, "weight", reals("weight", self.weight, MOST_MM))
+        if not self.distance_mm.ndim == self.weight.ndim == 1 or self.distance_mm.size != self.weight.size:
+            raise InputError("distance_mm and weight of reach must be as many numbers")
+        laid = tuple(None if line is None else reals("laid_mm", line, MOST_MM) for line in self.laid_mm)
+        if len(laid) != fibres or any(line is not None and (line.ndim != 2 or line.shape[1] != 2) for line in laid):
+            raise InputError(f"laid_mm must have a row of points or null for each of the {fibres} fibres")
+        object.__setattr__(self, "laid_mm", laid)
+        object.__setattr__(self, "noise", real("noise", self.noise, 1e-9, 10))
+        sensed = reals("sensed_mm", self.sensed_mm, MOST_MM)
+        if sensed.shape != (2,) or sensed.min() <= 0:
+            raise InputError(f"sensed_mm is {shown(self.sensed_mm)}, expected width and height above 0")
+        object.__setattr__(self, "sensed_mm", tuple(sensed.tolist()))
+        whole("presses", self.presses, 1, 2**53)
+        mapping("provenance", self.provenance)
+        self.contact()
+
+    def contact(self, pitch_mm: float | None = None) -> Contact:
+        """The measured contact, on a pad of that pitch; of the twin's own if None."""
+        pitch_mm = self.morphology.pitch_mm if pitch_mm is None else pitch_mm
+        points = zip((self.distance_mm / pitch_mm).tolist(), self.weight.tolist(), strict=True)
+        return Contact(reach=tuple(points), length="euclidean")
+
+    def laid_signals(self, places_mm: ArrayLike) -> Array:
+        """(Q, 2M) what the fibres as laid signal for presses at (Q, 2) mm as the arm counts, grid units.
+
+        0 for a fibre that no channel reads. Summed over elements of at most LONGEST, within some 1e-4 of the integral.
+        """
+        places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(reals("places_mm", places_mm, MOST_MM))))
+        profile, end = profile_of(self.contact().reach), self.contact().reach[-1][0]
+        out = np.zeros((len(places), len(self.laid_mm)))
+        for fibre, line in enumerate(self.laid_mm):
+            if line is not None:
+                middles, lengths = _elements(self.morphology.to_grid(line))
+                for press, place in enumerate(places):
+                    far = np.hypot(*(middles - place).T)
+                    out[press, fibre] = profile_weights(profile, end, far) @ lengths
+        return out
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Twin":
+        """Read a `twin.json`.
+
+        Raises:
+            InputError: the file is missing, torn, of another kind, or what it holds does not fit together.
+        """
+        path = as_path("path", path)
+        document = read_json(path, FORMAT)
+        try:
+            reach = document["reach"]
+            return cls(
+                Morphology.of_document(document["morphology"]),
+                tuple(TwinChannel(**channel) for channel in document["channels"]),
+                Frame(**document["frame"]),
+                reach["distance_mm"],
+                reach["weight"],
+                tuple(document["laid_mm"]),
+                document["noise"],
+                document["sensed_mm"],
+                document["presses"],
+                document.get("provenance", {}),
+            )
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise InputError(f"{path}: no valid twin ({error!r})") from error
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def save(self, path: str | Path) -> None:
+        """Write a `twin.json`, atomically."""
+        pad = self.morphology
+        document = {
+            "format": FORMAT,
+            "morphology": pad.document(),
+            "channels": [asdict(channel) for channel in self.channels],
+            "frame": asdict(self.frame),
+            "reach": {"distance_mm": self.distance_mm.tolist(), "weight": self.weight.tolist()},
+            "laid_mm": [None if line is None else np.round(line, 4).tolist() for line in self.laid_mm],
+            "noise": self.noise,
+            "sensed_mm": list(self.sensed_mm),
+            "presses": self.presses,
+            "provenance": dict(self.provenance),
+        }
+        write_json(as_path("path", path), document)
+
+
+def _refuse_wiring(read: list[int], fibres: int) -> None:
+    if read and max(read) >= fibres:
+        raise InputError(f"a channel reads fibre {max(read)}, allowed are 0 to {fibres - 1}")
+    if len(set(read)) < len(read):
+        raise InputError("two channels read the same fibre")
+
+
+def _elements(line: Array) -> tuple[Array, Array]:
+    """Middles (n, 2) and lengths (n,) of elements no longer than LONGEST along a polyline (P, 2)."""
+    along = np.diff(line, axis=0)
+    size = np.hypot(*along.T)
+    parts = np.maximum(np.ceil(size / LONGEST), 1).astype(int)
+    which = np.repeat(np.arange(len(parts)), parts)
+    share = (np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[which]
+    return line[which] + share[:, None] * along[which], (size / parts)[which]

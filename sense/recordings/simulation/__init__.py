@@ -1,0 +1,1 @@
+"""The simulated pad, and the recording that the published protocol makes of it."""
