@@ -245,11 +245,13 @@ def write_report(folder: Path) -> Path:
     from design.report.sections import design_sections, provenance_row, provenance_section
     from fabricate.report.sections import fabrication_sections
     from sense.report import sections as sensed
+    from sense.report.identification_results import identification_sections
 
     stages = (
         ("design", folder / "design.json", design_sections),
         ("fabrication", folder / "fabrication.json", fabrication_sections),
         ("recording", folder / "recording" / "start.json", sensed.recording_sections),
+        ("identification", folder / "identification.json", identification_sections),
         ("calibration", folder / "calibration.json", sensed.calibration_sections),
         ("fibre-loss", folder / "fibre_loss.json", sensed.fibre_loss_sections),
     )

@@ -3,7 +3,7 @@
 `padforge sense identify` finds one from a recording; searches design for its reach, simulations answer like it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,9 @@ class Twin:
         distance_mm, weight: (n,) how a fibre element answers a press at that distance, 1 at its largest, 0 at the end.
         laid_mm: for each fibre of the plan its course as laid, (P, 2) mm on the plan from its middle; None where no
             channel reads it.
+        angle_weight: (n,) what is added to `weight` times cos 2 phi, phi the angle between the fibre and the way to
+            the press; None where the answer does not depend on it.
+        sensitivity: for each fibre how much a piece of it counts, (P - 1,) about 1; None where all count alike.
         noise: standard deviation of a response that neither place nor history explains, share of full scale.
         sensed_mm: width and height of what was pressed, along the axes of the plan.
         presses: learnt from. provenance: free JSON.
@@ -114,19 +117,27 @@ class Twin:
     noise: float
     sensed_mm: tuple[float, float]
     presses: int
+    angle_weight: Array | None = None
+    sensitivity: tuple[Array | None, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         fibres = len(instance("morphology", self.morphology, Morphology).knots)
         _refuse_wiring([channel.fibre for channel in self.channels if channel.fibre is not None], fibres)
-        object.__setattr__(self, "distance_mm", reals("distance_mm", self.distance_mm, MOST_MM))
-        object.__setattr__(self, "weight", reals("weight", self.weight, MOST_MM))
-        if not self.distance_mm.ndim == self.weight.ndim == 1 or self.distance_mm.size != self.weight.size:
-            raise InputError("distance_mm and weight of reach must be as many numbers")
+        for name in ("distance_mm", "weight", *(["angle_weight"] if self.angle_weight is not None else [])):
+            object.__setattr__(self, name, reals(name, getattr(self, name), MOST_MM))
+            if getattr(self, name).shape != (len(self.distance_mm),):
+                raise InputError(f"{name} of reach must be a row of {len(self.distance_mm)} numbers, as distance_mm is")
         laid = tuple(None if line is None else reals("laid_mm", line, MOST_MM) for line in self.laid_mm)
-        if len(laid) != fibres or any(line is not None and (line.ndim != 2 or line.shape[1] != 2) for line in laid):
+        if len(laid) != fibres or any(line is not None and line.shape[1:] != (2,) for line in laid):
             raise InputError(f"laid_mm must have a row of points or null for each of the {fibres} fibres")
         object.__setattr__(self, "laid_mm", laid)
+        if self.sensitivity is not None:
+            found = tuple(None if row is None else reals("sensitivity", row, MOST_MM) for row in self.sensitivity)
+            pieces = [None if line is None else (len(line) - 1,) for line in laid]
+            if [None if row is None else row.shape for row in found] != pieces:
+                raise InputError("sensitivity must have a number for each piece of each course in laid_mm")
+            object.__setattr__(self, "sensitivity", found)
         object.__setattr__(self, "noise", real("noise", self.noise, 1e-9, 10))
         sensed = reals("sensed_mm", self.sensed_mm, MOST_MM)
         if sensed.shape != (2,) or sensed.min() <= 0:
@@ -148,14 +159,18 @@ class Twin:
         0 for a fibre that no channel reads. Summed over elements of at most LONGEST, within some 1e-4 of the integral.
         """
         places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(reals("places_mm", places_mm, MOST_MM))))
-        profile, end = profile_of(self.contact().reach), self.contact().reach[-1][0]
+        reach = self.contact().reach
+        profiles = [profile_of(reach)]
+        if self.angle_weight is not None:
+            points = zip((d for d, _ in reach), self.angle_weight.tolist(), strict=True)
+            profiles.append(profile_of(tuple(points)))
         out = np.zeros((len(places), len(self.laid_mm)))
         for fibre, line in enumerate(self.laid_mm):
             if line is not None:
-                middles, lengths = _elements(self.morphology.to_grid(line))
+                counts = None if self.sensitivity is None else self.sensitivity[fibre]
+                elements = _elements(self.morphology.to_grid(line), counts)
                 for press, place in enumerate(places):
-                    far = np.hypot(*(middles - place).T)
-                    out[press, fibre] = profile_weights(profile, end, far) @ lengths
+                    out[press, fibre] = _answer(*elements, place, profiles, reach[-1][0])
         return out
 
     @classmethod
@@ -179,6 +194,8 @@ class Twin:
                 document["noise"],
                 document["sensed_mm"],
                 document["presses"],
+                reach.get("angle_weight"),
+                None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
                 document.get("provenance", {}),
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
@@ -194,8 +211,10 @@ class Twin:
             "morphology": pad.document(),
             "channels": [asdict(channel) for channel in self.channels],
             "frame": asdict(self.frame),
-            "reach": {"distance_mm": self.distance_mm.tolist(), "weight": self.weight.tolist()},
-            "laid_mm": [None if line is None else np.round(line, 4).tolist() for line in self.laid_mm],
+            "reach": {"distance_mm": self.distance_mm.tolist(), "weight": self.weight.tolist()}
+            | ({} if self.angle_weight is None else {"angle_weight": self.angle_weight.tolist()}),
+            "laid_mm": _rounded(self.laid_mm),
+            "sensitivity": None if self.sensitivity is None else _rounded(self.sensitivity),
             "noise": self.noise,
             "sensed_mm": list(self.sensed_mm),
             "presses": self.presses,
@@ -211,11 +230,38 @@ def _refuse_wiring(read: list[int], fibres: int) -> None:
         raise InputError("two channels read the same fibre")
 
 
-def _elements(line: Array) -> tuple[Array, Array]:
-    """Middles (n, 2) and lengths (n,) of elements no longer than LONGEST along a polyline (P, 2)."""
+def _rounded(rows: Sequence[Array | None]) -> list[list[Any] | None]:
+    return [None if row is None else np.round(row, 4).tolist() for row in rows]
+
+
+def _elements(line: Array, counts: Array | None) -> tuple[Array, Array, Array]:
+    """Middles (n, 2), lengths times what they count (n,) and unit tangents (n, 2) of elements up to LONGEST.
+
+    Args:
+        line: (P, 2) a polyline. counts: (P - 1,) of each piece; None where all count alike.
+    """
     along = np.diff(line, axis=0)
     size = np.hypot(*along.T)
     parts = np.maximum(np.ceil(size / LONGEST), 1).astype(int)
     which = np.repeat(np.arange(len(parts)), parts)
     share = (np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[which]
-    return line[which] + share[:, None] * along[which], (size / parts)[which]
+    tangents = along / np.maximum(size, 1e-12)[:, None]
+    return (
+        line[which] + share[:, None] * along[which],
+        ((size if counts is None else counts * size) / parts)[which],
+        tangents[which],
+    )
+
+
+def _answer(
+    middles: Array, lengths: Array, tangents: Array, place: Array, profiles: Sequence[Array], end: float
+) -> float:
+    """What elements signal for a press at `place` (2,), by the profiles of the weight and of its angle's part."""
+    off = middles - place
+    far = np.hypot(*off.T)
+    near = far < end
+    weights = profile_weights(profiles[0], end, far[near])
+    for angled in profiles[1:]:
+        along = (off[near] * tangents[near]).sum(axis=1)
+        weights = weights + profile_weights(angled, end, far[near]) * (2 * along**2 / (far[near] ** 2 + 1e-6) - 1)
+    return float(weights @ lengths[near])

@@ -4,13 +4,14 @@ import click
 
 from .analysis import fibre_loss, learning_curve, recalibrate
 from .calibration import calibrate, evaluate
+from .identify import identify
 from .live import live
 from .locate import health, locate
 from .recordings import export, import_
 from .rig import doctor, record
 
 COMMANDS = (
-    *(import_, export, calibrate, evaluate, locate, health, record, doctor, live),
+    *(import_, export, calibrate, evaluate, identify, locate, health, record, doctor, live),
     *(recalibrate, fibre_loss, learning_curve),
 )
 

@@ -1,0 +1,206 @@
+"""All that an identification leaves in a folder: the twin, the document and its pictures, and what the report says."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from design.common.files import provenance, refuse_unwritable, staged, write_json
+from design.common.page.elements import PageSection, figures, paragraph, table
+from design.common.profiling import stage
+from design.pad.morphology import Morphology
+from sense.recordings.processing.limits import Array, Mask
+from sense.recordings.recording import Recording
+from sense.twin.identification import Identification, identify
+
+FORMAT = "padforge-identification/1"
+STRANGER = 0.02
+"""Share of the variance by which a plan must explain more than straight fibres do, to be known by its presses."""
+COMMAND = "padforge sense identify"
+
+
+def identify_into(
+    recording: Recording,
+    pad: Morphology,
+    out: Path,
+    seed: int = 0,
+    *,
+    inputs: list[Path] | None = None,
+    report: Callable[[str, int, int], None] = lambda what, done, of: None,
+) -> dict[str, Any]:
+    """Identify a pad, write twin.json, identification.json and two pictures to `out`, and return the document.
+
+    Nothing in `out` changes before the last result is there.
+
+    Raises:
+        InputError: as `identify`, or `out` cannot be written.
+    """
+    refuse_unwritable(out)
+    with stage("identify"):
+        found = identify(recording, pad, seed, report)
+    origin = provenance(COMMAND, seed, inputs or [])
+    twin, document = found.twin(origin), identification_document(found) | {"provenance": origin}
+    with staged(out) as folder, stage("figures"):
+        from .identification_figures import draw_laid_plan, draw_responses
+
+        twin.save(folder / "twin.json")
+        write_json(folder / "identification.json", document)
+        draw_responses(found, folder / "twin_responses.png")
+        draw_laid_plan(found, folder / "twin_plan.png")
+    return document
+
+
+def identification_document(found: Identification) -> dict[str, Any]:
+    """What was found, as JSON: fibres count from 0, None where no fibre explains a channel."""
+    twin, laid = found.twin(), found.laid_mm()
+    return {
+        "format": FORMAT,
+        "presses": len(found.learnt),
+        "held_out": len(found.held_out),
+        "channels": [
+            asdict(channel) | _laid(found, laid, channel.channel) | {"or_fibres": _others(found, channel.channel)}
+            for channel in twin.channels
+        ],
+        "explained": float(found.explained.mean()),
+        "explained_on_plan": found.on_plan,
+        "noise": twin.noise,
+        "frame": asdict(twin.frame),
+        "reach": {"distance_mm": twin.distance_mm.tolist(), "weight": twin.weight.tolist()},
+        "angle": twin.angle_weight is not None,
+        "sensed_mm": list(twin.sensed_mm),
+        "doubts": len(found.doubts),
+        "explained_by_straight": found.straight,
+    }
+
+
+def _laid(found: Identification, laid: Sequence[tuple[Array, Array, Mask]], channel: int) -> dict[str, float]:
+    """How far the fibre of a channel lies beside its plan within what was pressed, and how sure that is, mm."""
+    rows = np.flatnonzero(found.live == channel)
+    if not len(rows):
+        return {}
+    aside, unsure, within = laid[int(rows[0])]
+    if not within.any():
+        return {"aside_mm": 0.0, "unsure_mm": float(unsure.mean())}
+    return {"aside_mm": float(np.sqrt((aside[within] ** 2).mean())), "unsure_mm": float(unsure[within].mean())}
+
+
+def _others(found: Identification, channel: int) -> list[int]:
+    """Fibres that a channel may read as well, by the wirings that cannot be told from the one found."""
+    rows = np.flatnonzero(found.live == channel)
+    if not len(rows):
+        return []
+    row = int(rows[0])
+    return sorted({doubt.fibres[row] for doubt in found.doubts} - {found.fit.pad.fibres[row]})
+
+
+def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
+    """An identification for people; channels and fibres count from 1."""
+    frame = document["frame"]
+    return [
+        f"twin of {document['presses']} presses -> {out / 'twin.json'}",
+        "channel fibre  gain (mV)  noise (mV)  explained  beside its plan (mm)",
+        *(
+            f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 1e3:10.1f} {row['noise_v'] * 1e3:11.2f} "
+            + (
+                f"{row['explained']:10.2f} {row['aside_mm']:10.2f} +- {row['unsure_mm']:.2f}"
+                if "aside_mm" in row
+                else ""
+            )
+            for row in document["channels"]
+        ),
+        f"explained {document['explained']:.3f} of what presses held out show; on the plan as it is"
+        f" {document['explained_on_plan']:.3f}; noise {document['noise']:.1%} of full scale",
+        f"laid {_mirrored(frame)}, turned {frame['turn_deg']:.1f} degrees, shifted {_shift(frame)} mm,"
+        f" scale {frame['scale']:.3f}",
+        *doubt_lines(document),
+    ]
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    line = f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 1e3:10.1f} {row['noise_v'] * 1e3:11.2f}"
+    return line + (
+        f" {row['explained']:10.2f} {row['aside_mm']:10.2f} +- {row['unsure_mm']:.2f}" if "aside_mm" in row else ""
+    )
+
+
+def doubt_lines(document: Mapping[str, Any]) -> Iterator[str]:
+    """What the presses cannot tell, in words."""
+    if document["doubts"]:
+        told = "; ".join(
+            f"channel {row['channel'] + 1}: {_fibre(row)} or {', '.join(str(fibre + 1) for fibre in row['or_fibres'])}"
+            for row in document["channels"]
+            if row["or_fibres"]
+        )
+        yield (
+            f"not to be told: {document['doubts']} other ways to lie and be wired explain the presses as well"
+            + (f" ({told})" if told else "")
+        )
+    straight = document["explained_by_straight"]
+    if straight is not None and document["explained_on_plan"] < straight + STRANGER:
+        yield (
+            f"straight fibres explain {straight:.3f}, about as much as this plan does: is it the recording of this pad?"
+        )
+
+
+def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+    """How the pad was laid and wired, from an `identification.json` in `folder`.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
+        InputError: a picture beside it cannot be read.
+    """
+    frame = document["frame"]
+    live = [row for row in document["channels"] if "aside_mm" in row]
+    rows = [
+        [
+            row["channel"] + 1,
+            _fibre(row),
+            ", ".join(str(fibre + 1) for fibre in row["or_fibres"]) or "-",
+            f"{row['gain_v'] * 1e3:.1f}",
+            f"{row['noise_v'] * 1e3:.2f}",
+            *([f"{row['explained']:.2f}", f"{row['aside_mm']:.2f} ± {row['unsure_mm']:.2f}"] if row in live else "--"),
+        ]
+        for row in document["channels"]
+    ]
+    head = ["channel", "fibre", "or", "gain (mV a grid unit)", "noise (mV)", "explained", "beside its plan (mm)"]
+    return [
+        PageSection(
+            "How the pad was laid",
+            [
+                paragraph(
+                    f"Found from {document['presses']} presses: it lay {_mirrored(frame)}, turned"
+                    f" {frame['turn_deg']:.1f} degrees, shifted {_shift(frame)} mm, scale {frame['scale']:.3f}."
+                    f" The twin explains {document['explained']:.0%} of what {document['held_out']} presses held out"
+                    f" show, the plan as it is {document['explained_on_plan']:.0%}; noise is"
+                    f" {document['noise']:.1%} of full scale."
+                ),
+                *map(paragraph, doubt_lines(document)),
+                table(head, rows),
+                figures(
+                    [
+                        (folder / "twin_plan.png", "The plan, and the fibres as laid over it."),
+                        (
+                            folder / "twin_responses.png",
+                            "Answers of each channel by place: measured, predicted, left.",
+                        ),
+                    ]
+                ),
+            ],
+            [(f"{document['explained']:.0%}", "of the responses explained by the twin")],
+        )
+    ]
+
+
+def _fibre(row: Mapping[str, Any]) -> str:
+    return "none" if row["fibre"] is None else str(row["fibre"] + 1)
+
+
+def _mirrored(frame: Mapping[str, Any]) -> str:
+    return "turned over" if frame["mirrored"] else "as planned"
+
+
+def _shift(frame: Mapping[str, Any]) -> str:
+    x, y = frame["shift_mm"]
+    return f"{x:.1f}, {y:.1f}"

@@ -1,0 +1,1 @@
+"""The twin of a printed pad: how it was laid, wired and turned, and what a press really does to it."""

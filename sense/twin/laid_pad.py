@@ -1,0 +1,152 @@
+"""A pad as it was laid: what each of its channels answers to a press anywhere, fitted to presses.
+
+    volts_c(p) = rest_c + gain_c * sum_i (w(r_i) + v(r_i) cos 2 phi_i) exp(s_c(i)) l_i,    r_i = x_i + a_c(i) - F(p)
+
+over the elements i of the fibre that channel c reads: x_i where it was planned, a_c how far beside this it was laid,
+l_i its length as laid, s_c its sensitivity, a_c and s_c smooth curves; F the frame; w the reach, v its dependence on
+the angle between fibre and press.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from design.pad.twin import Frame
+from sense.recordings.processing.limits import Array, Indices
+
+from .kernels.response import along_fibre, channel_response
+from .plan import ELEMENTS, Plan
+from .responses import Responses
+
+SPLINES = 9
+"""Splines of the reach."""
+NARROW = 0.36
+"""Their distance, as a share of the standard deviation of the Gaussian reach that fits best."""
+ASIDE, SENSITIVITY = 12, 8
+"""Splines of a fibre's way beside its plan, and of its sensitivity."""
+SHARED, OWN = 4 + 2 * SPLINES, 2 + 2 * ASIDE + SENSITIVITY
+"""Values that all channels share: the frame's, and two profiles; and those of each channel."""
+AWAY, COUNTS = slice(2, 2 + 2 * ASIDE), slice(2 + 2 * ASIDE, OWN)
+"""Of the values of a channel those of its way beside the plan, in x and then in y, and of its sensitivity."""
+
+
+@dataclass(frozen=True)
+class LaidPad:
+    """A fitted pad of C channels.
+
+    Attributes:
+        plan: what was planned. fibres: (C,) which one each channel reads.
+        mirrored: whether the frame is. step: distance of the splines of the reach, grid units.
+        values: (SHARED + C OWN,) all that is fitted: turn (rad), shift (mm), scale; splines of w and of v; then for
+            each channel gain (V a grid unit), rest (V), splines of the way aside (grid units, in x, then in y) and of
+            the sensitivity.
+    """
+
+    plan: Plan
+    fibres: tuple[int, ...]
+    mirrored: bool
+    step: float
+    values: Array
+
+    @classmethod
+    def on_plan(cls, plan: Plan, fibres: tuple[int, ...], frame: Frame, width: float) -> "LaidPad":
+        """A pad that lies as planned, with a Gaussian reach of standard deviation `width` and gains of 1."""
+        step = NARROW * width
+        distance = np.linspace(0, (SPLINES + 1) * step, 100)
+        reach = np.linalg.lstsq(_splines(distance / step), np.exp(-0.5 * (distance / width) ** 2), rcond=None)[0]
+        values = np.zeros(SHARED + len(fibres) * OWN)
+        values[:4] = np.radians(frame.turn_deg), *frame.shift_mm, frame.scale
+        values[4 : 4 + SPLINES] = reach
+        values[SHARED::OWN] = 1.0
+        return cls(plan, fibres, frame.mirrored, step, values)
+
+    @property
+    def frame(self) -> Frame:
+        """How it lay."""
+        turn, x, y, scale = self.values[:4].tolist()
+        return Frame(self.mirrored, (float(np.degrees(turn)) + 180) % 360 - 180, (x, y), scale)
+
+    @property
+    def end(self) -> float:
+        """Distance at which a press is felt no more, grid units."""
+        return (SPLINES + 1) * self.step
+
+    @property
+    def own(self) -> Array:
+        """(C, OWN) the values of each channel."""
+        return self.values[SHARED:].reshape(-1, OWN)
+
+    def weights(self, distance: Array) -> Array:
+        """(2, n) w and v at distances (n,), grid units."""
+        return self.values[4:SHARED].reshape(2, SPLINES) @ _splines(distance / self.step).T
+
+    def course(self, channel: int) -> tuple[Array, Array]:
+        """(F, 2) elements of the fibre that a channel reads as laid, grid units, and how much each counts (F,)."""
+        aside, sensitivity = self._curves(channel)
+        off, uneven = along_fibre(aside, ELEMENTS)[0][0], along_fibre(sensitivity, ELEMENTS)[0][0]
+        return self.plan.course[self.fibres[channel]] + off.T, np.exp(uneven[0])
+
+    def _curves(self, channel: int) -> tuple[Array, Array]:
+        """(2, ASIDE) and (1, SENSITIVITY) coefficients."""
+        own = self.own[channel]
+        return own[AWAY].reshape(2, ASIDE), own[None, COUNTS]
+
+    def predict(self, places_mm: Array) -> Array:
+        """(Q, C) volts for presses (Q, 2) mm as the arm counts."""
+        return self.parts(places_mm)[0]
+
+    def left_over(self, presses: Responses) -> Responses:
+        """What this pad does not explain of answers."""
+        return replace(presses, volts=presses.volts - self.predict(presses.places_mm))
+
+    def parts(self, places_mm: Array) -> tuple[Array, list[Array]]:
+        """Volts (Q, C), and for each channel their derivatives (Q, SHARED + OWN) by the shared values and its own."""
+        places, by_frame = self._placed(places_mm)
+        profile = self.values[4:SHARED].reshape(2, SPLINES)
+        volts, rates = np.empty((len(places), len(self.fibres))), []
+        for c, (fibre, own) in enumerate(zip(self.fibres, self.own, strict=True)):
+            elements = self.plan.course[fibre], self.plan.tangent[fibre], self.plan.length[fibre]
+            signal, by_profile, by_aside, by_sensitivity, by_place = channel_response(
+                *elements, *self._curves(c), places, profile, self.step
+            )
+            volts[:, c] = own[1] + own[0] * signal
+            by_shared = [np.einsum("qx,qxp->qp", by_place, by_frame), by_profile.reshape(len(places), -1)]
+            by_curves = [by_aside.reshape(len(places), -1), by_sensitivity]
+            bent = np.hstack([*by_shared, np.zeros((len(places), 2)), *by_curves]) * own[0]
+            bent[:, SHARED], bent[:, SHARED + 1] = signal, 1.0
+            rates.append(bent)
+        return volts, rates
+
+    def at(self, values: Array) -> "LaidPad":
+        """The pad of other `values`, its reach scaled to 1 at its largest."""
+        moved = replace(self, values=values.copy())
+        largest = np.abs(moved.weights(np.linspace(0, self.end, 101))[0]).max()
+        if largest > 0:
+            moved.values[4:SHARED] /= largest
+            moved.values[SHARED::OWN] *= largest
+        return moved
+
+    def _placed(self, places_mm: Array) -> tuple[Array, Array]:
+        """Places (Q, 2) in grid units of the plan, and their derivatives (Q, 2, 4) by turn, shift and scale."""
+        frame, pitch = self.frame, self.plan.pitch_mm
+        turned = frame.turned(places_mm)
+        by = np.zeros((len(places_mm), 2, 4))
+        by[:, 0, 0], by[:, 1, 0] = -frame.scale * turned[:, 1], frame.scale * turned[:, 0]
+        by[:, 0, 1] = by[:, 1, 2] = 1
+        by[:, :, 3] = turned
+        return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(places_mm))), by / pitch
+
+
+def own_values(channel: int) -> Indices:
+    """Where the gain, rest and splines of a channel lie in `LaidPad.values`."""
+    return SHARED + channel * OWN + np.arange(OWN)
+
+
+def _splines(at: Array) -> Array:
+    """(n, SPLINES) the splines of a profile, mirrored at 0, at distances (n,) in steps."""
+    out = np.zeros((len(at), SPLINES))
+    for k in range(SPLINES):
+        for centre in {k, -k}:
+            far = np.abs(at - centre)
+            out[:, k] += np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, np.maximum(2 - far, 0) ** 3 / 6)
+    return out
