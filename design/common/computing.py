@@ -153,17 +153,17 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def forget_outdated(package: Path) -> None:
-    """Delete the compiled kernels of a package folder if its sources are not those of the last call.
+    """Delete the compiled kernels of a package, with the rooms in it, if its sources are not those of the last call.
 
     Does nothing where the folder cannot be written: what is compiled then is not kept in it either.
     """
     kept = package / "__pycache__"
     with suppress(OSError):
         kept.mkdir(exist_ok=True)
-        now = sha256(b"\0".join(source.read_bytes() for source in sorted(package.glob("*.py")))).digest()
+        now = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
         stamp = kept / "kernels.sha256"
         if stamp.exists() and stamp.read_bytes() == now:
             return
-        for compiled in kept.glob("*.nb[ic]"):
+        for compiled in package.rglob("__pycache__/*.nb[ic]"):
             compiled.unlink(missing_ok=True)
         stamp.write_bytes(now)

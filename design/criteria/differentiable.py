@@ -1,21 +1,22 @@
-"""The fibres and their exact signals in torch: what the gradient search differentiates."""
+"""The fibres and their signals in torch: what the gradient search differentiates."""
 
 import math
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from design.common import profiling
 from design.pad.contact import note_reach, press_shape
 from design.pad.kernels.exact_gradient import signals_gradient
 from design.pad.kernels.exact_signals import exact_signals
+from design.pad.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
 from design.pad.kernels.press import family_strays
 from design.settings import Contact
 
-MEASURED_PRECISION = 5e-5
-"""To which signals of a measured reach are integrated in a search: far within what was measured, and in less time."""
+Array = NDArray[np.float64]
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
@@ -75,18 +76,27 @@ def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
     return torch.stack([at, value], dim=-1), slope
 
 
-class ExactSignals(torch.autograd.Function):
-    """The exact signals of one pad as a torch function of its knots and slopes, with their analytic gradient.
+def press_signals(travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact) -> Tensor:
+    """Signals of one pad with their analytic gradient: exact, but for a measured reach within the kernel's PRECISION.
 
-    `ExactSignals.apply(travel, cross, slope, presses, contact)`: travel, cross, slope (2M, n) float64, presses (Q, 2)
-    numpy; gives (2M, Q).
+    Args:
+        travel, cross, slope: (2M, n) float64 knots and slopes, held independent. presses: (Q, 2) in grid units.
+
+    Returns:
+        (2M, Q), with the default weight and length in grid units.
     """
+    kind = MeasuredSignals if contact.reach else ExactSignals
+    return kind.apply(travel, cross, slope, presses, contact)  # pyright: ignore[reportReturnType]
+
+
+class ExactSignals(torch.autograd.Function):
+    """The exact signals of one pad as a torch function of its knots and slopes: `press_signals` of a disc."""
 
     @staticmethod
-    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Any, contact: Contact) -> Tensor:
-        """Signals (2M, Q) in grid units."""
+    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact) -> Tensor:
+        """Signals (2M, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        shape = press_shape(contact, MEASURED_PRECISION if contact.reach else None)
+        shape = press_shape(contact)
         strays, none = family_strays(v[None]), np.empty(0, np.int64)
         ctx.inputs = (t, v, d, strays[0], presses, shape)
         out = np.zeros(len(presses) * len(t))
@@ -101,4 +111,29 @@ class ExactSignals(torch.autograd.Function):
         """Gradient by travel, cross and slope."""
         t, v, d, strays, presses, shape = ctx.inputs
         found = signals_gradient(t, v, d, strays, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
+        return (*torch.from_numpy(found), None, None)
+
+
+class MeasuredSignals(torch.autograd.Function):
+    """The signals of one pad under a measured reach, from elements laid once a call: `press_signals` of a reach."""
+
+    @staticmethod
+    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact) -> Tensor:
+        """Signals (2M, Q)."""
+        t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
+        _, extents, law = press_shape(contact)
+        elements = fibre_elements(t, v, d, presses, law.radius, spacing_of(contact.reach), law.length)
+        ctx.inputs = (t, v, d, elements, presses, law)
+        out = np.empty((len(presses), len(t)))
+        looked_at = element_signals(t, v, elements, presses, law.radius, law.profile, out)
+        if profiling.is_profiling():
+            note_reach(t[None], family_strays(v[None]), presses, extents, looked_at)
+        return torch.from_numpy(out.T)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient by travel, cross and slope."""
+        t, v, d, elements, presses, law = ctx.inputs
+        up = np.ascontiguousarray(upstream[0].numpy().T)
+        found = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
         return (*torch.from_numpy(found), None, None)

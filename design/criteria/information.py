@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.pad.contact import fibre_axes, signals
-from design.pad.kernels import information as kernels
 from design.pad.kernels.pchip import population_slopes, sample_curves
+from design.pad.kernels.published import information as kernels
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import Contact

@@ -10,7 +10,7 @@ from design.common.computing import in_chunks
 from design.common.errors import InputError, instance, reals
 from design.common.settings import or_default
 from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
-from design.pad.kernels.information import published_terms as terms_kernel
+from design.pad.kernels.published.information import published_terms as terms_kernel
 from design.pad.morphology import Morphology
 from design.settings import Contact
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from design.common.checkpoints import State
 from design.criteria.ambiguity import ambiguity, full_scale, sharpness
-from design.criteria.differentiable import ExactSignals, pchip_slopes
+from design.criteria.differentiable import pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
 from design.criteria.rules import check_rules
@@ -174,10 +174,10 @@ class GradientSearch:
         there, losses, shares = (torch.tensor(x, dtype=torch.float32, device=device) for x in (places, kept, weight))
         total = torch.zeros((), device=device)
         for contact in self.problem.contacts:
-            found: Tensor = ExactSignals.apply(travel, cross, slope, places, contact)  # pyright: ignore[reportAssignmentType]
+            found = press_signals(travel, cross, slope, places, contact)
             total = total + ambiguity(found.float().to(device), there, losses, shares, noise * self.scale)
             if search.sharpness > 0:
-                in_order = ExactSignals.apply(travel, cross, slope, boustrophedon(grid, SIDE), contact)
+                in_order = press_signals(travel, cross, slope, boustrophedon(grid, SIDE), contact)
                 total = total + search.sharpness * sharpness(in_order.float().to(device))
         return total.cpu() / len(self.problem.contacts)
 

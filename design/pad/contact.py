@@ -15,7 +15,7 @@ from design.common.settings import or_default
 from design.pad.kernels import press
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
-from design.pad.kernels.sampled_signals import quantized_signals
+from design.pad.kernels.published.sampled_signals import quantized_signals
 from design.settings import Contact
 
 from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes
@@ -136,15 +136,13 @@ def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
     return travel, cross, knots.shape[:-3]
 
 
-def press_shape(contact: Contact, precision: float | None = None) -> tuple[tuple[Array, Array], Array, press.Law]:
+def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, press.Law]:
     """A contact as the kernels take it: chains and extents in the frame of each family, and the law of its weight."""
     length = _LENGTHS[contact.length]
     if contact.reach:
         end, profile = contact.reach[-1][0], press.profile_of(contact.reach)
-        law = press.Law(end, press.PROFILE, length, profile, precision or press.PROFILE_PRECISION)
-        return *press.frames(end, None), law
-    law = press.Law(contact.radius, _WEIGHTS[contact.weight], length, precision=precision or press.PRECISION)
-    return *press.frames(contact.radius, contact.sides), law
+        return *press.frames(end, None), press.Law(end, press.PROFILE, length, profile)
+    return *press.frames(contact.radius, contact.sides), press.Law(contact.radius, _WEIGHTS[contact.weight], length)
 
 
 def signals_quantized(

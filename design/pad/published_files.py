@@ -17,7 +17,7 @@ from design.common.files import read_bytes
 from design.settings import Contact
 
 from .kernels.press import INVERSE_SQUARE, MANHATTAN, UNIFORM, Law, frames
-from .kernels.sampled_signals import quantized_signals
+from .kernels.published.sampled_signals import quantized_signals
 from .knots import FARTHEST, Array, assemble, axes, of_parameters
 
 PITCH_MM = 11.25

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from .exact_signals import local_cubic, make_scratch, stretches_inside
-from .press import EPS, INVERSE, INVERSE_SQUARE, MANHATTAN, UNIFORM, in_frame, profile_piece, touched_range, weigh
+from .press import EPS, INVERSE, MANHATTAN, UNIFORM, in_frame, touched_range, weigh
 from .quadrature import HALVINGS, across, kronrod, precise
 
 GRAZING = 0.02
@@ -24,7 +24,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 @njit(cache=True, error_model="numpy")
-def _variations(s: float, h: float, d0: float, d1: float, place: Any, rate: Any) -> None:
+def variations(s: float, h: float, d0: float, d1: float, place: Any, rate: Any) -> None:
     """dp/dx and its derivative by s, both (6, 2), for x = t0, t1, v0, v1, d0, d1, at s in [0, 1] of the span."""
     place[:] = 0.0
     rate[:] = 0.0
@@ -58,17 +58,13 @@ def _normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, floa
 
 @njit(cache=True, error_model="numpy")
 def _weight_rate(square: float, law: Any) -> float:
-    """Derivative of `weigh` by the squared distance."""
-    radius, weight, profile = law.radius, law.weight, law.profile
+    """Derivative of `weigh` by the squared distance, but of a profile."""
+    radius, weight = law.radius, law.weight
     if weight == UNIFORM:
         return 0.0
     if weight == INVERSE:
         return -0.5 * square**-1.5 if square > (radius / 100) ** 2 else 0.0
-    if weight == INVERSE_SQUARE:
-        return -1 / (radius + square) ** 2
-    piece = profile[profile_piece(square, profile)]
-    x = square - piece[0]
-    return piece[2] + x * (2 * piece[3] + 3 * x * piece[4])
+    return -1 / (radius + square) ** 2
 
 
 @njit(cache=True, error_model="numpy")
@@ -84,7 +80,7 @@ def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, wor
         through = least if through > 0 else -least
     run = along_t + abs(along_v) if law.length == MANHATTAN else math.hypot(along_t, along_v)
     value = sign * weigh(t * t + v * v, law) * run
-    _variations(s + s0, span[1], d0, d1, place, rate)
+    variations(s + s0, span[1], d0, d1, place, rate)
     for x in range(6):
         out[x] -= value * (nt * place[x, 0] + nv * place[x, 1]) / through
 
@@ -97,7 +93,7 @@ def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work
     if law.weight == UNIFORM and is_manhattan:
         rising = 1.0 if across(span, b) >= across(span, a) else -1.0
         for sign, s in ((1.0, b), (-1.0, a)):
-            _variations(s + s0, span[1], d0, d1, place, rate)
+            variations(s + s0, span[1], d0, d1, place, rate)
             for x in range(6):
                 out[x] += sign * (place[x, 0] + rising * place[x, 1])
         return
@@ -122,7 +118,7 @@ def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work
             w, w_rate = weigh(square, law), _weight_rate(square, law)
             run_t = 1.0 if is_manhattan else span[1] / run
             run_v = math.copysign(1.0, along) if is_manhattan else along / run
-            _variations(s + s0, span[1], d0, d1, place, rate)
+            variations(s + s0, span[1], d0, d1, place, rate)
             for x in range(6):
                 moved = t * place[x, 0] + v * place[x, 1]
                 out[x] += share * (2 * w_rate * moved * run + w * (run_t * rate[x, 0] + run_v * rate[x, 1]))
@@ -135,7 +131,7 @@ def _span(
     """Set change (6,) to the derivatives of what span j of a fibre signals for a press at (ct, cv).
 
     Args:
-        shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `_variations`, all overwritten.
+        shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `variations`, all overwritten.
     """
     span, chains, radius = work[0], shape[0], shape[2].radius
     tolerance = 4 * EPS * (abs(cv) + radius)
@@ -165,6 +161,7 @@ def signals_gradient(
 
     Args:
         travel, cross, slope: (2M, n), held independent. strays: (2,). presses: (Q, 2). upstream: (Q, 2M).
+        law: of any weight but PROFILE, whose gradient `measured_signals` has.
     """
     fibres, n = travel.shape
     grid = fibres // 2

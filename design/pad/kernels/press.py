@@ -17,8 +17,6 @@ EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
 NO_PROFILE = np.empty((0, 5))
-PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
-"""To which a piece is integrated where it is no closed form, as a share; of a profile, as a share at weight 1."""
 
 
 class Law(NamedTuple):
@@ -28,14 +26,12 @@ class Law(NamedTuple):
         radius: of the shape, or where a profile ends. weight, length: UNIFORM, ...; MANHATTAN, ...
         profile: (B, 5), each row a squared distance and the powers of a cubic in what lies beyond it, up to the next
             row's; NO_PROFILE for a weight with a formula.
-        precision: to which it is integrated.
     """
 
     radius: float
     weight: int
     length: int
     profile: Array = NO_PROFILE
-    precision: float = PRECISION
 
 
 @njit(cache=True, error_model="numpy")

@@ -46,6 +46,8 @@ GAUSS = np.array(
     ]
 )
 HALVINGS = 48
+PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
+"""To which a piece is integrated where it is no closed form, as a share; of a profile, as a share at weight 1."""
 PIECES, PATIENCE = 500, 100
 """Beyond PIECES, what counts as precise doubles with every PATIENCE more: where rounding is all that is left, halving
 would never end."""
@@ -94,7 +96,8 @@ def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
 @njit(cache=True, error_model="numpy")
 def precise(error: float, pieces: int, law: Any) -> bool:
     """Whether a piece need not be halved, the `pieces`-th that is looked at."""
-    return error <= law.precision * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
+    least = PROFILE_PRECISION if law.weight == PROFILE else PRECISION
+    return error <= least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
 
 
 @njit(cache=True, error_model="numpy")

@@ -18,12 +18,13 @@ KERNELS = {
     "outer.py": "from numba import njit\nfrom .inner import inner\n@njit(cache=True)\ndef outer(x):\n"
     "    return 10 * inner(x)\n",
 }
+KERNELS |= {"room/__init__.py": "", "room/outer.py": KERNELS["outer.py"].replace(".inner", "..inner")}
 
 
 @pytest.fixture
 def package(tmp_path):
     folder = tmp_path / "kernels"
-    folder.mkdir()
+    (folder / "room").mkdir(parents=True)
     for name, text in KERNELS.items():
         (folder / name).write_text(text)
     return folder
@@ -32,17 +33,18 @@ def package(tmp_path):
 def outer_of_one(package):
     code = (
         f"import sys; sys.path.insert(0, {str(package.parent)!r})\n"
-        "from kernels.outer import outer\nprint(outer(1), sum(outer.stats.cache_hits.values()))"
+        "from kernels.outer import outer\nfrom kernels.room.outer import outer as in_room\n"
+        "print(*(y for x in (outer, in_room) for y in (x(1), sum(x.stats.cache_hits.values()))))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return tuple(map(int, done.stdout.split()))
 
 
 def test_a_change_in_what_a_kernel_calls_is_compiled_in(package):
-    assert outer_of_one(package) == (20, 0)
-    assert outer_of_one(package) == (20, 1)
+    assert outer_of_one(package) == (20, 0, 20, 0)
+    assert outer_of_one(package) == (20, 1, 20, 1)
     (package / "inner.py").write_text(KERNELS["inner.py"].replace("x + 1", "x + 2"))
-    assert outer_of_one(package) == (30, 0)
+    assert outer_of_one(package) == (30, 0, 30, 0)
 
 
 def test_a_folder_that_cannot_be_written_is_left_alone(package):

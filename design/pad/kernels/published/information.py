@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .pchip import pchip_sample
-from .press import in_frame
-from .roots import SCRATCH, roots_in_unit
+from ..pchip import pchip_sample
+from ..press import in_frame
+from ..roots import SCRATCH, roots_in_unit
 from .sampled_signals import fibre_quantized
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .pchip import pchip_sample
-from .press import MANHATTAN, UNIFORM, in_frame, weigh
+from ..pchip import pchip_sample
+from ..press import MANHATTAN, UNIFORM, in_frame, weigh
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,0 +1,1 @@
+"""The published way to see a pad: sampled fibres, and the information in their signals."""
