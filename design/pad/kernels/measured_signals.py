@@ -20,24 +20,12 @@ Array = NDArray[np.float64]
 
 PRECISION = 5e-5
 """Of signals here, as a share of the largest one: far within what was measured."""
-FEWEST, MOST = 6, 8
-"""Nodes of a rule: fewer do not follow how a span bends, and where it takes more it is cut in equal pieces."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not follow how a span bends
+_NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 FINER = 24
 """Times at most that elements are laid closer by a fifth, from a quarter of the reach on: a steep one asks for it."""
 MOST_PIECES = 512
-"""Of a span, so that memory is bounded: more would be asked for by a reach that ends within 0.01 grid units or so."""
-
-
-def _rules() -> tuple[Array, Array]:
-    """Nodes in [0, 1] and weights of the Gauss rules of 0 to MOST nodes, a row each."""
-    nodes, weights = np.zeros((2, MOST + 1, MOST))
-    for n in range(1, MOST + 1):
-        x, w = np.polynomial.legendre.leggauss(n)
-        nodes[n, :n], weights[n, :n] = (1 + x) / 2, w / 2
-    return nodes, weights
-
-
-_NODES, _WEIGHTS = _rules()
+"""Of a span, so that memory is bounded: only a reach that is hundreds of times shorter than a span would take more."""
 
 
 class Elements(NamedTuple):
@@ -64,11 +52,11 @@ def spacing_of(reach: tuple[tuple[float, float], ...]) -> float:
     heights, shifts = end * np.arange(32)[:, None, None] / 32, np.arange(16)[:, None] / 16
 
     def straight(spacing: float) -> Array:
-        """(heights, shifts) its signals by pieces of FEWEST elements that begin in different places."""
-        width = FEWEST * spacing
+        """(heights, shifts) its signals by pieces of a span that begin in different places."""
+        width = len(_NODES) * spacing
         begin = width * (np.arange(-math.ceil(end / width) - 1, math.ceil(end / width) + 1) + shifts)
-        at = (begin[..., None] + width * _NODES[FEWEST, :FEWEST]).reshape(len(shifts), -1)
-        lengths = np.tile(width * _WEIGHTS[FEWEST, :FEWEST], begin.shape[-1])
+        at = (begin[..., None] + width * _NODES).reshape(len(shifts), -1)
+        lengths = np.tile(width * _WEIGHTS, begin.shape[-1])
         return profile_weights(profile, end, np.hypot(at, heights)) @ lengths
 
     spacing = end / 4
@@ -82,13 +70,11 @@ def spacing_of(reach: tuple[tuple[float, float], ...]) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _pieces(h: float, rise: float, d0: float, d1: float, spacing: float) -> tuple[int, int]:
-    """In how many equal pieces a span is cut, and the nodes of each, so that they lie `spacing` apart or closer."""
+def _pieces(h: float, rise: float, d0: float, d1: float, spacing: float) -> int:
+    """In how many equal pieces a span is cut so that their elements lie `spacing` apart or closer, on average."""
     # the rate at which a span rises is a quadratic, which keeps within its Bezier points
     steepest = max(abs(h * d0), abs(h * d1), abs(3 * rise - h * (d0 + d1)))
-    nodes = max(math.hypot(h, steepest) / spacing, 1.0 * FEWEST)
-    pieces = math.ceil(min(nodes / MOST, 1.0 * MOST_PIECES))
-    return pieces, min(math.ceil(nodes / pieces), MOST)
+    return math.ceil(min(math.hypot(h, steepest) / (len(_NODES) * spacing), 1.0 * MOST_PIECES))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -105,7 +91,7 @@ def fibre_elements(travel: Any, cross: Any, slope: Any, presses: Any, end: float
     low, high = np.empty(2), np.empty(2)
     for axis in range(2):
         low[axis], high[axis] = presses[:, axis].min() - end, presses[:, axis].max() + end
-    rules, starts = np.zeros((fibres, n, 2), np.int64), np.zeros((fibres, n), np.int64)
+    pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
     total = 0
     for f in range(fibres):
         along = f // grid
@@ -114,8 +100,8 @@ def fibre_elements(travel: Any, cross: Any, slope: Any, presses: Any, end: float
             t0, t1, v0, v1 = travel[f, j], travel[f, j + 1], cross[f, j], cross[f, j + 1]
             is_near = t1 > low[along] and t0 < high[along]
             if is_near and max(v0, v1) > low[1 - along] and min(v0, v1) < high[1 - along]:
-                rules[f, j] = _pieces(t1 - t0, v1 - v0, slope[f, j], slope[f, j + 1], spacing)
-                total += rules[f, j, 0] * rules[f, j, 1]
+                pieces[f, j] = _pieces(t1 - t0, v1 - v0, slope[f, j], slope[f, j + 1], spacing)
+                total += pieces[f, j] * len(_NODES)
         starts[f, n - 1] = total
     out = np.empty((5, total))
     for f in range(fibres):
@@ -123,11 +109,10 @@ def fibre_elements(travel: Any, cross: Any, slope: Any, presses: Any, end: float
             h, v0, rise = travel[f, j + 1] - travel[f, j], cross[f, j], cross[f, j + 1] - cross[f, j]
             a1 = h * slope[f, j]
             a2, a3 = 3 * rise - 2 * a1 - h * slope[f, j + 1], a1 + h * slope[f, j + 1] - 2 * rise
-            pieces, nodes = rules[f, j]
             k = starts[f, j]
-            for piece in range(pieces):
-                for i in range(nodes):
-                    s, weight = (piece + _NODES[nodes, i]) / pieces, _WEIGHTS[nodes, i] / pieces
+            for piece in range(pieces[f, j]):
+                for i in range(len(_NODES)):
+                    s, weight = (piece + _NODES[i]) / pieces[f, j], _WEIGHTS[i] / pieces[f, j]
                     run = abs(a1 + s * (2 * a2 + 3 * a3 * s))
                     run = h + run if length == MANHATTAN else math.hypot(h, run)
                     out[0, k], out[1, k] = travel[f, j] + h * s, v0 + s * (a1 + s * (a2 + s * a3))
