@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from design import Morphology
 from design.common.errors import InputError, instance, whole
@@ -142,6 +143,7 @@ def _trimmed(laid: LaidPad) -> tuple[Array, Array]:
     return distance, weights / np.abs(weights[0]).max()
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def identify(
     recording: Recording, pad: Morphology, seed: int = 0, report: Report = lambda what, done, of: None
 ) -> Identification:
@@ -256,13 +258,13 @@ def _fitted(pad: LaidPad, learnt: Responses, report: Report) -> Fit:
     part, rest = learnt.of(every[~kept]), learnt.of(every[kept])
     rough = fit(pad, part, FIRST, caution=_caution(pad, part))
     report("courses", 1, 3)
-    plain = fit(rough.pad, part, FIRST, caution=_caution(rough.pad, part))
+    plain = fit(rough.pad.settled(), part, FIRST, caution=_caution(rough.pad, part))
     caution = _caution(plain.pad, part)
     turned = fit(plain.pad, part, replace(FIRST, angle=True), caution=caution)
     report("courses", 2, 3)
     gain = rest.explained(turned.pad.predict(rest.places_mm)) - rest.explained(plain.pad.predict(rest.places_mm))
     best = turned if gain.mean() > WORTH else plain
-    return fit(best.pad, learnt, best.freedom, caution=caution)
+    return fit(best.pad.settled(), learnt, best.freedom, caution=caution)
 
 
 def _caution(pad: LaidPad, presses: Responses) -> Array:

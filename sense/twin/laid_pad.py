@@ -95,6 +95,27 @@ class LaidPad:
         """(Q, C) volts for presses (Q, 2) mm as the arm counts."""
         return self.parts(places_mm)[0]
 
+    def settled(self) -> "LaidPad":
+        """The same pad, with what all its fibres have in common of their ways beside the plan told by the frame."""
+        low, high = 0.5, self.plan.grid + 0.5
+        planned = np.concatenate([self.plan.course[fibre] for fibre in self.fibres])
+        laid = np.concatenate([self.course(channel)[0] for channel in range(len(self.fibres))])
+        within = ((planned >= low) & (planned <= high)).all(axis=1)
+        turn = _turn_between(laid[within], planned[within])
+        rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        moved = laid @ rotation
+        shift = (planned - moved)[within].mean(axis=0)
+        aside = (moved + shift - planned).reshape(len(self.fibres), ELEMENTS, 2)
+        basis = along_fibre(np.eye(ASIDE), ELEMENTS)[0][0].T
+        coefficients = np.linalg.lstsq(basis, aside.transpose(1, 0, 2).reshape(ELEMENTS, -1), rcond=None)[0]
+        values, middle = self.values.copy(), (self.plan.grid + 1) / 2
+        values[0] += turn
+        # the frame turns about the middle of the pad, the courses about its corner
+        values[1:3] = values[1:3] @ rotation + self.plan.pitch_mm * (middle * (rotation.sum(axis=0) - 1) + shift)
+        own = values[SHARED:].reshape(-1, OWN)
+        own[:, AWAY] = coefficients.reshape(ASIDE, len(self.fibres), 2).transpose(1, 2, 0).reshape(len(own), -1)
+        return replace(self, values=values)
+
     def left_over(self, presses: Responses) -> Responses:
         """What this pad does not explain of answers."""
         return replace(presses, volts=presses.volts - self.predict(presses.places_mm))
@@ -135,6 +156,12 @@ class LaidPad:
         by[:, 0, 1] = by[:, 1, 2] = 1
         by[:, :, 3] = turned
         return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(places_mm))), by / pitch
+
+
+def _turn_between(points: Array, others: Array) -> float:
+    """The angle by which points (n, 2), turned about their middle, lie closest to others (n, 2)."""
+    a, b = points - points.mean(axis=0), others - others.mean(axis=0)
+    return float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
 
 
 def own_values(channel: int) -> Indices:
