@@ -63,6 +63,7 @@ BENCHES = {
     "networks": "design.evaluation.benchmark:BENCH",
     "filter": "sense.recordings.processing.benchmark:BENCH",
     "localizer": "sense.localizer.calibration.benchmark:BENCH",
+    "twin": "sense.twin.benchmark:BENCH",
     "mould": "fabricate.mould.benchmark:BENCH",
 }
 """Where each bench is, imported when it is asked for."""
