@@ -1,0 +1,86 @@
+"""Expected localisation error: how far off a regression is that learns places from noisy signals.
+
+For signals s of the fibres K that still work, with noise of standard deviation sigma on each, two terms are added:
+
+    G_K = mean_b |p_b - f_K(s_b + noise)|,                  f_K learnt from the noisy signals of other presses a,
+    C_K = mean_a sqrt(trace F_a^-1),   F_a = J_a' J_a / sigma^2 + 12 / size^2,   J_a = ds / dp there.
+
+f_K is kernel ridge regression with a Gaussian kernel one full scale wide (C. E. Rasmussen, C. K. I. Williams, Gaussian
+Processes for Machine Learning, 2006, chapter 2), so G_K is what a localizer of few presses comes to, confusions of far
+places included. C_K is the Cramer-Rao bound (van Trees 1968, section 2.4) with what is known beforehand, that the place
+is one of the pad: what no localizer falls below, however many presses it has learnt from. Where noise is small the
+ambiguity counts only confusions, of which there are none left; these two still fall with it.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+WIDTH, RIDGE = 1.0, 1e-3
+"""Width of the regression's kernel, full scales of a signal, and its ridge."""
+LEAST = 1e-8
+"""Squared distance, so that its root has a gradient at 0."""
+
+
+def lattice(
+    low: NDArray[np.float64], size: NDArray[np.float64], side: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """(side^2, 2) presses on a lattice over the rectangle from `low` on, (2,), `size` (2,), shifted by up to a cell."""
+    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    return low + size * (cell + rng.random(2)) / side
+
+
+def expected_error(
+    signals: Tensor, places: Tensor, step: Tensor, kept: Tensor, weight: Tensor, noise: Tensor, sigma: float
+) -> Tensor:
+    """Mean of G + C of the module's formula over losses, a scalar in grid units with gradient by the signals.
+
+    Args:
+        signals: (2M, 2Q) in full scales, for the presses of two lattices of Q = side^2 one after the other.
+        places: (2Q, 2), grid units. step: (2,) between neighbours of a lattice, grid units.
+        kept: (L, 2M), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
+        noise: (2M, 2Q) standard normal. sigma: of the noise, in full scales, > 0.
+    """
+    found, where = signals.T.double(), places.double()
+    count = len(found) // 2
+    rates = torch.cat([_rates(part, step.double()) for part in found.split(count)]) / sigma
+    size = step.double() * math.isqrt(count)
+    noisy = kept.double()[:, None, :] * (found + sigma * noise.T.double())
+    errors = _regression(noisy, where - where.mean(dim=0), count) + _bound(rates, kept.double(), size)
+    return errors.to(signals.dtype) @ weight
+
+
+def _rates(signals: Tensor, step: Tensor) -> Tensor:
+    """(P, 2M, 2) by how much signals (Q, 2M) on a lattice change by x and y, by differences over each of its cells."""
+    side = math.isqrt(len(signals))
+    a, b, c, d = (
+        signals.view(side, side, -1)[rows, columns]
+        for rows in (slice(None, -1), slice(1, None))
+        for columns in (slice(None, -1), slice(1, None))
+    )
+    by_x, by_y = (b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])
+    return torch.stack([by_x, by_y], dim=-1).reshape(-1, signals.shape[1], 2)
+
+
+def _bound(rates: Tensor, kept: Tensor, size: Tensor) -> Tensor:
+    """(L,) C for rates (P, 2M, 2) in units of the noise."""
+    known = torch.einsum("lk,qki,qkj->lqij", kept, rates, rates) + torch.diag(12 / size**2)
+    trace = known[..., 0, 0] + known[..., 1, 1]
+    return (trace / (known[..., 0, 0] * known[..., 1, 1] - known[..., 0, 1] ** 2)).sqrt().mean(dim=1)
+
+
+def _regression(noisy: Tensor, places: Tensor, count: int) -> Tensor:
+    """(L,) G for noisy signals (L, 2Q, 2M): the first `count` presses are learnt, the others asked for."""
+    learnt, asked = noisy[:, :count], noisy[:, count:]
+    known = torch.exp(_squares(learnt, learnt) / (-2 * WIDTH**2)) + RIDGE * torch.eye(count, dtype=noisy.dtype)
+    weights = torch.cholesky_solve(places[:count].expand(len(noisy), -1, -1), torch.linalg.cholesky(known))
+    found = torch.exp(_squares(asked, learnt) / (-2 * WIDTH**2)) @ weights
+    return ((found - places[count:]).square().sum(dim=-1) + LEAST).sqrt().mean(dim=1)
+
+
+def _squares(a: Tensor, b: Tensor) -> Tensor:
+    """(L, A, B) squared distances of rows (L, A, n) to rows (L, B, n)."""
+    return a.square().sum(dim=-1)[:, :, None] + b.square().sum(dim=-1)[:, None, :] - 2 * a @ b.mT
