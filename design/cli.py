@@ -130,10 +130,11 @@ def score(morphology: Path, spec: Path | None) -> None:
     from design.criteria.score import score as score_terms
     from design.pad.morphology import Morphology
 
-    from .settings import Contact, RulesSettings, SearchSettings
+    from .settings import Contact, PadSettings, RulesSettings, SearchSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
-    terms = score_terms(pad, settings.section(Contact), search.lost, search.noise, rules)
+    size = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm)
+    terms = score_terms(pad, settings.section(Contact), search.lost, search.noise, rules, size.sensed_mm)
     found = [asdict(violation) for violation in check_rules(pad, rules)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)

@@ -3,13 +3,49 @@
 from itertools import pairwise
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, field_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, field_validator
 
 from design.common.settings import Settings
 
 
+def _tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _side_lengths(value: object) -> object:
+    if isinstance(value, str) and value not in ("beyond", "fibres"):
+        raise ValueError('allowed are [width, height], "beyond" and "fibres"')
+    return _tuple(value)
+
+
+Millimetres = Annotated[float, Field(gt=0, le=1e6)]
+Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
+Rectangle = tuple[tuple[float, float], tuple[float, float]]
+"""Low and high corner, grid units."""
+
+
+def sensed_rectangle(grid: int, pitch_mm: float, sensed_mm: Sensed = "beyond") -> Rectangle:
+    """Low and high corner, in grid units, of what is pressed on a pad of M = `grid`.
+
+    Fibres run from 0 to M + 1, the outermost ones at 1 and M. "beyond" is 0.5 to M + 0.5 both ways, half a pitch beyond
+    the outermost; "fibres" is 1 to M, as published (0.5 to 1.5 for M = 1); a size lies about the middle, (M + 1) / 2.
+    """
+    if isinstance(sensed_mm, str):
+        width = height = grid if sensed_mm == "beyond" else max(grid - 1, 1)
+    else:
+        width, height = (side / pitch_mm for side in sensed_mm)
+    middle = (grid + 1) / 2
+    return (middle - width / 2, middle - height / 2), (middle + width / 2, middle + height / 2)
+
+
 class PadSettings(Settings):
-    """`[pad]`: what the pad is."""
+    """`[pad]`: what the pad is, and which part of it is pressed.
+
+    Attributes:
+        sensed_mm: (width, height), at most the pad's own, (M + 1) pitch_mm; "beyond": half a pitch beyond the outermost
+            fibres, or "fibres": between them, as published. Designs are for presses there; `sensed_rectangle` says
+            where that is.
+    """
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
     pitch_mm: float = Field(default=11.25, ge=0.1, le=1000, description="distance of neighbouring fibre ends, mm")
@@ -17,6 +53,25 @@ class PadSettings(Settings):
     deep_family: Literal["horizontal", "vertical"] = Field(
         default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
     )
+    sensed_mm: Annotated[Sensed, BeforeValidator(_side_lengths)] = Field(
+        default="beyond",
+        description='pressed [width, height] about the middle, mm; "beyond" the outermost fibres by half a pitch, or '
+        'between "fibres"',
+    )
+
+    @property
+    def sensed(self) -> Rectangle:
+        """`sensed_rectangle` of this pad."""
+        return sensed_rectangle(self.grid, self.pitch_mm, self.sensed_mm)
+
+    @field_validator("sensed_mm")
+    @classmethod
+    def _on_the_pad(cls, sensed_mm: Sensed, info: ValidationInfo) -> Sensed:
+        if isinstance(sensed_mm, tuple) and {"grid", "pitch_mm"} <= info.data.keys():
+            most = (info.data["grid"] + 1) * info.data["pitch_mm"]
+            if max(sensed_mm) > most * (1 + 1e-9):
+                raise ValueError(f"the pad itself is {most:g} mm wide and high")
+        return sensed_mm
 
 
 def _circle(value: object) -> object:
@@ -36,10 +91,6 @@ Point = tuple[Annotated[float, Field(ge=0, le=1e4)], Annotated[float, Field(ge=-
 def _points(value: object) -> object:
     """Lists, as files have them, as the tuples that a frozen model holds."""
     return tuple(_tuple(point) for point in value) if isinstance(value, list | tuple) else value
-
-
-def _tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
 
 
 class Contact(Settings):

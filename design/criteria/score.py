@@ -2,13 +2,11 @@
 
 from dataclasses import asdict
 
-import numpy as np
-
 from design.common.errors import InputError, instance
 from design.common.settings import or_default
-from design.pad.contact import boustrophedon, signals
+from design.pad.contact import boustrophedon, lattice, signals
 from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings, Sensed, sensed_rectangle
 
 from .fibre_loss import loss_shares, lost_subsets
 from .information import idle_share, information
@@ -19,18 +17,20 @@ MOST_PAIRS = 2**29
 """Most pairs of points of one fibre, over all fibres, that are looked at for folds: 2 GiB of distances."""
 
 
-def ambiguities(pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float) -> list[float]:
+def ambiguities(
+    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, sensed_mm: Sensed = "beyond"
+) -> list[float]:
     """Localisation ambiguity (formula of `ambiguity`) with 0, 1, ... fibres lost, grid units, on a grid of presses.
 
     Args:
         lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
+        sensed_mm: what is pressed (`PadSettings`).
     """
     import torch
 
     from .ambiguity import ambiguity, full_scale
 
-    line = np.linspace(1, pad.grid, SIDE) if pad.grid > 1 else np.linspace(0.5, 1.5, SIDE)
-    presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    presses = lattice(sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm), SIDE)
     found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
     places = torch.tensor(presses, dtype=torch.float32)
     fibres = 2 * pad.grid
@@ -51,6 +51,7 @@ def score(
     lost: int | tuple[float, ...] = 3,
     noise: float = 0.11,
     rules: RulesSettings | None = None,
+    sensed_mm: Sensed = "beyond",
 ) -> dict[str, float]:
     """Every term of a pad, by name.
 
@@ -58,7 +59,8 @@ def score(
     (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
     far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
-    (`published_objective`).
+    (`published_objective`). Presses are where `sensed_mm` says (`PadSettings`), those of the information and of the
+    published terms between the outermost fibres, as published.
 
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.
@@ -71,13 +73,14 @@ def score(
     from .penalties import PER_SPAN, penalties
 
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
-    size = PadSettings(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm)
+    size = PadSettings(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm, sensed_mm=sensed_mm)
     asked = SearchSettings(lost=lost, noise=noise)
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:
         raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
-    terms = {f"ambiguity_lost_{k}": value for k, value in enumerate(ambiguities(pad, contact, asked.lost, asked.noise))}
-    serpentine = boustrophedon(pad.grid, 32, 5 / 49)
+    spread = ambiguities(pad, contact, asked.lost, asked.noise, sensed_mm)
+    terms = {f"ambiguity_lost_{k}": value for k, value in enumerate(spread)}
+    serpentine = boustrophedon(pad.grid, 32, 5 / 49, rectangle=size.sensed)
     found = signals(pad, serpentine, contact)
     terms |= {"information": information(pad, contact), "idle_share": idle_share(found)}
     terms["sharpness"] = sharpness(torch.tensor(found.T)).item()

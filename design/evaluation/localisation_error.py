@@ -15,7 +15,7 @@ from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import boustrophedon, signals
 from design.pad.knots import Array
 from design.pad.morphology import MOST_GRID, Morphology
-from design.settings import Contact
+from design.settings import Contact, Rectangle, Sensed, sensed_rectangle
 
 from .levenberg_marquardt import Network, best_device, fit_many
 
@@ -65,7 +65,8 @@ def localisation_error(
         lost: numbers of lost fibres; those that would leave no fibre are left out.
         seed: of the jitter, the test presses, the splits and the networks' first weights.
         hidden: neurons of a network.
-        presses: to train on, a square number: a serpentine over 1..M (over 0.5..1.5 for a grid of 1).
+        presses: to train on, a square number: a serpentine over 1..M (over 0.5..1.5 for a grid of 1), as published;
+            `PressSets` has them anywhere.
         test: fresh presses, drawn uniformly over the same square.
         subsets: at most so many sets of a number of lost fibres, always the same; all if None.
 
@@ -88,20 +89,7 @@ def localisation_error(
     if sum(sets) > MOST_NETWORKS:
         raise InputError(f"subsets is {subsets}: that takes {sum(sets)} networks, allowed are {MOST_NETWORKS}")
     losses = [lost_subsets(fibres, number, most) for number, most in zip(levels, sets, strict=True)]
-    trial = PressSets.of(pad, side, test, seed, lambda places: signals(pad, places, contact))
-
-    def means(batch: list[Loss]) -> Array:
-        networks = trial.learn(batch, hidden)
-        return np.array([trial.errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
-
-    parts = {(at, k): batch for at, level in enumerate(losses) for k, batch in enumerate(batches(level))}
-    with one_torch_thread():
-        found = dict(run_tasks((key, partial(means, batch)) for key, batch in parts.items()))
-    by_level = [np.concatenate([found[key] for key in parts if key[0] == at]) for at in range(len(losses))]
-    return [
-        LossError(number, len(level), float(level.mean()), float(level.std()), float(level.max()))
-        for number, level in zip(levels, by_level, strict=True)
-    ]
+    return PressSets.of(pad, side, test, seed, lambda places: signals(pad, places, contact)).loss_errors(losses, hidden)
 
 
 def batches(losses: Sequence[Loss]) -> list[list[Loss]]:
@@ -126,10 +114,40 @@ class PressSets:
     seed: int
 
     @classmethod
-    def of(cls, pad: Morphology, side: int, test: int, seed: int, answer: Callable[[Array], Array]) -> "PressSets":
-        """A serpentine of side^2 presses to learn from and `test` fresh ones; `answer` gives signals for places."""
-        learned, fresh = training_presses(pad.grid, side, seed), fresh_presses(pad.grid, test, seed)
+    def of(
+        cls,
+        pad: Morphology,
+        side: int,
+        test: int,
+        seed: int,
+        answer: Callable[[Array], Array],
+        sensed_mm: Sensed = "fibres",
+    ) -> "PressSets":
+        """A serpentine of side^2 presses to learn from and `test` fresh ones, where `sensed_mm` says (`PadSettings`).
+
+        Args:
+            answer: gives the signals (Q, C) for places (Q, 2) in grid units.
+        """
+        rectangle = sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm)
+        learned = training_presses(pad.grid, side, seed, rectangle)
+        fresh = fresh_presses(pad.grid, test, seed, rectangle)
         return cls(learned, answer(learned), fresh, answer(fresh), seed)
+
+    def loss_errors(self, losses: Sequence[Sequence[Loss]], hidden: int) -> list[LossError]:
+        """Errors of networks of `hidden` neurons with fibres lost: for each number of them, over the sets given."""
+
+        def means(batch: list[Loss]) -> Array:
+            networks = self.learn(batch, hidden)
+            return np.array([self.errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
+
+        parts = {(at, k): batch for at, level in enumerate(losses) for k, batch in enumerate(batches(level))}
+        with one_torch_thread():
+            found = dict(run_tasks((key, partial(means, batch)) for key, batch in parts.items()))
+        by_level = [np.concatenate([found[key] for key in parts if key[0] == at]) for at in range(len(losses))]
+        return [
+            LossError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
+            for sets, level in zip(losses, by_level, strict=True)
+        ]
 
     def learn(self, losses: Sequence[Loss], hidden: int, repeat: int = 0) -> list[Network]:
         """A network for each of some losses of the same size, trained on the fibres that are left.
@@ -153,15 +171,14 @@ class PressSets:
         return np.setdiff1d(np.arange(self.recorded.shape[1]), loss)
 
 
-def training_presses(grid: int, side: int, seed: int) -> Array:
-    """(side^2, 2) presses of a jittered serpentine over the square that is evaluated, grid units."""
+def training_presses(grid: int, side: int, seed: int, rectangle: Rectangle | None = None) -> Array:
+    """(side^2, 2) presses of a jittered serpentine over a rectangle, grid units: between the fibres if None."""
     jitter_seed = int(np.random.default_rng([0, seed]).integers(2**32))
-    if grid == 1:
-        return boustrophedon(2, side, JITTER, jitter_seed) - 0.5
-    return boustrophedon(grid, side, JITTER, jitter_seed)
+    rectangle = rectangle or sensed_rectangle(grid, 1.0, "fibres")
+    return boustrophedon(grid, side, JITTER, jitter_seed, rectangle)
 
 
-def fresh_presses(grid: int, count: int, seed: int) -> Array:
-    """(count, 2) presses drawn uniformly over the square that is evaluated, grid units."""
-    low, high = (1, grid) if grid > 1 else (0.5, 1.5)
+def fresh_presses(grid: int, count: int, seed: int, rectangle: Rectangle | None = None) -> Array:
+    """(count, 2) presses drawn uniformly over a rectangle, grid units: between the fibres if None."""
+    low, high = rectangle or sensed_rectangle(grid, 1.0, "fibres")
     return np.random.default_rng([1, seed]).uniform(low, high, (count, 2))

@@ -21,6 +21,7 @@ from design.criteria.penalties import penalties
 from design.criteria.rules import check_rules
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
+from design.settings import Rectangle
 
 from .parametrization import Fibres, border_of, first_course
 from .problem import SearchProblem
@@ -58,7 +59,7 @@ class GradientSearch:
             course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
             self.fibres = Fibres.through(course, border_of(pad, rules))
             # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
-            presses = boustrophedon(pad.grid, SCALE_SIDE)
+            presses = boustrophedon(pad.grid, SCALE_SIDE, rectangle=pad.sensed)
             self.scale = full_scale(torch.tensor(signals(self.fibres.knots()[None], presses, problem.contacts[0])[0].T))
             self._optimiser = self._adam()
         else:
@@ -167,17 +168,18 @@ class GradientSearch:
 
     def _spread(self, travel: Tensor, cross: Tensor, noise: float) -> Tensor:
         """Ambiguity, and sharpness where it is asked for, averaged over the contacts."""
-        search, grid = self.problem.search, self.problem.pad.grid
+        search, pad = self.problem.search, self.problem.pad
         slope, device = pchip_slopes(travel, cross), torch.device(search.device)
-        places = stratified(grid, self.rng)
-        kept, weight = draw_losses(2 * grid, loss_shares(search.lost), self.rng)
+        places = stratified(pad.sensed, self.rng)
+        kept, weight = draw_losses(2 * pad.grid, loss_shares(search.lost), self.rng)
         there, losses, shares = (torch.tensor(x, dtype=torch.float32, device=device) for x in (places, kept, weight))
         total = torch.zeros((), device=device)
         for contact in self.problem.contacts:
             found = press_signals(travel, cross, slope, places, contact)
             total = total + ambiguity(found.float().to(device), there, losses, shares, noise * self.scale)
             if search.sharpness > 0:
-                in_order = press_signals(travel, cross, slope, boustrophedon(grid, SIDE), contact)
+                serpentine = boustrophedon(pad.grid, SIDE, rectangle=pad.sensed)
+                in_order = press_signals(travel, cross, slope, serpentine, contact)
                 total = total + search.sharpness * sharpness(in_order.float().to(device))
         return total.cpu() / len(self.problem.contacts)
 
@@ -186,9 +188,10 @@ class GradientSearch:
         return rules.enforce and bool(check_rules(self.morphology(), rules))
 
 
-def stratified(grid: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """One press in each of SIDE x SIDE cells over a part of the pad, (SIDE^2, 2): all of 1..M unless it is large."""
-    low, size = (1.0, min(grid - 1.0, WINDOW)) if grid > 1 else (0.5, 1.0)
-    corner = low + rng.random(2) * (max(grid - 1.0, size) - size)
+def stratified(rectangle: Rectangle, rng: np.random.Generator) -> NDArray[np.float64]:
+    """One press in each of SIDE x SIDE cells over a part of what is pressed, (SIDE^2, 2): all of it unless large."""
+    low, high = np.array(rectangle)
+    size = np.minimum(high - low, WINDOW)
+    corner = low + rng.random(2) * (high - low - size)
     cell = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
     return corner + size * (cell + rng.random(cell.shape)) / SIDE

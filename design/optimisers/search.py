@@ -133,7 +133,9 @@ def search(
         found = _candidates(problem, states, stop)
     with profiling.stage("check and score"):
         best, violations = _choose(found if origin is None else [*found, origin], problem)
-        terms = score(best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules)
+        terms = score(
+            best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules, problem.pad.sensed_mm
+        )
     if checkpoints and not stop.reason:
         checkpoints.clear()
     history, seconds = _history(problem, states), time.perf_counter() - begin
@@ -243,7 +245,8 @@ def _choose(found: list[Morphology], problem: SearchProblem) -> tuple[Morphology
     search, enforce = problem.search, problem.rules.enforce
 
     def rank(pad: Morphology) -> tuple[int, float]:
-        spread = [np.mean(ambiguities(pad, contact, search.lost, search.noise)) for contact in problem.contacts]
+        judged = search.lost, search.noise, problem.pad.sensed_mm
+        spread = [np.mean(ambiguities(pad, contact, *judged)) for contact in problem.contacts]
         return len(broken[id(pad)]), float(np.mean(spread))
 
     broken = {id(pad): check_rules(pad, problem.rules) if enforce else [] for pad in found}

@@ -16,7 +16,7 @@ from design.pad.kernels import press
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.published.sampled_signals import quantized_signals
-from design.settings import Contact
+from design.settings import Contact, Rectangle
 
 from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes
 from .morphology import Morphology
@@ -202,18 +202,27 @@ def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[
     return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
 
 
-def boustrophedon(grid: int, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
-    """A serpentine of side x side presses over 1..M, each moved by U(0, jitter) along both axes.
+def boustrophedon(
+    grid: int, side: int, jitter: float = 0.0, seed: int = 214, rectangle: Rectangle | None = None
+) -> Array:
+    """A serpentine of side x side presses, each moved by U(0, jitter) along both axes.
 
     Args:
         grid: M. side: presses per row and rows, Q = side^2. jitter: grid units.
         seed: of numpy's legacy RandomState, by which the published values are stated.
+        rectangle: over which, as `sensed_rectangle` gives it; 1..M both ways, as published, if None.
 
     Returns:
         (Q, 2) presses; x runs forth on even rows and back on odd ones, so that neighbours in order are neighbours
         in place.
     """
-    line = np.linspace(1, grid, side)
-    x = np.where(np.arange(side)[:, None] % 2 == 0, line, line[::-1])
-    places = np.column_stack([x.ravel(), np.repeat(line, side)])
+    rows = lattice(rectangle or ((1, 1), (grid, grid)), side).reshape(side, side, 2)
+    rows[1::2] = rows[1::2, ::-1]
+    places = rows.reshape(-1, 2)
     return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter
+
+
+def lattice(rectangle: Rectangle, side: int) -> Array:
+    """(side^2, 2) places, side x side of them evenly from corner to corner of a rectangle, row by row from below."""
+    x, y = (np.linspace(low, high, side) for low, high in zip(*rectangle, strict=True))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

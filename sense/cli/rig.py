@@ -79,7 +79,8 @@ def record(
         options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
-        setup = Setup(pad, settings.section(Contact), options, target, command, inputs)
+        sensed_mm = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm).sensed_mm
+        setup = Setup(pad, settings.section(Contact), options, target, command, inputs, sensed_mm)
         if resume and not (target / START).exists():
             click.echo(f"{target}: nothing to resume, a new recording begins", err=True)
         with reported("presses") as report:

@@ -11,6 +11,7 @@ from design import Contact, Morphology
 from design.common.errors import InputError, real
 from design.common.files import read_json
 from design.common.settings import validated
+from design.settings import PadSettings
 from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.recording import Recording
@@ -94,8 +95,12 @@ def simulated(model: Path) -> SimulatedConverter:
     try:
         pad = Morphology(np.array(source["morphology"]["knots"]), source["morphology"]["pitch_mm"])
         contact, rig = dict(source["contact"]), dict(source["rig"])
+        size = {"grid": pad.grid, "pitch_mm": pad.pitch_mm, "sensed_mm": source.get("sensed_mm", "beyond")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
     return SimulatedConverter(
-        pad, validated(RigSettings, rig, f"{path}: rig"), validated(Contact, contact, f"{path}: contact")
+        pad,
+        validated(RigSettings, rig, f"{path}: rig"),
+        validated(Contact, contact, f"{path}: contact"),
+        sensed_mm=validated(PadSettings, size, f"{path}: pad").sensed_mm,
     )

@@ -14,7 +14,7 @@ from design.common.files import provenance
 from design.common.profiling import stage
 from design.common.settings import Spec
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import Contact, PadSettings
 from sense.localizer.localizer import Localizer
 from sense.recordings.recorder import refuse_existing
 from sense.recordings.recording import Recording
@@ -42,8 +42,9 @@ def record_simulated(
     """
     refuse_existing(out)
     options = spec.section(RigSettings, **overrides)
+    sensed_mm = spec.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm).sensed_mm
     with stage("simulate"):
-        recording = simulate(pad, options, spec.section(Contact))
+        recording = simulate(pad, options, spec.section(Contact), sensed_mm)
     recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
     return recording
 

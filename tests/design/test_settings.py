@@ -2,11 +2,12 @@
 
 import tomllib
 
+import numpy as np
 import pytest
 
 from design import Contact, InputError, Spec
 from design.common.settings import commented_toml
-from design.settings import PadSettings, RulesSettings, SearchSettings
+from design.settings import PadSettings, RulesSettings, SearchSettings, sensed_rectangle
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -81,6 +82,7 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
         "pitch_mm": 11.25,
         "fibre_diameter_mm": 0.3,
         "deep_family": "horizontal",
+        "sensed_mm": "beyond",
     }
     assert Contact().model_dump() == {
         "radius": 0.6,
@@ -109,6 +111,7 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
     ("model", "key", "kept", "refused"),
     [
         (PadSettings, "grid", (1, 64), (0,)),
+        (PadSettings, "sensed_mm", ("beyond", "fibres", (56.25, 0.1)), ("all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0)),
         (Contact, "sides", (3,), (2,)),
         (SearchSettings, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
         (SearchSettings, "noise", (1e-9, 10.0), (0.0, 10.1)),
@@ -122,6 +125,22 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
 )
 def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):
     require_ends(model, key, kept, refused)
+
+
+def test_what_is_pressed_lies_about_the_middle_of_the_pad():
+    assert sensed_rectangle(4, 11.25) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
+    assert sensed_rectangle(4, 11.25, "fibres") == ((1, 1), (4, 4))
+    assert sensed_rectangle(1, 11.25, "fibres") == ((0.5, 0.5), (1.5, 1.5))
+    assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
+    again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
+    np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
+
+
+def test_what_is_pressed_is_no_larger_than_the_pad():
+    spec = Spec({"pad": {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]}}, "pad.toml")
+    expected = r"pad\.toml: \[pad\] sensed_mm: got \[31, 5\], .*the pad itself is 30 mm wide and high"
+    with pytest.raises(InputError, match=expected):
+        spec.section(PadSettings)
 
 
 def test_keys_of_very_many_parts_are_refused_at_once(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from design import Contact, Morphology, signals
+from design.settings import Sensed
 from sense.recordings.processing.limits import Array
 from sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
 from sense.recordings.simulation.published_protocol import random_places
@@ -23,12 +24,18 @@ class SimulatedConverter:
     """
 
     def __init__(
-        self, pad: Morphology, rig: RigSettings, contact: Contact, clock: Callable[[], float] = time.monotonic
+        self,
+        pad: Morphology,
+        rig: RigSettings,
+        contact: Contact,
+        clock: Callable[[], float] = time.monotonic,
+        sensed_mm: Sensed = "beyond",
     ) -> None:
         rng = np.random.default_rng(rig.seed)
         random_places(pad, rig.presses, rng)  # those of the recording, drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig, self._clock = pad, contact, rig, clock
+        self._sensed_mm: Sensed = sensed_mm
         self._finger = rng.spawn(1)[0]
         self._started_s: float | None = None
         self._count = 0
@@ -60,6 +67,6 @@ class SimulatedConverter:
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
         press, within_s = divmod(at_s, cycle_s)
         if press > self._press:
-            self._press, self._place_mm = press, random_places(self._pad, 1, self._finger)[0]
+            self._press, self._place_mm = press, random_places(self._pad, 1, self._finger, self._sensed_mm)[0]
         down = min((within_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - within_s) / TRAVEL_S)
         return self._place_mm, self._rig.depth_mm * max(down, 0.0)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
+from design.settings import Sensed, sensed_rectangle
 from sense.recordings.csv_table import read_csv
 from sense.recordings.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
 from sense.settings import RigSettings
@@ -61,22 +62,22 @@ class PressPlan:
         return cls(table[:, :2], table[:, 2])
 
 
-def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator) -> PressPlan:
-    """The plan that `[rig]` asks for: `presses` places in the square half a pitch beyond the outer fibres.
+def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator, sensed_mm: Sensed = "beyond") -> PressPlan:
+    """The plan that `[rig]` asks for: `presses` places over what is pressed of the pad, as `sensed_mm` of `[pad]` says.
 
     A grid has as many rows as columns and at least `presses` places, of which the first are taken; boustrophedon runs
     forth and back along its rows. Depths are taken in turn. An adaptive plan is uniform until a localizer steers it.
     """
-    half = pad.grid / 2 * pad.pitch_mm
+    low, high = pad.to_mm(sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm))
     if rig.plan in ("grid", "boustrophedon"):
         side = int(np.ceil(np.sqrt(rig.presses)))
-        line = np.linspace(-half, half, side) if side > 1 else np.zeros(1)
-        x = np.tile(line, (side, 1))
+        x, y = np.linspace(low, high, side).T if side > 1 else np.zeros((2, 1))
+        rows = np.tile(x, (side, 1))
         if rig.plan == "boustrophedon":
-            x[1::2] = x[1::2, ::-1]
-        places = np.column_stack([x.ravel(), np.repeat(line, side)])[: rig.presses]
+            rows[1::2] = rows[1::2, ::-1]
+        places = np.column_stack([rows.ravel(), np.repeat(y, side)])[: rig.presses]
     else:
-        places = rng.uniform(-half, half, (rig.presses, 2))
+        places = rng.uniform(low, high, (rig.presses, 2))
     depths = np.resize(rig.depths_mm or (rig.depth_mm,), len(places))
     return PressPlan(places, depths)
 

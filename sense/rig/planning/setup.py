@@ -10,7 +10,7 @@ from design.common.files import provenance, read_json
 
 if TYPE_CHECKING:
     from design.pad.morphology import Morphology
-    from design.settings import Contact
+    from design.settings import Contact, Sensed
     from sense.recordings.recorder import Recorder
     from sense.settings import RigSettings
 
@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from."""
+    """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from.
+
+    Attributes:
+        sensed_mm: which part of the pad is pressed (`PadSettings`), unless a file says where.
+    """
 
     pad: "Morphology"
     contact: "Contact"
@@ -27,6 +31,7 @@ class Setup:
     out: Path
     command: str
     inputs: Sequence[Path] = ()
+    sensed_mm: "Sensed" = "beyond"
 
 
 def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
@@ -47,7 +52,7 @@ def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
         return PressPlan.of(kept["presses"])
     if (file := rig.plan_file) is not None:
         return read_plan(file, rig.depth_mm)
-    return planned(setup.pad, rig, np.random.default_rng(rig.seed))
+    return planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.sensed_mm)
 
 
 _LASTING = ("channels", "rate_hz", "converter_rate_hz", "readings_per_press", "pad_mm", "pad_angle_deg", "contact_mm")

@@ -102,7 +102,7 @@ def test_sharpness_is_the_mean_second_difference():
 def test_the_score_holds_the_ambiguity_of_every_number_of_losses():
     """On the module's own grid of presses, each mask of losses counted alike."""
     pad, contact, noise = Morphology.random(2, 3, seed=0), Contact(), 0.07
-    line = np.linspace(1, 2, 20)
+    line = np.linspace(0.5, 2.5, 20)
     presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     found = torch.tensor(signals(pad, presses, contact).T)
     sigma = noise * found.amax(dim=1).mean().item()

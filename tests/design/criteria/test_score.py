@@ -1,6 +1,8 @@
 """Scores of pads, whatever their size."""
 
-from design import Contact, Morphology
+import pytest
+
+from design import Contact, InputError, Morphology
 from design.criteria.score import score
 
 
@@ -8,3 +10,15 @@ def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
     """Of 2M = 32 fibres taken 5 at a time there are two hundred thousand losses: a sample stands for them."""
     terms = score(Morphology.straight(16), Contact(), lost=5)
     assert 0 < terms["ambiguity_lost_0"] <= terms["ambiguity_lost_5"]
+
+
+def test_a_pad_is_scored_where_it_is_pressed():
+    """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
+    pad = Morphology.random(3, 4, seed=1)
+    beyond, between, wide = (score(pad, lost=1, sensed_mm=where) for where in ("beyond", "fibres", (40, 20)))
+    for name in beyond:
+        same = name.startswith(("published", "information", "penalty"))
+        assert (beyond[name] == between[name] == wide[name]) == same
+    assert score(pad, lost=1) == beyond
+    with pytest.raises(InputError, match="the pad itself is 45 mm wide"):
+        score(pad, sensed_mm=(46, 20))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from design import Contact, Morphology
+from design import Contact, Morphology, signals
 from design.common.errors import InputError
-from design.evaluation.localisation_error import fresh_presses, localisation_error, training_presses
+from design.evaluation.localisation_error import PressSets, fresh_presses, localisation_error, training_presses
 
 
 def means(pad, **settings):
@@ -76,3 +76,19 @@ def test_fibres_that_no_press_touches_do_no_harm():
 def test_settings_that_cannot_be_used_are_refused(settings):
     with pytest.raises(InputError, match="allowed is"):
         localisation_error(Morphology.straight(4), **settings)
+
+
+def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
+    pad, rng = Morphology.random(2, 3, seed=0), np.random.default_rng(0)
+
+    def answer(places):
+        return signals(pad, places) + 0.02 * rng.standard_normal((len(places), 4))
+
+    trial = PressSets.of(pad, 12, 300, 0, answer, sensed_mm="beyond")
+    for places, jitter in ((trial.learned, 5 / 49), (trial.fresh, 0)):
+        assert (places >= 0.5).all()
+        assert (places <= 2.5 + jitter).all()
+        assert (np.ptp(places, axis=0) > 1.97).all()
+    none, one = trial.loss_errors([[()], [(0,), (3,)]], hidden=10)
+    assert (none.lost, none.subsets, one.lost, one.subsets) == (0, 1, 1, 2)
+    assert 0.005 < none.mean < one.mean < 0.6

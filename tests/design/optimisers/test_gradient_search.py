@@ -14,8 +14,9 @@ SMALL = SearchSettings(knots=3, starts=1, steps=20, lost=1)
 
 
 def test_descent_beats_the_square_grid_within_the_rules():
-    found = search(settings=SearchSettings(knots=9, starts=1, steps=60, lost=1))
-    pad, grid = (score(m, Contact(), lost=1, noise=0.02) for m in (found.morphology, Morphology.straight(4)))
+    found = search(PadSettings(sensed_mm="fibres"), settings=SearchSettings(knots=9, starts=1, steps=60, lost=1))
+    pads = found.morphology, Morphology.straight(4)
+    pad, grid = (score(m, Contact(), lost=1, noise=0.02, sensed_mm="fibres") for m in pads)
     assert found.violations == []
     assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
     assert pad["ambiguity_lost_1"] < 0.5 * grid["ambiguity_lost_1"]
@@ -36,6 +37,25 @@ def test_several_contacts_serve_both_better_than_one_alone():
     for_one, for_both = (search(PadSettings(grid=2), settings=settings) for settings in (one, both))
     alone, together = (score(found.morphology, large, lost=0)["ambiguity_lost_0"] for found in (for_one, for_both))
     assert together < alone
+
+
+def test_steps_look_at_what_is_pressed_in_parts_of_it_that_are_not_too_large():
+    rng = np.random.default_rng(0)
+    for rectangle in (((1.0, 1.0), (4.0, 4.0)), ((0.5, 1.5), (4.5, 3.5)), ((0.5, 0.5), (12.5, 3.5))):
+        low, high = np.array(rectangle)
+        size = np.minimum(high - low, gradient_search.WINDOW)
+        corners = []
+        for _ in range(30):
+            places = gradient_search.stratified(rectangle, rng)
+            assert (places >= low).all()
+            assert (places <= high).all()
+            corners.append(places.min(axis=0))
+            cells = np.floor((places - corners[-1]) / size * gradient_search.SIDE + 0.5)
+            assert len(np.unique(cells, axis=0)) > 0.4 * len(places)
+            assert (np.ptp(places, axis=0) > 0.9 * size).all()
+            assert (np.ptp(places, axis=0) <= size).all()
+        reached = np.ptp(corners, axis=0)
+        assert (reached < 0.1 * size).tolist() == (size == high - low).tolist()
 
 
 def test_rules_that_cannot_hold_are_named(monkeypatch):
@@ -69,7 +89,7 @@ def as_usual():
 
 def found_within(rules):
     settings = SearchSettings(starts=1, steps=60, lost=1, knots=6)
-    return search(PadSettings(grid=2), settings=settings, rules=RulesSettings(**rules))
+    return search(PadSettings(grid=2, sensed_mm="fibres"), settings=settings, rules=RulesSettings(**rules))
 
 
 @pytest.mark.parametrize(

@@ -166,10 +166,11 @@ def test_a_search_from_a_pad_improves_on_it():
 
 def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
     free, quick = RulesSettings(enforce=False), SMALL.model_copy(update={"steps": 10, "starts": 1})
-    origin = search(settings=quick, rules=free).morphology
+    pad = PadSettings(sensed_mm="fibres")
+    origin = search(pad, settings=quick, rules=free).morphology
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [Morphology.straight(4)])
-    assert search(settings=quick, rules=free, origin=origin).morphology == origin
-    assert search(settings=quick, rules=free).morphology == Morphology.straight(4)
+    assert search(pad, settings=quick, rules=free, origin=origin).morphology == origin
+    assert search(pad, settings=quick, rules=free).morphology == Morphology.straight(4)
 
 
 def test_an_origin_that_does_not_fit_is_refused():

@@ -103,3 +103,10 @@ def test_presses_that_are_no_places_are_refused(presses):
 def test_the_serpentine_moves_one_cell_at_a_time():
     places = boustrophedon(4, 7)
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 0.5)
+    assert (places.min(), places.max()) == (1, 4)
+
+
+def test_the_serpentine_fills_the_rectangle_it_is_given():
+    places = boustrophedon(4, 3, rectangle=((0.5, 2), (4.5, 3)))
+    expected = [(0.5, 2), (2.5, 2), (4.5, 2), (4.5, 2.5), (2.5, 2.5), (0.5, 2.5), (0.5, 3), (2.5, 3), (4.5, 3)]
+    assert places.tolist() == [list(place) for place in expected]

@@ -49,6 +49,16 @@ def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row
     np.testing.assert_allclose(uniform.mean(axis=0), 0, atol=1.5)
 
 
+def test_plans_keep_to_what_is_pressed_of_the_pad():
+    for kind, presses in (("uniform", 500), ("adaptive", 500), ("grid", 9), ("boustrophedon", 9)):
+        rig = RigSettings(presses=presses, plan=kind)
+        places = planned(PAD, rig, np.random.default_rng(0), (50.0, 8.0)).places_mm
+        np.testing.assert_allclose(np.abs(places).max(axis=0), [25, 4], rtol=0.02)
+        assert (np.abs(places) <= [25.001, 4.001]).all()
+    between = planned(PAD, RigSettings(presses=9, plan="grid"), np.random.default_rng(0), "fibres").places_mm
+    assert np.abs(between).max() == 1.5 * 11.25
+
+
 @pytest.mark.parametrize("depth", [0.0, -1.0])
 def test_presses_go_in(depth):
     with pytest.raises(InputError, match="press 1 has depth"):
