@@ -1,5 +1,6 @@
 """Every term of a pad by name: what the searches minimise, and what the literature reports."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 
 from design.common.errors import InputError, instance
@@ -45,6 +46,11 @@ def ambiguities(
     return spread
 
 
+def ambiguity_terms(spread: Sequence[float]) -> dict[str, float]:
+    """`ambiguities` by name, as `score` has them."""
+    return {f"ambiguity_lost_{lost}": value for lost, value in enumerate(spread)}
+
+
 def score(
     pad: Morphology,
     contact: Contact | None = None,
@@ -65,12 +71,7 @@ def score(
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.
     """
-    import torch
-
-    from design.pad.contact import fibre_axes
-
-    from .ambiguity import sharpness
-    from .penalties import PER_SPAN, penalties
+    from .penalties import PER_SPAN
 
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
     size = PadSettings(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm, sensed_mm=sensed_mm)
@@ -78,13 +79,25 @@ def score(
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:
         raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
-    spread = ambiguities(pad, contact, asked.lost, asked.noise, sensed_mm)
-    terms = {f"ambiguity_lost_{k}": value for k, value in enumerate(spread)}
+    return all_terms(pad, ambiguities(pad, contact, asked.lost, asked.noise, sensed_mm), contact, rules, size)
+
+
+def all_terms(
+    pad: Morphology, spread: Sequence[float], contact: Contact, rules: RulesSettings, size: PadSettings
+) -> dict[str, float]:
+    """What `score` gives for a pad of that size, whose `ambiguities` are known to be `spread`."""
+    import torch
+
+    from design.pad.contact import fibre_axes
+
+    from .ambiguity import sharpness
+    from .penalties import penalties
+
     serpentine = boustrophedon(pad.grid, 32, 5 / 49, rectangle=size.sensed)
     found = signals(pad, serpentine, contact)
-    terms |= {"information": information(pad, contact), "idle_share": idle_share(found)}
-    terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     broken = penalties(travel, cross, size, rules)
+    terms = ambiguity_terms(spread) | {"information": information(pad, contact), "idle_share": idle_share(found)}
+    terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
     return terms | {f"published_{name}": value for name, value in asdict(published_terms(pad, contact)[0]).items()}

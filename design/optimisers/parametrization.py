@@ -10,6 +10,7 @@ from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings
 
 KNOTS_PER_TURN = 3  # before, at and after: a turn of given radius needs its shoulders
+STRAIGHT_START = 3  # the last of the default's: zigzags more often lead to the better pad
 WIDEST_BORDER = 0.45  # of the pad's side: a wider border leaves no room, which the rule check then says
 
 
@@ -72,9 +73,12 @@ def first_course(
 ) -> Array:
     """Knots (2M, N+2, 2) a start of the search begins with.
 
-    Without an origin each start has its own zigzag. With one, start 0 has its very course, later ones have it with
-    knots moved by a tenth of a grid unit or so.
+    Without an origin each start has its own zigzag, but start 3, which has straight fibres. With one, start 0 has its
+    very course, later ones have it with knots moved by a tenth of a grid unit or so. So are those of straight fibres:
+    where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no gradient to follow.
     """
+    if origin is None and start == STRAIGHT_START:
+        origin = Morphology.straight(pad.grid)
     if origin is None:
         return _zigzag(pad, rules, knots, rng)
     refined = refine(origin.knots, knots)

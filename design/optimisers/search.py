@@ -27,7 +27,8 @@ from design.common.errors import path as as_path
 from design.common.settings import or_default
 from design.criteria.fibre_loss import loss_shares
 from design.criteria.rules import Violation, check_rules
-from design.criteria.score import ambiguities, score
+from design.criteria.score import all_terms, ambiguities
+from design.pad.courses.curves import refine
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -78,9 +79,11 @@ class SearchResult:
     """What a search found.
 
     Attributes:
-        morphology: the best pad: fewest broken rules first, then least mean ambiguity over the losses.
+        morphology: the best pad: fewest broken rules first, then least mean ambiguity over the losses. Straight fibres
+            count as found, but by the published method.
         terms: every term of `score` for it.
         violations: the rules it breaks; empty where rules are not enforced.
+        straight: the ambiguity with 0, 1, ... lost of straight fibres on the same pad, to set beside its own.
         history: one entry per noted step: {"run", "step", "objective"}.
         enforced: whether it was to keep to the rules.
         seconds: wall time.
@@ -90,6 +93,7 @@ class SearchResult:
     morphology: Morphology
     terms: dict[str, float]
     violations: list[Violation]
+    straight: list[float]
     enforced: bool = True
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
@@ -132,14 +136,16 @@ def search(
         _advance(problem, states, stop, run, checkpoints)
         found = _candidates(problem, states, stop)
     with profiling.stage("check and score"):
-        best, violations = _choose(found if origin is None else [*found, origin], problem)
-        terms = score(
-            best, problem.contacts[0], problem.search.lost, problem.search.noise, problem.rules, problem.pad.sensed_mm
-        )
+        straight = _Judged(_straight(problem), problem)
+        known = [] if origin is None else [_Judged(origin, problem)]
+        if problem.search.method == "descent":  # the published method is left as it was published
+            known.append(straight)
+        best = min([*(_Judged(pad, problem) for pad in found), *known], key=lambda judged: judged.rank)
+        terms = all_terms(best.pad, best.spread[0], problem.contacts[0], problem.rules, problem.pad)
     if checkpoints and not stop.reason:
         checkpoints.clear()
-    history, seconds = _history(problem, states), time.perf_counter() - begin
-    return SearchResult(best, terms, violations, problem.rules.enforce, history, seconds, stop.reason)
+    told = problem.rules.enforce, _history(problem, states), time.perf_counter() - begin, stop.reason
+    return SearchResult(best.pad, terms, best.broken, straight.spread[0], *told)
 
 
 def _problem(
@@ -240,18 +246,25 @@ def _candidates(problem: SearchProblem, states: dict[int, State], stop: _Stop) -
     return [finish(problem, best, states[best], stop.mend_until())]
 
 
-def _choose(found: list[Morphology], problem: SearchProblem) -> tuple[Morphology, list[Violation]]:
-    """The pad with fewest broken rules, then least mean ambiguity, and what it breaks."""
-    search, enforce = problem.search, problem.rules.enforce
+class _Judged:
+    """A pad, the rules it breaks, and its ambiguities (contacts, losses)."""
 
-    def rank(pad: Morphology) -> tuple[int, float]:
-        judged = search.lost, search.noise, problem.pad.sensed_mm
-        spread = [np.mean(ambiguities(pad, contact, *judged)) for contact in problem.contacts]
-        return len(broken[id(pad)]), float(np.mean(spread))
+    def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
+        asked = problem.search.lost, problem.search.noise, problem.pad.sensed_mm
+        self.pad = pad
+        self.broken: list[Violation] = check_rules(pad, problem.rules) if problem.rules.enforce else []
+        self.spread = [ambiguities(pad, contact, *asked) for contact in problem.contacts]
 
-    broken = {id(pad): check_rules(pad, problem.rules) if enforce else [] for pad in found}
-    best = found[0] if len(found) == 1 else min(found, key=rank)
-    return best, broken[id(best)]
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Least for the best pad: fewest broken rules, then least mean ambiguity."""
+        return len(self.broken), float(np.mean(self.spread))
+
+
+def _straight(problem: SearchProblem) -> Morphology:
+    """Straight fibres with as many knots as those that are searched."""
+    knots = Morphology.straight(problem.pad.grid).knots
+    return Morphology(refine(knots, problem.search.knots), problem.pad.pitch_mm)
 
 
 def _name(problem: SearchProblem, start: int) -> str:

@@ -10,6 +10,7 @@ from design.common.figures import save_figure
 from design.common.files import provenance, write_json
 from design.common.profiling import stage
 from design.criteria.rules import check_rules
+from design.criteria.score import ambiguity_terms
 from design.optimisers.search import SearchResult, SearchRun, search
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -52,6 +53,7 @@ def run_search(
     document = {
         "format": "padforge-design/1",
         "terms": result.terms,
+        "straight": ambiguity_terms(result.straight),
         "violations": [asdict(violation) for violation in result.violations],
         "history": result.history,
         "seconds": round(result.seconds, 3),
@@ -87,6 +89,7 @@ def search_lines(result: SearchResult, out: Path) -> list[str]:
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
         + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
         f"  ambiguity {lost} grid units under noise, with {' / '.join(map(str, range(len(spread))))} fibres lost",
+        f"            {' / '.join(f'{value:.3f}' for value in result.straight)} with straight fibres",
         *(broken or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
         *([f"  ... and {more} more"] if more > 0 else []),
     ]

@@ -46,11 +46,14 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
                     paragraph(
                         "How far, on average, the place that a noisy reading suggests lies from the one that was"
                         " pressed, over all losses of so many fibres. The noise has a standard deviation of"
-                        f" {float(settings['search']['noise']):.0%} of a signal's full scale."
+                        f" {100 * float(settings['search']['noise']):.2g}% of a signal's full scale."
                     ),
                     table(
-                        ["fibres lost", "grid units", "mm"],
-                        [[lost, f"{value:.3f}", f"{value * pitch_mm:.2f}"] for lost, value in spread.items()],
+                        ["fibres lost", "grid units", "mm", "mm, straight fibres"],
+                        [
+                            [lost, f"{value:.3f}", f"{value * pitch_mm:.2f}", _straight(document, lost, pitch_mm)]
+                            for lost, value in spread.items()
+                        ],
                     ),
                 ],
             ),
@@ -90,6 +93,12 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     return PageSection(
         "Provenance", [folded("Commands, seeds, versions and inputs of every stage", [table(head, rows)])]
     )
+
+
+def _straight(document: Mapping[str, Any], lost: int, pitch_mm: float) -> str:
+    """The ambiguity of straight fibres in mm; nothing where a search before this version left none."""
+    value = document.get("straight", {}).get(f"ambiguity_lost_{lost}")
+    return "-" if value is None else f"{float(value) * pitch_mm:.2f}"
 
 
 def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:

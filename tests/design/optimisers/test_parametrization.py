@@ -57,6 +57,15 @@ def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 
+def test_one_of_the_random_starts_has_straight_fibres():
+    """Within a tenth of a grid unit or so, and clear of the slopes without a gradient of fibres that are quite so."""
+    pad, rules = PadSettings(), RulesSettings()
+    courses = [first_course(pad, rules, 21, None, start, np.random.default_rng(start)) for start in range(5)]
+    off = [np.abs(course[:4, :, 1] - np.arange(1, 5)[:, None]) for course in courses]
+    assert [each.max() < 0.5 for each in off] == [False, False, False, True, False]
+    assert (off[3][:, 1:-1] > 0).all()
+
+
 def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
     rules = RulesSettings(border_mm=400)
     knots = Fibres.through(Morphology.random(4, 5).knots, border_of(PadSettings(), rules)).knots()

@@ -9,7 +9,7 @@ import pytest
 
 from design import Contact, InputError, Morphology
 from design.common.checkpoints import Checkpoints
-from design.criteria.score import score
+from design.criteria.score import ambiguities, score
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import SearchRun, search
 from design.optimisers.start import advance_start
@@ -154,10 +154,10 @@ def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch)
 
 
 def test_a_search_from_a_pad_improves_on_it():
-    pad = PadSettings(grid=3)
-    origin = search(pad, settings=SearchSettings(knots=3, starts=1, steps=40, lost=1, seed=3)).morphology
-    before = score(origin, Contact(), lost=1)
-    after = search(pad, settings=SearchSettings(knots=5, starts=1, steps=80, lost=1), origin=origin)
+    pad, small = PadSettings(grid=3), Contact(radius=0.3)
+    origin = search(pad, small, SearchSettings(knots=3, starts=1, steps=40, lost=1, seed=3)).morphology
+    before = score(origin, small, lost=1)
+    after = search(pad, small, SearchSettings(knots=5, starts=1, steps=80, lost=1), origin=origin)
     assert after.morphology.knots.shape == (6, 7, 2)
     assert after.terms["ambiguity_lost_0"] + after.terms["ambiguity_lost_1"] < (
         before["ambiguity_lost_0"] + before["ambiguity_lost_1"]
@@ -170,7 +170,34 @@ def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
     origin = search(pad, settings=quick, rules=free).morphology
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [Morphology.straight(4)])
     assert search(pad, settings=quick, rules=free, origin=origin).morphology == origin
-    assert search(pad, settings=quick, rules=free).morphology == Morphology.straight(4)
+    found = search(pad, settings=quick, rules=free).morphology
+    assert np.ptp(found.knots[:4, :, 1], axis=1).tolist() == [0, 0, 0, 0]
+
+
+def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
+    """But by the published method, which is left as it is."""
+    worse, straight = Morphology.random(4, 3, seed=2), Morphology.straight(4)
+    free, quick = RulesSettings(enforce=False), SMALL.model_copy(update={"steps": 1, "starts": 1, "generations": 1})
+    monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [worse])
+    contact = Contact(reach=((0, 1), (0.5, 0.7), (1, 0.2), (1.6, 0)))
+    plain = ambiguities(straight, contact, quick.lost, quick.noise)
+    assert np.mean(plain) < np.mean(ambiguities(worse, contact, quick.lost, quick.noise))
+    found = search(contact=contact, settings=quick, rules=free)
+    assert found.morphology.knots.shape == worse.knots.shape
+    np.testing.assert_array_equal(found.morphology.knots[:4, :, 1], straight.knots[:4, :1, 1] + np.zeros(5))
+    assert found.straight == pytest.approx(plain, rel=1e-6)
+    assert [found.terms[f"ambiguity_lost_{lost}"] for lost in (0, 1)] == found.straight
+    genetic = search(contact=contact, settings=quick.model_copy(update={"method": "genetic"}), rules=free)
+    assert genetic.morphology == worse
+    assert genetic.straight == found.straight
+
+
+def test_the_terms_of_what_is_found_are_its_scores():
+    pad, contact = PadSettings(grid=2, sensed_mm=(20, 30)), Contact(radius=0.9)
+    settings = SearchSettings(knots=3, starts=1, steps=5, lost=1, noise=0.05)
+    found = search(pad, contact, settings, QUICK)
+    assert found.terms == score(found.morphology, contact, 1, 0.05, QUICK, (20, 30))
+    assert found.straight == pytest.approx(ambiguities(Morphology.straight(2), contact, 1, 0.05, (20, 30)), rel=1e-6)
 
 
 def test_an_origin_that_does_not_fit_is_refused():

@@ -24,6 +24,7 @@ def design_document() -> dict:
     return {
         "format": "padforge-design/1",
         "terms": {"ambiguity_lost_0": 0.1, "ambiguity_lost_1": 0.2, "information": 9.5},
+        "straight": {"ambiguity_lost_0": 0.25, "ambiguity_lost_1": 0.5},
         "violations": [],
         "provenance": provenance("padforge design", 3) | {"settings": settings},
     }

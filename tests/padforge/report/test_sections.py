@@ -69,6 +69,21 @@ def test_rules_and_checks_have_their_verdicts(pad: Path) -> None:
     assert "(0.0, 0.5) (1.0, 0.5) (2.0, 0.5) and 2 more" in text
 
 
+def test_straight_fibres_stand_beside_the_design(pad: Path) -> None:
+    """In mm; a search of before they were told leaves their column empty."""
+    rows = [[cell.strip() for cell in row] for row in ambiguity_rows(write_report(pad).read_text())]
+    assert rows == [["0", "0.100", "1.12", "2.81"], ["1", "0.200", "2.25", "5.62"]]
+    older = design_document()
+    del older["straight"]
+    written(pad / "design.json", older)
+    assert [row[-1] for row in ambiguity_rows(write_report(pad).read_text())] == ["-", "-"]
+
+
+def ambiguity_rows(text: str) -> list[list[str]]:
+    table = text.partition("mm, straight fibres</th>")[2].partition("</table>")[0]
+    return [re.findall(r"<td.*?>(.*?)</td>", row) for row in table.split("<tr>")[1:]]
+
+
 def test_the_laying_guide_is_that_of_the_bench(made: Path, page: Path) -> None:
     document, text = json.loads((made / "fabrication.json").read_text()), page.read_text()
     for fibre in document["fibres"]:
