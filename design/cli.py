@@ -22,7 +22,7 @@ morphology_argument = click.argument("morphology", type=click.Path(path_type=Pat
 
 @click.group(invoke_without_command=True)
 @spec_option
-@click.option("--method", type=click.Choice(["descent", "genetic"]), help="Gradient search, or the published one.")
+@click.option("--method", type=click.Choice(["descent", "error", "genetic"]), help="As [search] method.")
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
 @click.option("--from", "origin", metavar="random|straight|FILE", default="random", help="What to start from.")

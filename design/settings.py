@@ -150,8 +150,8 @@ class SearchSettings(Settings):
         contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
     """
 
-    method: Literal["descent", "genetic"] = Field(
-        default="descent", description="gradient search, or the published one"
+    method: Literal["descent", "error", "genetic"] = Field(
+        default="descent", description="gradients of the ambiguity, or of the expected error; or as published"
     )
     knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")

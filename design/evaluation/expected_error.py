@@ -13,24 +13,79 @@ ambiguity counts only confusions, of which there are none left; these two still 
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from design.criteria.ambiguity import full_scale
+from design.criteria.fibre_loss import loss_shares, lost_subsets
+from design.pad.contact import signals as exact_signals
+from design.pad.knots import Array
+from design.pad.morphology import Morphology
+from design.settings import Contact, Rectangle, Sensed, sensed_rectangle
+
+SIDE, WINDOW = 14, 5.0
+"""Presses along a side of a lattice, and the longest side, grid units: presses further apart are seldom confused."""
+PAIRS, MOST_LOSSES = 4, 32
+"""Pairs of lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
+HARDER = 3.0
+"""About how many times as great the error is with one more fibre lost: by its inverse each counts as much."""
 WIDTH, RIDGE = 1.0, 1e-3
 """Width of the regression's kernel, full scales of a signal, and its ridge."""
 LEAST = 1e-8
 """Squared distance, so that its root has a gradient at 0."""
 
 
-def lattice(
-    low: NDArray[np.float64], size: NDArray[np.float64], side: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """(side^2, 2) presses on a lattice over the rectangle from `low` on, (2,), `size` (2,), shifted by up to a cell."""
-    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
-    return low + size * (cell + rng.random(2)) / side
+def expected_errors(
+    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, sensed_mm: Sensed = "beyond"
+) -> list[float]:
+    """Expected error (formula of this module) with 0, 1, ... fibres lost, grid units, always by the same presses.
+
+    Args:
+        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
+        sensed_mm: what is pressed (`PadSettings`).
+    """
+    rng, fibres = np.random.default_rng(0), len(pad.knots)
+    rectangle = sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm)
+    errors = np.zeros((PAIRS, min(len(loss_shares(lost)), fibres)))
+    for pair in errors:
+        places, step = two_lattices(rectangle, rng)
+        found = torch.tensor(exact_signals(pad, places, contact).T)
+        white = torch.tensor(rng.standard_normal(found.shape))
+        given = found / full_scale(found), torch.tensor(places), torch.tensor(step)
+        for k in range(len(pair)):
+            losses = lost_subsets(fibres, k, MOST_LOSSES)
+            kept = torch.ones(len(losses), fibres, dtype=torch.float64)
+            for row, loss in enumerate(losses):
+                kept[row, list(loss)] = 0
+            equal = torch.full((len(losses),), 1 / len(losses), dtype=torch.float64)
+            pair[k] = expected_error(*given, kept, equal, white, noise).item()
+    return errors.mean(axis=0).tolist()
+
+
+def error_terms(errors: Sequence[float]) -> dict[str, float]:
+    """`expected_errors` by name."""
+    return {f"expected_error_lost_{lost}": value for lost, value in enumerate(errors)}
+
+
+def balanced(shares: tuple[float, ...]) -> tuple[float, ...]:
+    """Shares (sum 1) of 0, 1, ... lost fibres in which a gain of some percent counts alike, from the P(k) `shares`."""
+    weights = [share * HARDER**-k for k, share in enumerate(shares)]
+    return tuple(weight / sum(weights) for weight in weights)
+
+
+def two_lattices(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Presses (2 SIDE^2, 2) on two lattices, each shifted by up to a cell, and their step (2,), grid units.
+
+    They lie over a part of what is pressed, all of it unless it is large.
+    """
+    low, high = np.array(rectangle)
+    size = np.minimum(high - low, WINDOW)
+    corner = low + rng.random(2) * (high - low - size)
+    cell = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+    return corner + size * np.concatenate([cell + rng.random(2) for _ in range(2)]) / SIDE, size / SIDE
 
 
 def expected_error(

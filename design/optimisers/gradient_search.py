@@ -1,4 +1,4 @@
-"""Gradient search on the localisation ambiguity under noise and fibre loss, within the rules.
+"""Gradient search on the ambiguity, or on the expected error, under noise and fibre loss, within the rules.
 
 One start is a `GradientSearch`: it advances by any number of steps, tells its state as plain arrays and goes on from
 them to the same bits, so that it can run in slices on any thread or machine and survive being killed.
@@ -6,6 +6,8 @@ them to the same bits, so that it can run in slices on any thread or machine and
 
 import json
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,11 +21,12 @@ from design.criteria.differentiable import pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
 from design.criteria.rules import check_rules
+from design.evaluation.expected_error import balanced, expected_error, two_lattices
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
 from design.settings import Rectangle
 
-from .parametrization import Fibres, border_of, first_course
+from .parametrization import Fibres, border_of, first_course, nearly_straight
 from .problem import SearchProblem
 
 SIDE = 14  # presses per row and column of the stratified sample a step looks at
@@ -38,6 +41,10 @@ REPAIR_STEPS, REPAIR_CHECKS = 600, 20  # after the last step, until the exact ch
 REPAIR_MARGIN = 0.01  # added to the margin at each check that does not pass
 REPAIR_RATE, REPAIR_FASTER, REPAIR_FASTEST = 0.002, 1.15, 0.01  # gentle at first, and faster with each such check
 
+SignalsAt = Callable[[NDArray[np.float64]], Tensor]
+Measure = Callable[[SignalsAt, float], Tensor]
+"""What a step minimises, by the signals (2M, Q) at presses (Q, 2) and the noise, share of full scale."""
+
 
 class GradientSearch:
     """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of what is broken.
@@ -45,7 +52,8 @@ class GradientSearch:
     The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
 
     Attributes:
-        step: steps done. objective: ambiguity and sharpness at the last step. done: whether nothing is left to do.
+        step: steps done. objective: what is minimised, but for the rules, at the last step. done: whether nothing is
+            left to do.
         scale: full scale of the signals, grid units.
     """
 
@@ -56,7 +64,12 @@ class GradientSearch:
         self._history: list[tuple[int, float]] = []
         pad, search, rules = problem.pad, problem.search, problem.rules
         if state is None:
-            course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
+            nearly = search.method == "error" and problem.origin is None
+            course = (
+                nearly_straight(pad.grid, search.knots, self.rng)
+                if nearly
+                else first_course(pad, rules, search.knots, problem.origin, start, self.rng)
+            )
             self.fibres = Fibres.through(course, border_of(pad, rules))
             # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
             presses = boustrophedon(pad.grid, SCALE_SIDE, rectangle=pad.sensed)
@@ -167,21 +180,48 @@ class GradientSearch:
         return torch.optim.Adam([self.fibres.spans, self.fibres.cross], lr=RATE)
 
     def _spread(self, travel: Tensor, cross: Tensor, noise: float) -> Tensor:
-        """Ambiguity, and sharpness where it is asked for, averaged over the contacts."""
+        """What is minimised, and sharpness where it is asked for, averaged over the contacts."""
         search, pad = self.problem.search, self.problem.pad
-        slope, device = pchip_slopes(travel, cross), torch.device(search.device)
-        places = stratified(pad.sensed, self.rng)
-        kept, weight = draw_losses(2 * pad.grid, loss_shares(search.lost), self.rng)
-        there, losses, shares = (torch.tensor(x, dtype=torch.float32, device=device) for x in (places, kept, weight))
-        total = torch.zeros((), device=device)
+        slope = pchip_slopes(travel, cross)
+        measure = self._expected_error() if search.method == "error" else self._ambiguity()
+        total = torch.zeros((), device=search.device)
         for contact in self.problem.contacts:
-            found = press_signals(travel, cross, slope, places, contact)
-            total = total + ambiguity(found.float().to(device), there, losses, shares, noise * self.scale)
+            total = total + measure(partial(press_signals, travel, cross, slope, contact=contact), noise)
             if search.sharpness > 0:
                 serpentine = boustrophedon(pad.grid, SIDE, rectangle=pad.sensed)
                 in_order = press_signals(travel, cross, slope, serpentine, contact)
-                total = total + search.sharpness * sharpness(in_order.float().to(device))
+                total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
+
+    def _ambiguity(self) -> Measure:
+        """The ambiguity on presses and losses drawn once for all contacts of a step."""
+        search, pad = self.problem.search, self.problem.pad
+        places = stratified(pad.sensed, self.rng)
+        kept, weight = draw_losses(2 * pad.grid, loss_shares(search.lost), self.rng)
+        there, losses, shares = (
+            torch.tensor(x, dtype=torch.float32, device=search.device) for x in (places, kept, weight)
+        )
+
+        def measure(signals_at: SignalsAt, noise: float) -> Tensor:
+            return ambiguity(signals_at(places).float().to(search.device), there, losses, shares, noise * self.scale)
+
+        return measure
+
+    def _expected_error(self) -> Measure:
+        """The expected error on presses, losses and noise drawn once for all contacts of a step."""
+        search, pad = self.problem.search, self.problem.pad
+        places, step = two_lattices(pad.sensed, self.rng)
+        kept, weight = draw_losses(2 * pad.grid, balanced(loss_shares(search.lost)), self.rng)
+        white = self.rng.standard_normal((2 * pad.grid, len(places)))
+        there, apart, losses, shares, heard = (
+            torch.tensor(x, device=search.device) for x in (places, step, kept, weight, white)
+        )
+
+        def measure(signals_at: SignalsAt, noise: float) -> Tensor:
+            found = signals_at(places).to(search.device) / self.scale
+            return expected_error(found, there, apart, losses, shares, heard, noise)
+
+        return measure
 
     def _broken(self) -> bool:
         rules = self.problem.rules

@@ -88,6 +88,16 @@ def first_course(
     return assemble(np.clip(inner, MARGIN, pad.grid + 1 - MARGIN))
 
 
+def nearly_straight(grid: int, knots: int, rng: np.random.Generator) -> Array:
+    """Knots (2M, N+2, 2) of straight fibres, moved crosswise by a tenth of a grid unit or so."""
+    course = refine(Morphology.straight(grid).knots, knots)
+    crosswise = 0.1 * rng.standard_normal(course[:, 1:-1, 0].shape)
+    inner = course[:, 1:-1].copy()
+    inner[:grid, :, 1] += crosswise[:grid]
+    inner[grid:, :, 0] += crosswise[grid:]
+    return assemble(np.clip(inner, MARGIN, grid + 1 - MARGIN))
+
+
 def _zigzag(pad: PadSettings, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
     """A random zigzag each family runs side by side: nothing crosses within a family, and every turn is round.
 

@@ -20,12 +20,12 @@ class SearchProblem:
     @property
     def starts(self) -> range:
         """Numbers of the starts; the genetic search is one."""
-        return range(self.search.starts if self.search.method == "descent" else 1)
+        return range(self.search.starts if self.search.method != "genetic" else 1)
 
     @property
     def steps(self) -> int:
         """Steps of a start, or generations, as far as they are known beforehand."""
-        return self.search.steps if self.search.method == "descent" else self.search.generations
+        return self.search.generations if self.search.method == "genetic" else self.search.steps
 
     def settings(self) -> dict[str, Any]:
         """Everything a result depends on, as JSON, by section."""

@@ -27,7 +27,8 @@ from design.common.errors import path as as_path
 from design.common.settings import or_default
 from design.criteria.fibre_loss import loss_shares
 from design.criteria.rules import Violation, check_rules
-from design.criteria.score import all_terms, ambiguities
+from design.criteria.score import all_terms, ambiguities, ambiguity_terms
+from design.evaluation.expected_error import balanced, error_terms, expected_errors
 from design.pad.courses.curves import refine
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -83,7 +84,8 @@ class SearchResult:
             count as found, but by the published method.
         terms: every term of `score` for it.
         violations: the rules it breaks; empty where rules are not enforced.
-        straight: the ambiguity with 0, 1, ... lost of straight fibres on the same pad, to set beside its own.
+        straight: the ambiguities of straight fibres on the same pad, to set beside its own, and where it was found by
+            them the expected errors; both by name, as in `terms`.
         history: one entry per noted step: {"run", "step", "objective"}.
         enforced: whether it was to keep to the rules.
         seconds: wall time.
@@ -93,7 +95,7 @@ class SearchResult:
     morphology: Morphology
     terms: dict[str, float]
     violations: list[Violation]
-    straight: list[float]
+    straight: dict[str, float]
     enforced: bool = True
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
@@ -138,14 +140,16 @@ def search(
     with profiling.stage("check and score"):
         straight = _Judged(_straight(problem), problem)
         known = [] if origin is None else [_Judged(origin, problem)]
-        if problem.search.method == "descent":  # the published method is left as it was published
+        if problem.search.method != "genetic":  # the published method is left as it was published
             known.append(straight)
         best = min([*(_Judged(pad, problem) for pad in found), *known], key=lambda judged: judged.rank)
-        terms = all_terms(best.pad, best.spread[0], problem.contacts[0], problem.rules, problem.pad)
+        located = best.terms()
+        spread = [value for name, value in located.items() if name.startswith("ambiguity")]
+        terms = located | all_terms(best.pad, spread, problem.contacts[0], problem.rules, problem.pad)
     if checkpoints and not stop.reason:
         checkpoints.clear()
     told = problem.rules.enforce, _history(problem, states), time.perf_counter() - begin, stop.reason
-    return SearchResult(best.pad, terms, best.broken, straight.spread[0], *told)
+    return SearchResult(best.pad, terms, best.broken, straight.terms(), *told)
 
 
 def _problem(
@@ -247,18 +251,33 @@ def _candidates(problem: SearchProblem, states: dict[int, State], stop: _Stop) -
 
 
 class _Judged:
-    """A pad, the rules it breaks, and its ambiguities (contacts, losses)."""
+    """A pad, the rules it breaks, and what the search minimises of it (contacts, losses)."""
 
     def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
-        asked = problem.search.lost, problem.search.noise, problem.pad.sensed_mm
+        self._problem, self._asked = problem, (problem.search.lost, problem.search.noise, problem.pad.sensed_mm)
         self.pad = pad
         self.broken: list[Violation] = check_rules(pad, problem.rules) if problem.rules.enforce else []
-        self.spread = [ambiguities(pad, contact, *asked) for contact in problem.contacts]
+        measure = expected_errors if problem.search.method == "error" else ambiguities
+        self.spread = [measure(pad, contact, *self._asked) for contact in problem.contacts]
 
     @property
     def rank(self) -> tuple[int, float]:
-        """Least for the best pad: fewest broken rules, then least mean ambiguity."""
-        return len(self.broken), float(np.mean(self.spread))
+        """Least for the best pad: fewest broken rules, then least mean of what is minimised."""
+        if self._problem.search.method != "error":
+            return len(self.broken), float(np.mean(self.spread))
+        shares = balanced(loss_shares(self._problem.search.lost))[: len(self.spread[0])]
+        return len(self.broken), float(np.mean(np.array(self.spread) @ shares))
+
+    def _ambiguities(self) -> list[float]:
+        """With 0, 1, ... lost, under the first contact."""
+        if self._problem.search.method != "error":
+            return self.spread[0]
+        return ambiguities(self.pad, self._problem.contacts[0], *self._asked)
+
+    def terms(self) -> dict[str, float]:
+        """Ambiguities, and expected errors where they are minimised, by name."""
+        expected = error_terms(self.spread[0]) if self._problem.search.method == "error" else {}
+        return ambiguity_terms(self._ambiguities()) | expected
 
 
 def _straight(problem: SearchProblem) -> Morphology:

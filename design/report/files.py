@@ -10,7 +10,6 @@ from design.common.figures import save_figure
 from design.common.files import provenance, write_json
 from design.common.profiling import stage
 from design.criteria.rules import check_rules
-from design.criteria.score import ambiguity_terms
 from design.optimisers.search import SearchResult, SearchRun, search
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -53,7 +52,7 @@ def run_search(
     document = {
         "format": "padforge-design/1",
         "terms": result.terms,
-        "straight": ambiguity_terms(result.straight),
+        "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],
         "history": result.history,
         "seconds": round(result.seconds, 3),
@@ -81,17 +80,28 @@ def write_plan(spec: "Spec", pad: Morphology, path: Path) -> None:
 
 def search_lines(result: SearchResult, out: Path) -> list[str]:
     """What a person wants to know of a search, in a few lines."""
-    spread = [value for name, value in result.terms.items() if name.startswith("ambiguity")]
-    lost = " / ".join(f"{value:.3f}" for value in spread)
     broken = [f"  broken  {violation}" for violation in result.violations[:10]]
     more = len(result.violations) - len(broken)
     return [
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
         + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
-        f"  ambiguity {lost} grid units under noise, with {' / '.join(map(str, range(len(spread))))} fibres lost",
-        f"            {' / '.join(f'{value:.3f}' for value in result.straight)} with straight fibres",
+        *_located(result, "expected_error", "expected error"),
+        *_located(result, "ambiguity", "ambiguity"),
         *(broken or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
         *([f"  ... and {more} more"] if more > 0 else []),
+    ]
+
+
+def _located(result: SearchResult, name: str, told: str) -> list[str]:
+    """How well a pad and straight fibres locate by one measure, where the search has it: two lines."""
+    spread = [value for term, value in result.terms.items() if term.startswith(name)]
+    plain = [value for term, value in result.straight.items() if term.startswith(name)]
+    if not spread:
+        return []
+    lost = " / ".join(map(str, range(len(spread))))
+    return [
+        f"  {told} {' / '.join(f'{value:.3f}' for value in spread)} grid units under noise, with {lost} fibres lost",
+        f"  {' ' * len(told)} {' / '.join(f'{value:.3f}' for value in plain)} with straight fibres",
     ]
 
 

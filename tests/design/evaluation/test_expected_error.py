@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from design.evaluation import expected_error as module
-from design.evaluation.expected_error import expected_error, lattice
+from design.evaluation.expected_error import balanced, expected_error, expected_errors, two_lattices
+from design.pad.morphology import Morphology
+from design.settings import Contact
 
-SIDE, SIZE = 8, np.array([4.0, 4.0])
-STEP = torch.tensor(SIZE / SIDE)
-PLACES = np.concatenate([lattice(np.zeros(2), SIZE, SIDE, np.random.default_rng(seed)) for seed in (0, 1)])
+SIDE, SIZE = 14, np.array([4.0, 4.0])
+PLACES, STEPS = two_lattices(((0.0, 0.0), (4.0, 4.0)), np.random.default_rng(0))
+STEP = torch.tensor(STEPS)
 NONE_LOST = torch.ones(1, 2), torch.ones(1)
 
 
@@ -19,12 +21,28 @@ def error(signals: np.ndarray, kept=NONE_LOST[0], weight=NONE_LOST[1], sigma=0.0
     return expected_error(*given, sigma).item()
 
 
-def test_a_lattice_lies_within_its_rectangle_a_cell_apart():
-    places = lattice(np.array([1.0, 2.0]), np.array([3.0, 6.0]), 3, np.random.default_rng(0)).reshape(3, 3, 2)
+def test_two_lattices_lie_within_the_rectangle_a_step_apart():
+    places, step = two_lattices(((1.0, 2.0), (4.0, 6.2)), np.random.default_rng(0))
     assert (places >= [1, 2]).all()
-    assert (places <= [4, 8]).all()
-    assert np.diff(places[..., 0], axis=1) == pytest.approx(1.0)
-    assert np.diff(places[..., 1], axis=0) == pytest.approx(2.0)
+    assert (places <= [4, 6.2]).all()
+    for each in places.reshape(2, 14, 14, 2):
+        assert np.diff(each[..., 0], axis=1) == pytest.approx(step[0])
+        assert np.diff(each[..., 1], axis=0) == pytest.approx(step[1])
+    large, _ = two_lattices(((0.5, 0.5), (40.5, 40.5)), np.random.default_rng(0))
+    assert np.ptp(large, axis=0).max() < 5
+
+
+def test_a_pad_errs_more_the_more_fibres_are_lost_and_the_louder_they_are():
+    pad = Morphology.straight(3)
+    wide = Contact(reach=((0, 1), (0.5, 0.66), (1.0, 0.19), (1.65, 0)), length="euclidean")
+    quiet, loud = (expected_errors(pad, wide, 2, noise) for noise in (0.01, 0.05))
+    assert quiet == sorted(quiet)
+    assert np.all(np.array(loud) > quiet)
+
+
+def test_balanced_shares_count_a_further_loss_less():
+    assert balanced((0.5, 0.5)) == pytest.approx((0.75, 0.25))
+    assert balanced((0.0, 1.0, 0.0)) == (0, 1, 0)
 
 
 def test_the_bound_of_signals_that_are_the_place_is_their_noise():
