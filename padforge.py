@@ -12,6 +12,7 @@ from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from pkgutil import resolve_name
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +56,9 @@ SECTIONS = {
     "localizer": "sense.settings:LocalizerSettings",
 }
 """The sections of a `pad.toml`, and where the settings of each are."""
+
+PRESETS = {"published": "design.settings:PUBLISHED"}
+"""Settings other than the defaults, by section, that `padforge init` can write."""
 
 BENCHES = {
     "contact": "design.pad.benchmark:BENCH",
@@ -127,19 +131,20 @@ for group in (design_group, fabricate_group, sense_group, study_group, bench_com
 
 @cli.command("init")
 @click.argument("path", type=click.Path(dir_okay=False, path_type=Path), default="pad.toml")
-def _init(path: Path) -> None:
+@click.option("--preset", type=click.Choice(list(PRESETS)), help="published: contact, noise and area of the paper.")
+def _init(path: Path, preset: str | None) -> None:
     """Write a settings file, pad.toml, with every default and a comment a key.
 
     \b
     padforge init
-    padforge init soft.toml
+    padforge init soft.toml --preset published
     """
     from design.common.files import write_text
     from design.common.settings import commented_toml
 
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or move it away")
-    write_text(path, commented_toml(_sections()))
+    write_text(path, commented_toml(_sections(), resolve_name(PRESETS[preset]) if preset else None))
     click.echo(f"settings -> {path}")
 
 
@@ -183,8 +188,6 @@ def _report(folder: Path) -> None:
 
 
 def _sections() -> "dict[str, type[Settings]]":
-    from pkgutil import resolve_name
-
     return {name: resolve_name(where) for name, where in SECTIONS.items()}
 
 

@@ -91,14 +91,24 @@ class Spec:
         """
         if not (isinstance(model, type) and issubclass(model, Settings)):
             raise InputError(f"model is {shown(model)}, expected a section such as Pad")
-        name = model.section()
         given = {key: value for key, value in overrides.items() if value is not None}
-        return validated(model, {**self._tables.get(name, {}), **given}, f"{self.source}: [{name}]")
+        return validated(model, {**self.given(model), **given}, f"{self.source}: [{model.section()}]")
+
+    def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
+        """These settings, with the values in `tables`, by section, in place of their own."""
+        names = {*self._tables, *tables}
+        return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
+
+    def given(self, model: type[Settings]) -> Mapping[str, Any]:
+        """What the file states of the section `model` stands for, as it stands there."""
+        return self._tables.get(model.section(), {})
 
 
-def or_default(name: str, value: AnySettings | None, model: type[AnySettings]) -> AnySettings:
-    """The argument `name` of a public function: a section, or its defaults for None."""
-    return model() if value is None else instance(name, value, model)
+def or_default(
+    name: str, value: AnySettings | None, model: type[AnySettings], default: AnySettings | None = None
+) -> AnySettings:
+    """The argument `name` of a public function: a section, or for None `default`, the section's own if that is None."""
+    return (default or model()) if value is None else instance(name, value, model)
 
 
 def validated(model: type[AnySettings], values: Mapping[str, Any], where: str) -> AnySettings:
@@ -119,14 +129,15 @@ def _finding(error: ValidationError, model: type[Settings], where: str) -> Input
     return InputError(f"{where} {key}: got {shown(first['input'])}, {first['msg'].lower()}")
 
 
-def commented_toml(models: Mapping[str, type[Settings]]) -> str:
-    """A `pad.toml` that states every default, with each field's description as its comment."""
-    lines = ["# padforge settings. Every key is optional; what stands here is the default."]
+def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:
+    """A `pad.toml` that states every default, or what a preset has in its place, with descriptions as comments."""
+    head = "# padforge settings. Every key is optional; what stands here is the default"
+    lines = [f"{head}, or of the preset." if preset else f"{head}."]
     for name, model in models.items():
         lines += ["", f"[{name}]"]
-        defaults = model().model_dump()
+        stated = ((preset or {}).get(name) or model()).model_dump()
         for key, field in model.model_fields.items():
-            lines.append(f"{key} = {_toml_value(defaults[key])}".ljust(36) + f"# {field.description}")
+            lines.append(f"{key} = {_toml_value(stated[key])} ".ljust(36) + f"# {field.description}")
     return "\n".join(lines) + "\n"
 
 

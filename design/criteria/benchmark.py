@@ -11,7 +11,7 @@ from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.benchmark import KNOTS, PUBLISHED, SAMPLES, plain_signals
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import PUBLISHED_CONTACT
 
 from .information import disorder_area, joint_entropy, published_sharpness, quantize
 from .published_objective import published_objective, published_presses
@@ -45,7 +45,7 @@ def exact_objective(pad: Morphology) -> float:
 
 def plain_objective(pad: Morphology, samples: int = PUBLISHED, gamma: float = 5e-6) -> float:
     """The published objective from `plain_signals` and numpy alone."""
-    found = plain_signals(pad, published_presses(pad.grid), Contact(), samples)
+    found = plain_signals(pad, published_presses(pad.grid), PUBLISHED_CONTACT, samples)
     span = np.ptp(found, axis=0)
     levels = np.ceil((found - found.min(axis=0)) / np.where(span > 0, span, 1) * 4096)
     entropy = 0.0

@@ -12,7 +12,7 @@ from design.common.settings import or_default
 from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
 from design.pad.kernels.published.information import published_terms as terms_kernel
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import PUBLISHED_CONTACT, Contact
 
 from .information import LEVELS
 
@@ -62,7 +62,7 @@ def published_terms(
     samples = as_samples(samples, travel.shape[1])
     grid = travel.shape[1] // 2
     places = as_presses(published_presses(grid) if presses is None else presses)[0]
-    shape = press_shape(or_default("contact", contact, Contact))
+    shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT))
     found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:

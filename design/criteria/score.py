@@ -7,7 +7,16 @@ from design.common.errors import InputError, instance
 from design.common.settings import or_default
 from design.pad.contact import boustrophedon, lattice, signals
 from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings, Sensed, sensed_rectangle
+from design.settings import (
+    NOISE,
+    PUBLISHED_CONTACT,
+    Contact,
+    PadSettings,
+    RulesSettings,
+    SearchSettings,
+    Sensed,
+    sensed_rectangle,
+)
 
 from .fibre_loss import loss_shares, lost_subsets
 from .information import idle_share, information
@@ -55,7 +64,7 @@ def score(
     pad: Morphology,
     contact: Contact | None = None,
     lost: int | tuple[float, ...] = 3,
-    noise: float = 0.11,
+    noise: float = NOISE,
     rules: RulesSettings | None = None,
     sensed_mm: Sensed = "beyond",
 ) -> dict[str, float]:
@@ -65,8 +74,10 @@ def score(
     (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
     far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
-    (`published_objective`). Presses are where `sensed_mm` says (`PadSettings`), those of the information and of the
-    published terms between the outermost fibres, as published.
+    (`published_objective`), of the published contact where `contact` is a measured one.
+
+    Presses are where `sensed_mm` says (`PadSettings`), those of the information and of the published terms between the
+    outermost fibres, as published.
 
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.
@@ -99,5 +110,6 @@ def all_terms(
     broken = penalties(travel, cross, size, rules)
     terms = ambiguity_terms(spread) | {"information": information(pad, contact), "idle_share": idle_share(found)}
     terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
+    shape = PUBLISHED_CONTACT if contact.reach else contact
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
-    return terms | {f"published_{name}": value for name, value in asdict(published_terms(pad, contact)[0]).items()}
+    return terms | {f"published_{name}": value for name, value in asdict(published_terms(pad, shape)[0]).items()}

@@ -15,7 +15,7 @@ from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import boustrophedon, signals
 from design.pad.knots import Array
 from design.pad.morphology import MOST_GRID, Morphology
-from design.settings import Contact, Rectangle, Sensed, sensed_rectangle
+from design.settings import PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 from .levenberg_marquardt import Network, best_device, fit_many
 
@@ -61,7 +61,7 @@ def localisation_error(
     included, and so are lower. Networks are trained side by side, one thread a core, and do not depend on how many.
 
     Args:
-        contact: the published default if None.
+        contact: PUBLISHED_CONTACT if None.
         lost: numbers of lost fibres; those that would leave no fibre are left out.
         seed: of the jitter, the test presses, the splits and the networks' first weights.
         hidden: neurons of a network.
@@ -78,7 +78,7 @@ def localisation_error(
     if side**2 != presses:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
     test, hidden = whole("test", test, 1, MOST_PRESSES), whole("hidden", hidden, 1, 1000)
-    seed, contact = whole("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact)
+    seed, contact = whole("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact, PUBLISHED_CONTACT)
     fibres = 2 * instance("pad", pad, Morphology).grid
     if not isinstance(lost, Sequence) or isinstance(lost, str):
         raise InputError(f"lost is {shown(lost)}, expected numbers of lost fibres")

@@ -8,7 +8,7 @@ from typing import Any
 from design.benchmarking.harness import Bench, BenchTrial
 from design.criteria.rules import check_rules
 from design.evaluation.localisation_error import localisation_error
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
 
 from .search import SearchResult, SearchRun, search
 
@@ -34,24 +34,25 @@ def trials() -> Iterator[BenchTrial]:
     """Every way at every budget, for N of KNOTS and each of SEEDS.
 
     The genetic search minimises the published objective; the gradient search runs without design rules, as the genetic
-    one does, and with them.
+    one does, and with them. Both are for the published contact, between the fibres.
     """
     free = RulesSettings(enforce=False)
-    ways = [("genetic", n, SearchSettings(method="genetic", generations=n), free) for n in GENERATIONS]
+    ways = [("genetic", n, {"method": "genetic", "generations": n}, free) for n in GENERATIONS]
     for steps in STEPS:
-        descent = SearchSettings(method="descent", starts=1, steps=steps)
+        descent = {"method": "descent", "starts": 1, "steps": steps}
         ways += [("descent", steps, descent, free), ("with rules", steps, descent, RulesSettings())]
     for knots in KNOTS:
         for way, size, settings, rules in ways:
             for seed in SEEDS:
-                chosen = settings.model_copy(update={"knots": knots, "seed": seed})
-                work = partial(search, PadSettings(), Contact(), chosen, rules, run=SearchRun(executor=InThisThread()))
+                chosen = PUBLISHED_SEARCH.model_copy(update={**settings, "knots": knots, "seed": seed})
+                asked = PUBLISHED_PAD, PUBLISHED_CONTACT, chosen, rules
+                work = partial(search, *asked, run=SearchRun(executor=InThisThread()))
                 yield BenchTrial(f"N={knots}", way, size, work, judge_pad, repetition=seed)
 
 
 def judge_pad(found: SearchResult) -> Mapping[str, float]:
     """How well a pad serves: localisation errors with up to three fibres lost, their mean, and the rules it breaks."""
-    errors = [level.mean for level in localisation_error(found.morphology, Contact(), subsets=SUBSETS)]
+    errors = [level.mean for level in localisation_error(found.morphology, subsets=SUBSETS)]
     broken = len(check_rules(found.morphology, RulesSettings()))
     lost = {f"lost_{number}": error for number, error in enumerate(errors)}
     return {"error": sum(errors) / len(errors), "violations": broken, **lost}

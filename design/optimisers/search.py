@@ -113,6 +113,8 @@ def search(
 ) -> SearchResult:
     """Find the fibres of a pad by the method `settings` names; None stands for the defaults of `pad.toml`.
 
+    The published method has the published contact by default.
+
     The same settings give the same morphology, wherever the starts run and however often they are broken off and
     resumed; only a time budget or Ctrl-C that cuts a search short changes what it finds.
 
@@ -124,10 +126,9 @@ def search(
         InputError: an origin that does not fit, a device that is not there, or states of other settings.
     """
     begin = time.perf_counter()
-    sections = (or_default("pad", pad, PadSettings), or_default("contact", contact, Contact))
-    problem = _problem(
-        *sections, or_default("settings", settings, SearchSettings), or_default("rules", rules, RulesSettings), origin
-    )
+    pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
+    contact = or_default("contact", contact, Contact, settings.usual_contact)
+    problem = _problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
     run = SearchRun() if run is None else instance("run", run, SearchRun)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
     states = checkpoints.begin(run.resume) if checkpoints else {}

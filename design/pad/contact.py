@@ -16,7 +16,7 @@ from design.pad.kernels import press
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.published.sampled_signals import quantized_signals
-from design.settings import Contact, Rectangle
+from design.settings import PUBLISHED_CONTACT, Contact, Rectangle
 
 from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes
 from .morphology import Morphology
@@ -39,7 +39,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
         pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
         presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, whose signals add; where their
             shapes overlap a fibre counts once for each.
-        contact: shape, weight and length; the published default if None.
+        contact: shape, weight and length; PUBLISHED_CONTACT if None.
 
     Returns:
         (Q, 2M) signals, or (..., Q, 2M) for a population; with the default weight and length in grid units. Uniform
@@ -48,7 +48,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     Raises:
         InputError: presses of the wrong shape or not finite.
     """
-    return signals_and_spans(pad, presses, or_default("contact", contact, Contact))[0]
+    return signals_and_spans(pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT))[0]
 
 
 def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
@@ -82,7 +82,7 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     """
     from scipy.sparse import csr_array
 
-    contact = or_default("contact", contact, Contact)
+    contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
     travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
     places, strays = as_presses(presses)[0], press.family_strays(cross)
     starts = press.count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
@@ -153,7 +153,7 @@ def signals_quantized(
     Args:
         pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
         presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, as in `signals`.
-        contact: shape and weight; the published default if None.
+        contact: shape and weight; PUBLISHED_CONTACT if None.
         samples: points per fibre, uniform along the travel axis, at least 2 (published: 2000).
 
     Returns:
@@ -162,7 +162,7 @@ def signals_quantized(
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
-    return quantized_and_samples(pad, presses, or_default("contact", contact, Contact), samples)[0]
+    return quantized_and_samples(pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT), samples)[0]
 
 
 def quantized_and_samples(

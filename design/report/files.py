@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 
 
 def run_search(
-    spec: "Spec", out: Path, overrides: dict[str, Any], origin: str = "random", run: SearchRun | None = None
+    spec: "Spec",
+    out: Path,
+    overrides: dict[str, Any],
+    origin: str = "random",
+    run: SearchRun | None = None,
 ) -> tuple[dict[str, Any], SearchResult]:
     """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result.
 
@@ -42,6 +46,7 @@ def run_search(
         begin, inputs = Morphology.load(origin), [Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
+    contact = contact if spec.given(Contact) else settings.usual_contact
     with progress() as bar:
         run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
         result = search(pad, contact, settings, rules, origin=begin, run=run)

@@ -118,7 +118,9 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     from .robustness import robustness_study
 
-    return robustness_study(_pads(names, seed), seed=seed, contact=common.load_spec(spec).section(Contact), **options)
+    settings = common.load_spec(spec)
+    contact = settings.section(Contact) if settings.given(Contact) else None
+    return robustness_study(_pads(names, seed), seed=seed, contact=contact, **options)
 
 
 @_command("sensitivity")

@@ -68,11 +68,13 @@ def _load(name: str, seed: int) -> tuple[str, Morphology]:
 
 
 def _optimised(grid: int, seed: int) -> Morphology:
-    """What the default search finds from a single start, under the default rules."""
+    """What a search finds from a single start, for the published contact and under the default rules."""
     from design.optimisers.search import search
-    from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+    from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH
 
-    return search(PadSettings(grid=grid), Contact(), SearchSettings(starts=1, seed=seed), RulesSettings()).morphology
+    pad = PUBLISHED_PAD.model_copy(update={"grid": grid})
+    settings = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "seed": seed})
+    return search(pad, PUBLISHED_CONTACT, settings).morphology
 
 
 def described(pads: Mapping[str, Morphology]) -> dict[str, Any]:

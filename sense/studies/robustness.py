@@ -15,7 +15,7 @@ from design.criteria.fibre_loss import lost_subsets
 from design.evaluation.localisation_error import Loss, PressSets, batches
 from design.pad.contact import signals, signals_quantized
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import PUBLISHED_CONTACT, Contact
 from sense.recordings.processing.limits import Array
 
 from .pads import described
@@ -46,7 +46,7 @@ def robustness_study(
     """Errors of networks trained afresh for every set of lost fibres, as published, with maps of them over the pad.
 
     Args:
-        pads: by label. contact: the published default if None. rule: of RULES.
+        pads: by label. contact: PUBLISHED_CONTACT if None. rule: of RULES.
         lost: most fibres that are lost at once. hidden: neurons of a network.
         presses: to train on, a square number. test: fresh presses. seed: of presses and networks.
 
@@ -56,7 +56,7 @@ def robustness_study(
     side = math.isqrt(presses)
     if side**2 != presses or side < 2:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
-    contact = contact or Contact()
+    contact = contact or PUBLISHED_CONTACT
     parts = [
         (label, part)
         for label, pad in pads.items()

@@ -5,9 +5,29 @@ import tomllib
 import numpy as np
 import pytest
 
-from design import Contact, InputError, Spec
+from design import (
+    Contact,
+    InputError,
+    Morphology,
+    Spec,
+    localisation_error,
+    published_objective,
+    score,
+    signals,
+    signals_quantized,
+    signals_sparse,
+)
 from design.common.settings import commented_toml
-from design.settings import PadSettings, RulesSettings, SearchSettings, sensed_rectangle
+from design.criteria.information import information
+from design.pad.kernels.press import profile_of, profile_weights
+from design.settings import (
+    MEASURED_REACH,
+    PUBLISHED_CONTACT,
+    PadSettings,
+    RulesSettings,
+    SearchSettings,
+    sensed_rectangle,
+)
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -76,7 +96,7 @@ def test_a_missing_file_is_refused(tmp_path):
         Spec.load(tmp_path / "none.toml")
 
 
-def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
+def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     assert PadSettings().model_dump() == {
         "grid": 4,
         "pitch_mm": 11.25,
@@ -84,13 +104,9 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
         "deep_family": "horizontal",
         "sensed_mm": "beyond",
     }
-    assert Contact().model_dump() == {
-        "radius": 0.6,
-        "sides": 30,
-        "weight": "uniform",
-        "length": "manhattan",
-        "reach": (),
-    }
+    published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "reach": ()}
+    assert PUBLISHED_CONTACT.model_dump() == published
+    assert Contact().model_dump() == published | {"length": "euclidean", "reach": MEASURED_REACH}
     assert RulesSettings().model_dump() == {
         "enforce": True,
         "min_bend_radius_mm": 1.0,
@@ -104,7 +120,7 @@ def test_the_defaults_are_those_of_the_published_pads_and_what_can_be_built():
     search = SearchSettings().model_dump()
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
-    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.11, 0.0)
+    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.015, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +157,64 @@ def test_what_is_pressed_is_no_larger_than_the_pad():
     expected = r"pad\.toml: \[pad\] sensed_mm: got \[31, 5\], .*the pad itself is 30 mm wide and high"
     with pytest.raises(InputError, match=expected):
         spec.section(PadSettings)
+
+
+def test_a_contact_given_by_its_shape_is_of_the_published_kind():
+    """As it was before contacts were measured, and where it is written out, whatever it is, it reads back so."""
+    ways = (
+        ({}, MEASURED_REACH, "euclidean"),
+        ({"length": "manhattan"}, MEASURED_REACH, "manhattan"),
+        ({"reach": [[0, 1], [0.5, 0.25], [1, 0]]}, ((0, 1), (0.5, 0.25), (1, 0)), "euclidean"),
+        ({"radius": 0.6}, (), "manhattan"),
+        ({"sides": "circle"}, (), "manhattan"),
+        ({"weight": "inverse", "length": "euclidean"}, (), "euclidean"),
+        ({"reach": []}, (), "manhattan"),
+    )
+    for given, reach, length in ways:
+        contact = Spec({"contact": given}).section(Contact)
+        assert (contact.reach, contact.length) == (reach, length), given
+        assert Contact.model_validate_json(contact.model_dump_json()) == contact
+        assert Contact.model_validate(contact.model_dump()) == contact
+        search = SearchSettings(contacts=(contact, Contact(radius=0.9)))
+        assert SearchSettings.model_validate_json(search.model_dump_json()) == search
+        assert (
+            Spec(tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))).section(Contact) == contact
+        )
+
+
+@pytest.mark.parametrize("shape", [{"radius": 0.9}, {"sides": "circle"}, {"weight": "inverse"}])
+def test_a_shape_beside_a_reach_is_refused_since_it_would_change_nothing(shape):
+    stated = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
+    with pytest.raises(InputError, match=r"\[contact\] reach: .*which counts where reach is \[\]"):
+        Spec({"contact": stated | shape}).section(Contact)
+    assert Spec({"contact": stated | shape | {"reach": []}}).section(Contact).reach == ()
+
+
+def test_the_measured_reach_is_about_a_gaussian():
+    distance = np.linspace(0, 2, 400)
+    weight = profile_weights(profile_of(MEASURED_REACH), MEASURED_REACH[-1][0], distance)
+    np.testing.assert_allclose(weight, np.exp(-(distance**2) / (2 * 0.55**2)), atol=0.015)
+    assert (np.diff(weight) <= 1e-12).all()
+
+
+def test_functions_that_restate_the_paper_have_its_contact_by_default():
+    pad, presses = Morphology.random(2, 3, seed=0), [[1.2, 1.7], [2.0, 0.8]]
+    for function in (signals, signals_quantized):
+        np.testing.assert_array_equal(function(pad, presses), function(pad, presses, PUBLISHED_CONTACT))
+    np.testing.assert_array_equal(signals_sparse(pad, presses).toarray(), signals(pad, presses))
+    assert published_objective(pad) == published_objective(pad, PUBLISHED_CONTACT)
+    assert information(pad) == information(pad, PUBLISHED_CONTACT) != information(pad, Contact())
+    few = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
+    assert localisation_error(pad, **few) == localisation_error(pad, PUBLISHED_CONTACT, **few)
+
+
+def test_what_is_designed_for_unless_asked_is_measured_but_by_the_published_method():
+    assert SearchSettings().usual_contact == Contact()
+    assert SearchSettings(method="genetic").usual_contact == PUBLISHED_CONTACT
+    terms = score(Morphology.random(2, 3, seed=0), lost=0)
+    published = score(Morphology.random(2, 3, seed=0), PUBLISHED_CONTACT, lost=0)
+    for name in terms:
+        assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name
 
 
 def test_keys_of_very_many_parts_are_refused_at_once(tmp_path):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from design import Contact, PadSettings, RulesSettings, SearchSettings, Spec
 from tests.padforge.program import called, padforge
 
 
@@ -85,6 +86,18 @@ def test_init_writes_settings_that_every_command_reads(tmp_path):
     result = called("run", cwd=tmp_path)
     assert result.code == 2
     assert "pad.toml: [search] steps: got 0" in result.err
+
+
+def test_init_writes_the_world_of_the_paper_if_asked(tmp_path):
+    """And says which presets there are, where one is asked for that is none."""
+    assert called("init", "--preset", "published", cwd=tmp_path).code == 0
+    spec = Spec.load(tmp_path / "pad.toml")
+    assert spec.section(PadSettings) == PadSettings(sensed_mm="fibres")
+    assert spec.section(Contact) == Contact(radius=0.6, sides=30, weight="uniform", length="manhattan", reach=())
+    assert spec.section(SearchSettings) == SearchSettings(noise=0.11)
+    assert spec.section(RulesSettings) == RulesSettings()
+    assert called("init", "other.toml", "--preset", "mine", cwd=tmp_path).code == 2
+    assert "published" in called("init", "--help", cwd=tmp_path).out
 
 
 @pytest.mark.parametrize(

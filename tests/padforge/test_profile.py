@@ -9,10 +9,10 @@ from importlib.machinery import PathFinder
 import numpy as np
 import pytest
 
-from design import Contact, Morphology, signals, signals_sparse
+from design import Morphology, signals, signals_sparse
 from design.common import profiling
 from design.optimisers.search import SearchRun, search
-from design.settings import PadSettings, RulesSettings, SearchSettings
+from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from fabricate import build
 from sense import RigSettings, calibrate, simulate
 from sense.settings import LocalizerSettings
@@ -94,7 +94,7 @@ def test_the_import_of_a_heavy_library_is_a_stage(clock, monkeypatch, tmp_path):
 def test_of_a_straight_pad_a_press_looks_at_the_fibres_it_reaches(of):
     presses = [[1, 1], [2.5, 3.0], [0.7, 2.5]]  # reaching 1 + 1, 2 + 1 and 1 + 2 of 4 + 4 fibres
     with profiling.profiled() as profile:
-        of(Morphology.straight(4), presses, Contact())
+        of(Morphology.straight(4), presses, PUBLISHED_CONTACT)
     assert profile.counts == {"fibres, press by press": [8, 24], "spans, press by press": [8, 24]}
 
 
@@ -106,7 +106,7 @@ def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
         wavy[fibre, :, fibre // 2] = line
         wavy[fibre, :, 1 - fibre // 2] = knots[fibre, 0, 1 - fibre // 2]
     with profiling.profiled() as profile:
-        signals(Morphology(wavy), [[1.25, 1.0]], Contact())
+        signals(Morphology(wavy), [[1.25, 1.0]], PUBLISHED_CONTACT)
     # reach 0.6: along fibre 0 over 0.65..1.85, so 3 of 6 spans; across, 1.0 is within 0.4..1.6 of both vertical fibres'
     # 1.25 only for the first one, along which 0.4..1.6 has 4
     assert profile.counts["spans, press by press"] == [3 + 4, 4 * 6]
@@ -115,7 +115,7 @@ def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
 
 def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     settings = SearchSettings(knots=1, starts=2, steps=2, lost=0)
-    asked = (PadSettings(grid=1), Contact(), settings, RulesSettings(enforce=False))
+    asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
     monkeypatch.setattr("design.common.checkpoints.Checkpoints.clear", lambda self: None)
     with profiling.profiled() as profile:
         first = search(*asked, run=SearchRun(keep_in=tmp_path / "search"))

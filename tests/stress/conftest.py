@@ -8,7 +8,7 @@ import pytest
 import scipy.io
 
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import PUBLISHED_CONTACT
 from fabricate.export import build
 from fabricate.mesh_files import read_mesh
 from tests.stress.damage import PAD, RULES, SEARCH, published
@@ -34,7 +34,7 @@ def folder(tmp_path_factory) -> Path:
     with (folder / "new.mat").open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + b"\x00\x02IM")
     terms = {"ambiguity_lost_0": 0.1, "information": 3.0}
-    settings = {"pad": PAD, "contact": Contact(), "search": SEARCH, "rules": RULES}
+    settings = {"pad": PAD, "contact": PUBLISHED_CONTACT, "search": SEARCH, "rules": RULES}
     made_by = {
         "command": "padforge design",
         "seed": 0,

@@ -6,10 +6,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design import Contact, Morphology, signals
+from design import Morphology, signals
 from design.criteria.ambiguity import ambiguity, full_scale, sharpness
 from design.criteria.fibre_loss import draw_losses, loss_shares, lost_subsets
 from design.criteria.score import ambiguities
+from design.settings import PUBLISHED_CONTACT
 
 PAIR = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
 ALL = torch.ones(1, 3), torch.ones(1)
@@ -101,7 +102,7 @@ def test_sharpness_is_the_mean_second_difference():
 
 def test_the_score_holds_the_ambiguity_of_every_number_of_losses():
     """On the module's own grid of presses, each mask of losses counted alike."""
-    pad, contact, noise = Morphology.random(2, 3, seed=0), Contact(), 0.07
+    pad, contact, noise = Morphology.random(2, 3, seed=0), PUBLISHED_CONTACT, 0.07
     line = np.linspace(0.5, 2.5, 20)
     presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     found = torch.tensor(signals(pad, presses, contact).T)

@@ -7,6 +7,7 @@ from design.evaluation.localisation_error import LossError
 from design.optimisers import benchmark as search
 from design.optimisers.search import SearchResult
 from design.pad.morphology import Morphology as Pad
+from design.settings import PUBLISHED_PAD, SearchSettings
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +43,6 @@ def test_the_search_bench_has_every_way_budget_and_seed(monkeypatch, taken):
 def test_a_search_is_the_same_in_this_thread(monkeypatch):
     monkeypatch.setattr(search, "GENERATIONS", (2,))
     trial = next(iter(search.trials()))
-    settings = search.SearchSettings(method="genetic", generations=2, knots=3, seed=0)
-    again = search.search(search.PadSettings(), search.Contact(), settings, search.RulesSettings(enforce=False))
+    settings = SearchSettings(method="genetic", generations=2, knots=3, seed=0)
+    again = search.search(PUBLISHED_PAD, settings=settings, rules=search.RulesSettings(enforce=False))
     np.testing.assert_array_equal(trial.work().morphology.knots, again.morphology.knots)

@@ -6,10 +6,10 @@ import pytest
 from design.criteria.published_objective import published_objective
 from design.optimisers.genetic_search import GeneticSearch
 from design.optimisers.problem import SearchProblem
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from tests.helpers.effort import LONG
 
-PAD, CONTACT = PadSettings(grid=3), Contact()
+PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
 
 

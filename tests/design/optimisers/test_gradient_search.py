@@ -9,15 +9,23 @@ from design.criteria.score import score
 from design.optimisers import gradient_search
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import search
-from design.settings import PadSettings, RulesSettings, SearchSettings
+from design.settings import (
+    PUBLISHED_CONTACT,
+    PUBLISHED_PAD,
+    PUBLISHED_SEARCH,
+    PadSettings,
+    RulesSettings,
+    SearchSettings,
+)
 
 SMALL = SearchSettings(knots=3, starts=1, steps=20, lost=1)
 
 
 def test_descent_beats_the_square_grid_within_the_rules():
-    found = search(PadSettings(sensed_mm="fibres"), settings=SearchSettings(knots=9, starts=1, steps=60, lost=1))
+    settings = PUBLISHED_SEARCH.model_copy(update={"knots": 9, "starts": 1, "steps": 60, "lost": 1})
+    found = search(PUBLISHED_PAD, PUBLISHED_CONTACT, settings)
     pads = found.morphology, Morphology.straight(4)
-    pad, grid = (score(m, Contact(), lost=1, noise=0.02, sensed_mm="fibres") for m in pads)
+    pad, grid = (score(m, PUBLISHED_CONTACT, lost=1, noise=0.02, sensed_mm="fibres") for m in pads)
     assert found.violations == []
     assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
     assert pad["ambiguity_lost_1"] < 0.5 * grid["ambiguity_lost_1"]
@@ -32,11 +40,13 @@ def test_small_and_odd_pads_are_searched_too(grid, pitch):
 
 
 def test_several_contacts_serve_both_better_than_one_alone():
-    one = SearchSettings(starts=1, steps=60, lost=0, knots=4)
+    one = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 60, "lost": 0, "knots": 4})
     large = Contact(radius=1.2)
     both = one.model_copy(update={"contacts": (large,)})
-    for_one, for_both = (search(PadSettings(grid=2), settings=settings) for settings in (one, both))
-    alone, together = (score(found.morphology, large, lost=0)["ambiguity_lost_0"] for found in (for_one, for_both))
+    for_one, for_both = (search(PadSettings(grid=2), PUBLISHED_CONTACT, settings) for settings in (one, both))
+    alone, together = (
+        score(found.morphology, large, 0, one.noise)["ambiguity_lost_0"] for found in (for_one, for_both)
+    )
     assert together < alone
 
 
@@ -90,8 +100,8 @@ def as_usual():
 
 def found_within(rules):
     """By steps alone: with so few of them straight fibres are as good, and break no rule."""
-    settings = SearchSettings(starts=1, steps=60, lost=1, knots=6)
-    problem = SearchProblem(PadSettings(grid=2, sensed_mm="fibres"), (Contact(),), settings, rules)
+    settings = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 60, "lost": 1, "knots": 6})
+    problem = SearchProblem(PadSettings(grid=2, sensed_mm="fibres"), (PUBLISHED_CONTACT,), settings, rules)
     start = gradient_search.GradientSearch(problem, 0)
     start.advance(1000)
     assert start.done

@@ -13,7 +13,7 @@ from design.criteria.score import ambiguities, score
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import SearchRun, search
 from design.optimisers.start import advance_start
-from design.settings import PadSettings, RulesSettings, SearchSettings
+from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 SMALL = SearchSettings(knots=3, starts=2, steps=30, population=20, generations=6, lost=1)
 QUICK = RulesSettings(min_bend_radius_mm=0.5)
@@ -22,15 +22,15 @@ QUICK = RulesSettings(min_bend_radius_mm=0.5)
 @pytest.fixture(scope="module")
 def small():
     """What a small search finds."""
-    return search(settings=SMALL)
+    return search(contact=PUBLISHED_CONTACT, settings=SMALL)
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
 def test_the_same_seed_gives_the_same_fibres_and_another_seed_others(method, small):
     settings = SMALL.model_copy(update={"method": method})
-    first = small if method == "descent" else search(settings=settings)
-    second = search(settings=settings)
-    other = search(settings=settings.model_copy(update={"seed": 1}))
+    first = small if method == "descent" else search(contact=PUBLISHED_CONTACT, settings=settings)
+    second = search(contact=PUBLISHED_CONTACT, settings=settings)
+    other = search(contact=PUBLISHED_CONTACT, settings=settings.model_copy(update={"seed": 1}))
     assert first.morphology == second.morphology
     assert first.history == second.history
     assert first.morphology != other.morphology
@@ -48,7 +48,9 @@ def test_genetic_search_improves_generation_by_generation():
 def test_ctrl_c_keeps_the_best_so_far(method):
     """The signal comes from the first report; what was found by then is returned, and says so."""
     settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
-    found = search(settings=settings, run=SearchRun(lambda *step: signal.raise_signal(signal.SIGINT)))
+    found = search(
+        contact=PUBLISHED_CONTACT, settings=settings, run=SearchRun(lambda *step: signal.raise_signal(signal.SIGINT))
+    )
     assert found.stopped == "interrupted"
     assert found.morphology.grid == 4
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -63,7 +65,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
     pad = PadSettings(grid=2)
     settings = SMALL.model_copy(update={"method": method})
-    whole, kills = search(pad, settings=settings), 0
+    whole, kills = search(pad, PUBLISHED_CONTACT, settings=settings), 0
 
     def attempt():
         heard = []
@@ -73,7 +75,9 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
             if len(heard) == 2:
                 raise KilledError
 
-        return search(pad, settings=settings, run=SearchRun(report, tmp_path / "search", resume=True))
+        return search(
+            pad, PUBLISHED_CONTACT, settings=settings, run=SearchRun(report, tmp_path / "search", resume=True)
+        )
 
     while kills < 100:
         try:
@@ -91,55 +95,78 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
 
 
 def test_resuming_with_other_settings_is_refused_and_names_what_differs(tmp_path):
-    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     other = SMALL.model_copy(update={"seed": 5})
     with pytest.raises(InputError, match="begun with search seed 0, now 5"):
-        search(settings=other, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
+        search(
+            contact=PUBLISHED_CONTACT,
+            settings=other,
+            rules=QUICK,
+            run=SearchRun(keep_in=tmp_path / "search", resume=True),
+        )
 
 
 def test_a_damaged_state_is_named(tmp_path):
-    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     path = tmp_path / "search" / "start_0000.npz"
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read"):
-        search(settings=SMALL, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
+        search(
+            contact=PUBLISHED_CONTACT,
+            settings=SMALL,
+            rules=QUICK,
+            run=SearchRun(keep_in=tmp_path / "search", resume=True),
+        )
 
 
 def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
-    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
     path = tmp_path / "search" / "start_0000.npz"
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     with np.load(path) as arrays:
         state = {name: arrays[name] for name in arrays.files}
     np.savez(path, allow_pickle=False, **state | {"done": np.array([1, 2])})
     with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read \(it is not as it was written\)"):
-        search(settings=SMALL, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
+        search(
+            contact=PUBLISHED_CONTACT,
+            settings=SMALL,
+            rules=QUICK,
+            run=SearchRun(keep_in=tmp_path / "search", resume=True),
+        )
 
 
 def test_a_state_of_another_start_is_refused(tmp_path):
-    problem = SearchProblem(PadSettings(), (Contact(),), SMALL, QUICK)
+    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
     Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
     (tmp_path / "search" / "start_0000.npz").rename(tmp_path / "search" / "start_0001.npz")
     with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
-        search(settings=SMALL, rules=QUICK, run=SearchRun(keep_in=tmp_path / "search", resume=True))
+        search(
+            contact=PUBLISHED_CONTACT,
+            settings=SMALL,
+            rules=QUICK,
+            run=SearchRun(keep_in=tmp_path / "search", resume=True),
+        )
 
 
 def test_a_generation_that_fits_no_memory_is_refused():
     settings = SearchSettings(method="genetic", population=100_000)
     with pytest.raises(InputError, match="population is 100000: that takes"):
-        search(settings=settings)
+        search(contact=PUBLISHED_CONTACT, settings=settings)
 
 
 def test_the_executor_does_not_matter(small):
     with ThreadPoolExecutor(1) as one:
-        assert search(settings=SMALL, run=SearchRun(executor=one)).morphology == small.morphology
+        assert (
+            search(contact=PUBLISHED_CONTACT, settings=SMALL, run=SearchRun(executor=one)).morphology
+            == small.morphology
+        )
 
 
 def test_a_time_budget_ends_it_with_the_best_so_far():
     settings = SMALL.model_copy(update={"steps": 1_000_000})
-    found = search(settings=settings, run=SearchRun(time_budget=1.0))
+    found = search(contact=PUBLISHED_CONTACT, settings=settings, run=SearchRun(time_budget=1.0))
     assert found.stopped == "out of time"
     assert found.violations == []
     assert found.seconds < 30
@@ -147,10 +174,10 @@ def test_a_time_budget_ends_it_with_the_best_so_far():
 
 def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch):
     monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    found = search(settings=SMALL, run=SearchRun(time_budget=1e-6))
+    found = search(contact=PUBLISHED_CONTACT, settings=SMALL, run=SearchRun(time_budget=1e-6))
     assert found.stopped == "out of time"
     assert found.morphology.knots.shape == (8, 5, 2)
-    assert search(settings=SMALL, run=SearchRun(time_budget=0.5)).stopped == "out of time"
+    assert search(contact=PUBLISHED_CONTACT, settings=SMALL, run=SearchRun(time_budget=0.5)).stopped == "out of time"
 
 
 def test_a_search_from_a_pad_improves_on_it():
@@ -167,19 +194,22 @@ def test_a_search_from_a_pad_improves_on_it():
 def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
     free, quick = RulesSettings(enforce=False), SMALL.model_copy(update={"steps": 10, "starts": 1})
     pad = PadSettings(sensed_mm="fibres")
-    origin = search(pad, settings=quick, rules=free).morphology
+    origin = search(pad, PUBLISHED_CONTACT, settings=quick, rules=free).morphology
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [Morphology.straight(4)])
-    assert search(pad, settings=quick, rules=free, origin=origin).morphology == origin
-    found = search(pad, settings=quick, rules=free).morphology
+    assert search(pad, PUBLISHED_CONTACT, settings=quick, rules=free, origin=origin).morphology == origin
+    found = search(pad, PUBLISHED_CONTACT, settings=quick, rules=free).morphology
     assert np.ptp(found.knots[:4, :, 1], axis=1).tolist() == [0, 0, 0, 0]
 
 
 def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
     """But by the published method, which is left as it is."""
     worse, straight = Morphology.random(4, 3, seed=2), Morphology.straight(4)
-    free, quick = RulesSettings(enforce=False), SMALL.model_copy(update={"steps": 1, "starts": 1, "generations": 1})
+    free, quick = (
+        RulesSettings(enforce=False),
+        SMALL.model_copy(update={"steps": 1, "starts": 1, "generations": 1, "noise": 0.11}),
+    )
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [worse])
-    contact = Contact(reach=((0, 1), (0.5, 0.7), (1, 0.2), (1.6, 0)))
+    contact = Contact(reach=((0, 1), (0.5, 0.7), (1, 0.2), (1.6, 0)), length="manhattan")
     plain = ambiguities(straight, contact, quick.lost, quick.noise)
     assert np.mean(plain) < np.mean(ambiguities(worse, contact, quick.lost, quick.noise))
     found = search(contact=contact, settings=quick, rules=free)
@@ -202,9 +232,9 @@ def test_the_terms_of_what_is_found_are_its_scores():
 
 def test_an_origin_that_does_not_fit_is_refused():
     with pytest.raises(InputError, match="the morphology to start from has grid 3, allowed is that of the pad, 4"):
-        search(settings=SMALL, origin=Morphology.straight(3))
+        search(contact=PUBLISHED_CONTACT, settings=SMALL, origin=Morphology.straight(3))
     with pytest.raises(InputError, match="knots is 3, allowed is at least the 7"):
-        search(settings=SMALL, origin=Morphology.random(4, 7))
+        search(contact=PUBLISHED_CONTACT, settings=SMALL, origin=Morphology.random(4, 7))
 
 
 def test_a_device_that_is_not_there_is_refused():
@@ -213,7 +243,7 @@ def test_a_device_that_is_not_there_is_refused():
     if torch.cuda.is_available():
         pytest.skip("there is one here")
     with pytest.raises(InputError, match="device is 'cuda'"):
-        search(settings=SMALL.model_copy(update={"device": "cuda"}))
+        search(contact=PUBLISHED_CONTACT, settings=SMALL.model_copy(update={"device": "cuda"}))
 
 
 def test_a_loss_of_every_fibre_is_refused():

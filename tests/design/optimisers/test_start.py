@@ -2,7 +2,6 @@
 
 import pytest
 
-from design import Contact
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import search
 from design.optimisers.start import advance_start
@@ -16,5 +15,6 @@ def test_slow_steps_come_in_shorter_slices_to_the_same_result(method, monkeypatc
     settings = SMALL.model_copy(update={"method": method})
     whole = search(settings=settings)
     monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    assert advance_start(SearchProblem(PadSettings(), (Contact(),), settings, RulesSettings(), None), 0, None).step == 1
+    problem = SearchProblem(PadSettings(), (settings.usual_contact,), settings, RulesSettings(), None)
+    assert advance_start(problem, 0, None).step == 1
     assert search(settings=settings).morphology == whole.morphology

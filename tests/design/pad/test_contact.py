@@ -10,11 +10,12 @@ from scipy.interpolate import PchipInterpolator
 
 from design import Contact, InputError, Morphology, signals_quantized
 from design.pad.contact import boustrophedon
+from design.settings import PUBLISHED_CONTACT
 
 SETS = [
-    ("1para", Contact()),
-    ("5para_dis", Contact()),
-    ("20para", Contact()),
+    ("1para", PUBLISHED_CONTACT),
+    ("5para_dis", PUBLISHED_CONTACT),
+    ("20para", PUBLISHED_CONTACT),
     ("5para_moresamps", Contact(weight="inverse_square")),
     ("square_grid_cir", Contact(sides=50)),
 ]

@@ -10,6 +10,7 @@ import pytest
 import sense.live.sources
 from design import Morphology
 from design.common.errors import InputError
+from design.settings import PUBLISHED_CONTACT
 from sense import Recording
 from sense.live.sources import connected, replayed, simulated
 from sense.recordings.simulation.published_protocol import simulate
@@ -83,7 +84,7 @@ def test_the_simulated_rig_presses_the_pad_that_was_recorded() -> None:
     rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
     recorded = simulate(pad, rig)
     time = Time()
-    converter = SimulatedConverter(pad, rig, sense.live.sources.Contact(), time)
+    converter = SimulatedConverter(pad, rig, PUBLISHED_CONTACT, time)
     with pytest.raises(RigFault, match="not connected"):
         converter.read()
     assert converter.connect() == {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}

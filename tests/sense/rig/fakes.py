@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from design import Contact, Morphology
+from design import Morphology
+from design.settings import PUBLISHED_CONTACT
 from sense.recordings.recorder import STATE_COLUMNS
 from sense.recordings.simulation.pad_model import LivePad
 from sense.rig.devices import ArmState, ConverterSamples, Pose, RigFault
@@ -114,7 +115,7 @@ class FakeConverter:
 
     def __init__(self, arm: FakeArm, rig: RigSettings = RIG, pad: Morphology = PAD) -> None:
         self.arm, self.rig, self.frame = arm, rig, Frame.of(rig)
-        self.model = LivePad(pad, Contact(), rig, rig.converter_rate_hz, np.random.default_rng(1))
+        self.model = LivePad(pad, PUBLISHED_CONTACT, rig, rig.converter_rate_hz, np.random.default_rng(1))
         self.rate_hz, self.taken_s = rig.converter_rate_hz, arm.time()
         self.lose = 0
         self.lost = self.stalled = False

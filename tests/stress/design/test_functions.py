@@ -29,7 +29,7 @@ from design.criteria.score import score
 from design.evaluation.localisation_error import localisation_error
 from design.optimisers.search import SearchRun, search
 from design.report.plan_drawing import draw_plan
-from design.settings import PadSettings, RulesSettings, SearchSettings
+from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.values import LAX, call_spoiled, contacts, pads, presses
@@ -91,10 +91,10 @@ CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Argument
     "signals": (signals, {"pad": PAD, "presses": [[1, 1], [2, 2]], "contact": None}, some_signals),
     "signals_quantized": (
         signals_quantized,
-        {"pad": PAD, "presses": [[1, 1]], "contact": Contact(), "samples": 50},
+        {"pad": PAD, "presses": [[1, 1]], "contact": PUBLISHED_CONTACT, "samples": 50},
         some_signals,
     ),
-    "signals_sparse": (signals_sparse, {"pad": PAD, "presses": [[1, 1]], "contact": Contact()}, some_sparse),
+    "signals_sparse": (signals_sparse, {"pad": PAD, "presses": [[1, 1]], "contact": PUBLISHED_CONTACT}, some_sparse),
     "crossings": (crossings, {"pad": PAD, "tolerance": 1e-3}, lambda found, given: finite([c.place for c in found])),
     "flatten": (flatten, {"pad": PAD, "tolerance": 1e-2}, lines),
     "published_objective": (
@@ -147,14 +147,18 @@ CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Argument
         {"pad": PAD, "rules": RulesSettings()},
         lambda found, given: finite([v.measured for v in found]),
     ),
-    "draw_plan": (draw_plan, {"pad": PAD, "contact": Contact(), "violations": []}, ignored),
+    "draw_plan": (draw_plan, {"pad": PAD, "contact": PUBLISHED_CONTACT, "violations": []}, ignored),
 }
 SLOW_CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Arguments], None]]] = {
-    "score": (score, {"pad": PAD, "contact": Contact(), "lost": 1, "noise": 0.1, "rules": RulesSettings()}, numbers),
+    "score": (
+        score,
+        {"pad": PAD, "contact": PUBLISHED_CONTACT, "lost": 1, "noise": 0.1, "rules": RulesSettings()},
+        numbers,
+    ),
     "search": (
         quick_search,
         {
-            "contact": Contact(),
+            "contact": PUBLISHED_CONTACT,
             "rules": RulesSettings(),
             "origin": None,
             "resume": False,

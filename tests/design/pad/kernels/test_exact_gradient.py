@@ -7,10 +7,11 @@ import torch
 from design import Contact, Morphology, signals
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.pad.contact import fibre_axes
+from design.settings import PUBLISHED_CONTACT
 
 REACH = ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0))
 CONTACTS = [
-    Contact(),
+    PUBLISHED_CONTACT,
     Contact(sides=None),
     Contact(sides=3),
     Contact(sides=4, length="euclidean"),
@@ -61,7 +62,7 @@ def test_the_torch_function_gives_the_exact_signals():
     pad = Morphology.random(4, 5, seed=1)
     presses = np.random.default_rng(1).uniform(1, 4, (20, 2))
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
-    found = torch_signals(travel, cross, presses, Contact()).T.numpy()
+    found = torch_signals(travel, cross, presses, PUBLISHED_CONTACT).T.numpy()
     np.testing.assert_allclose(found, signals(pad, presses), rtol=1e-12, atol=1e-14)
 
 

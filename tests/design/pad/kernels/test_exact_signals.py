@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
 from design.pad.contact import signals_and_spans
 from design.pad.knots import assemble
+from design.settings import PUBLISHED_CONTACT
 from tests.helpers.effort import LONG, few
 
 WEIGHTS: tuple[Literal["uniform", "inverse_square", "inverse"], ...] = ("uniform", "inverse_square", "inverse")
@@ -217,7 +218,7 @@ def test_work_follows_what_is_touched():
     counts = {}
     for grid in (4, 128):
         presses = rng.uniform(1, grid, (400, 2))
-        counts[grid] = signals_and_spans(Morphology.straight(grid), presses, Contact())[1]
+        counts[grid] = signals_and_spans(Morphology.straight(grid), presses, PUBLISHED_CONTACT)[1]
     assert counts[128] <= 1.2 * counts[4]
     pad, presses = Morphology.random(4, 20, seed=0), rng.uniform(1, 4, (100, 2))
     small, large = (signals_and_spans(pad, presses, Contact(radius=radius))[1] for radius in (0.1, 1.0))

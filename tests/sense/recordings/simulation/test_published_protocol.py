@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design import Contact, InputError, Morphology, signals, signals_quantized
+from design import InputError, Morphology, signals, signals_quantized
+from design.settings import PUBLISHED_CONTACT
 from sense import RigSettings, simulate
 from sense.recordings.simulation.pad_model import (
     ADC_STEPS,
@@ -52,7 +53,9 @@ def test_presses_keep_to_what_is_sensed_and_the_recording_says_what_that_is() ->
 
 
 def test_touched_fibres_answer_and_others_do_not() -> None:
-    recording = simulate(PAD, RigSettings(presses=200, noise_mv=0.0, drift_mv=0.0, creep=0.0, hysteresis=0.0))
+    recording = simulate(
+        PAD, RigSettings(presses=200, noise_mv=0.0, drift_mv=0.0, creep=0.0, hysteresis=0.0), PUBLISHED_CONTACT
+    )
     touched = signals_quantized(PAD, PAD.to_grid(recording.presses_mm)) > 0
     cycles = recording.readings.reshape(200, 40, 8)
     change = cycles[:, 35] - cycles[:, 15]
@@ -61,7 +64,7 @@ def test_touched_fibres_answer_and_others_do_not() -> None:
 
 
 def test_untouched_fibres_stay_within_noise() -> None:
-    recording = simulate(PAD, RigSettings(presses=300, drift_mv=0.0, creep=0.0, hysteresis=0.0))
+    recording = simulate(PAD, RigSettings(presses=300, drift_mv=0.0, creep=0.0, hysteresis=0.0), PUBLISHED_CONTACT)
     touched = signals_quantized(PAD, PAD.to_grid(recording.presses_mm)) > 0
     cycles = recording.readings.reshape(300, 40, 8)
     change = cycles[:, 28:38].mean(axis=1) - cycles[:, 8:18].mean(axis=1)
@@ -146,12 +149,12 @@ def test_asked_bit_by_bit_the_model_gives_the_same(pieces: list[int], seed: int)
 def test_the_live_pad_answers_where_and_as_deep_as_the_tip_presses() -> None:
     quiet = RigSettings(noise_mv=0, drift_mv=0, creep=0, hysteresis=0)
     pad = Morphology.straight(2)
-    model = LivePad(pad, Contact(), quiet, 1000.0, np.random.default_rng(0))
+    model = LivePad(pad, PUBLISHED_CONTACT, quiet, 1000.0, np.random.default_rng(0))
     depths = np.repeat([-5.0, 0.0, 2.5, 5.0], 20)
     volts = model.volts(np.tile([-5.0, 7.0], (80, 1)), depths)
     rest, above, half, full = (volts[20 * i + 10] for i in range(4))
     assert np.array_equal(rest, above)
-    touched = signals(pad, pad.to_grid([[-5.0, 7.0]]), Contact())[0] > 0
+    touched = signals(pad, pad.to_grid([[-5.0, 7.0]]), PUBLISHED_CONTACT)[0] > 0
     assert touched.any()
     assert ((full < half) & (half < rest))[touched].all()
     assert np.array_equal(full[~touched], rest[~touched])

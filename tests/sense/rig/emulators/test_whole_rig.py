@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from design import Contact, Morphology
+from design import Morphology
+from design.settings import PUBLISHED_CONTACT
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
@@ -45,7 +46,9 @@ class Rig:
     def anew(self) -> None:
         """Another rig in the place of this one."""
         self.kept.close()
-        self.arm, self.converter, self.robot, self.board = self.kept.enter_context(emulated(PAD, Contact(), RIG))
+        self.arm, self.converter, self.robot, self.board = self.kept.enter_context(
+            emulated(PAD, PUBLISHED_CONTACT, RIG)
+        )
 
     def record(self, run: Path, plan: PressPlan, report: Report = lambda done, of: None) -> float:
         """Record into `run` or go on with it; when that began."""

@@ -4,7 +4,7 @@ import pytest
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import PUBLISHED_CONTACT
 from sense.rig.planning.press_plan import planned
 from sense.rig.planning.setup import Setup, plan_of, recorder_of
 from sense.settings import RigSettings
@@ -14,7 +14,7 @@ RIG = RigSettings(presses=5, channels=4)
 
 
 def setup(out: Path, pad: Morphology = PAD) -> Setup:
-    return Setup(pad, Contact(), RIG, out, "test")
+    return Setup(pad, PUBLISHED_CONTACT, RIG, out, "test")
 
 
 def begun(out: Path) -> None:

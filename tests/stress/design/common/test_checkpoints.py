@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from design.common.checkpoints import Checkpoints
 from design.common.errors import InputError
 from design.optimisers.search import SearchRun, search
-from design.settings import Contact
+from design.settings import PUBLISHED_CONTACT
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.damage import PAD, RULES, SEARCH, damages, replacements
@@ -31,7 +31,7 @@ def begun(tmp_path_factory) -> dict[str, bytes]:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            search(PAD, Contact(), settings, RULES, run=SearchRun(stop, kept))
+            search(PAD, PUBLISHED_CONTACT, settings, RULES, run=SearchRun(stop, kept))
         found |= {f"{method}/{path.name}": path.read_bytes() for path in kept.iterdir()}
     return found
 
@@ -57,7 +57,7 @@ def test_damaged_checkpoints(folder: Path, begun: dict[str, bytes], method: str,
     settings = SEARCH.model_copy(update={"method": method})
     with ends_in_time():
         try:
-            found = search(PAD, Contact(), settings, RULES, run=SearchRun(keep_in=kept, resume=True))
+            found = search(PAD, PUBLISHED_CONTACT, settings, RULES, run=SearchRun(keep_in=kept, resume=True))
         except InputError as error:
             require_one_line(error)
             Checkpoints(kept, {}).clear()

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import (
-    Contact,
     Morphology,
     crossings,
     flatten,
@@ -17,7 +16,7 @@ from design.criteria.rules import check_rules
 from design.pad.courses.bending import bend_radius, fold_gap, traced_curve
 from design.pad.courses.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
 from design.pad.knots import assemble
-from design.settings import RulesSettings
+from design.settings import PUBLISHED_CONTACT, RulesSettings
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import transposed, whole_lengths
@@ -47,7 +46,7 @@ def test_curves_keep_to_their_knots(data):
             )
     long = lengths(pad)
     assert (long >= (pad.grid + 1) * (1 - 1e-9)).all()
-    assert (long <= whole_lengths(pad, Contact()) * (1 + 1e-4)).all()
+    assert (long <= whole_lengths(pad, PUBLISHED_CONTACT) * (1 + 1e-4)).all()
 
 
 @settings(few(20), suppress_health_check=LAX)
