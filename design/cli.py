@@ -18,6 +18,11 @@ from design.common.command_line import (
 )
 
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
+twin_option = click.option(
+    "--twin",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="twin.json of a printed pad: its reach, noise and sensed area are designed for.",
+)
 
 
 @click.group(invoke_without_command=True)
@@ -26,6 +31,7 @@ morphology_argument = click.argument("morphology", type=click.Path(path_type=Pat
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
 @click.option("--from", "origin", metavar="random|straight|FILE", default="random", help="What to start from.")
+@twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Where presses are told apart.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="End with the best after S seconds.")
 @click.option("--resume", is_flag=True, help="Go on where a search into the same folder was broken off.")
@@ -42,6 +48,7 @@ def design(
     knots: int | None,
     starts: int | None,
     origin: str,
+    twin: Path | None,
     device: str | None,
     time_budget: float | None,
     resume: bool,
@@ -56,6 +63,7 @@ def design(
     padforge design                                   into out/pad, with the settings of pad.toml or the defaults
     padforge design --knots 8 --seed 1 --out out/pad
     padforge design --from out/pad/morphology.json    improves on a pad
+    padforge design --twin out/pad/twin.json          for what presses of a printed pad have shown
     padforge design check out/pad/morphology.json     exit 1 if a rule is broken
 
     Writes morphology.json, design.json, design.svg and design.png. Exit 1 if the best pad breaks a rule. Ctrl-C ends
@@ -71,7 +79,7 @@ def design(
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with claimed(out), cluster(scheduler) as executor:
         how = SearchRun(resume=resume, time_budget=time_budget, executor=executor)
-        document, result = run_search(load_spec(spec), out, overrides, origin, how)
+        document, result = run_search(load_spec(spec), out, overrides, origin, how, twin)
     show_result(document, search_lines(result, out), as_json)
     context.exit(INTERRUPTED if result.stopped == "interrupted" else 1 if result.violations else 0)
 
@@ -120,19 +128,24 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
 @design.command()
 @morphology_argument
 @spec_option
-def score(morphology: Path, spec: Path | None) -> None:
+@twin_option
+def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     """Print every term of the objective as JSON.
 
     \b
     padforge design score out/pad/morphology.json
+    padforge design score out/pad/morphology.json --twin out/pad/twin.json
     """
     from design.criteria.rules import check_rules
     from design.criteria.score import score as score_terms
     from design.pad.morphology import Morphology
+    from design.report.twin_settings import settings_for_twin
 
     from .settings import Contact, PadSettings, RulesSettings, SearchSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
+    if twin is not None:
+        settings = settings_for_twin(settings, twin, pad)
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
     size = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm)
     terms = score_terms(pad, settings.section(Contact), search.lost, search.noise, rules, size.sensed_mm)

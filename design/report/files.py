@@ -15,6 +15,7 @@ from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .plan_drawing import draw_plan
+from .twin_settings import settings_for_twin
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -29,6 +30,7 @@ def run_search(
     overrides: dict[str, Any],
     origin: str = "random",
     run: SearchRun | None = None,
+    twin: Path | None = None,
 ) -> tuple[dict[str, Any], SearchResult]:
     """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result.
 
@@ -37,13 +39,15 @@ def run_search(
         origin: "random", "straight" or the file of a morphology to start from, which also says how many knots a fibre
             has unless `overrides` does.
         run: how long it may take and on what it runs; its states are kept in `out`, and a bar tells its progress.
+        twin: a `twin.json`, for whose reach, noise and sensed rectangle to search.
     """
+    spec, inputs = (spec, []) if twin is None else (settings_for_twin(spec, twin), [twin])
     pad, contact, rules = spec.section(PadSettings), spec.section(Contact), spec.section(RulesSettings)
-    begin, inputs = None, []
+    begin = None
     if origin == "straight":
         begin = Morphology.straight(pad.grid, pad.pitch_mm)
     elif origin != "random":
-        begin, inputs = Morphology.load(origin), [Path(origin)]
+        begin, inputs = Morphology.load(origin), [*inputs, Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
     contact = contact if spec.given(Contact) else settings.usual_contact
