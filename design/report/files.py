@@ -109,8 +109,8 @@ def _located(result: SearchResult, name: str, told: str) -> list[str]:
         return []
     lost = " / ".join(map(str, range(len(spread))))
     return [
-        f"  {told} {' / '.join(f'{value:.3f}' for value in spread)} grid units under noise, with {lost} fibres lost",
-        f"  {' ' * len(told)} {' / '.join(f'{value:.3f}' for value in plain)} with straight fibres",
+        f"  {told} {' / '.join(f'{value:#.3g}' for value in spread)} grid units under noise, with {lost} fibres lost",
+        f"  {' ' * len(told)} {' / '.join(f'{value:#.3g}' for value in plain)} with straight fibres",
     ]
 
 

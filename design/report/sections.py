@@ -51,7 +51,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
                     table(
                         ["fibres lost", "grid units", "mm", "mm, straight fibres"],
                         [
-                            [lost, f"{value:.3f}", f"{value * pitch_mm:.2f}", _straight(document, lost, pitch_mm)]
+                            [lost, f"{value:#.3g}", f"{value * pitch_mm:#.3g}", _straight(document, lost, pitch_mm)]
                             for lost, value in spread.items()
                         ],
                     ),
@@ -66,7 +66,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         [
             (f"{grid} + {grid}", f"fibres on {size}"),
             (holds, "design rules"),
-            (f"{spread[0] * pitch_mm:.2f} mm", "ambiguity of the design"),
+            (f"{spread[0] * pitch_mm:#.3g} mm", "ambiguity of the design"),
         ],
     )
     return [fibres]
@@ -98,7 +98,7 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
 def _straight(document: Mapping[str, Any], lost: int, pitch_mm: float) -> str:
     """The ambiguity of straight fibres in mm; nothing where a search before this version left none."""
     value = document.get("straight", {}).get(f"ambiguity_lost_{lost}")
-    return "-" if value is None else f"{float(value) * pitch_mm:.2f}"
+    return "-" if value is None else f"{float(value) * pitch_mm:#.3g}"
 
 
 def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:

@@ -28,9 +28,9 @@ def test_straight_fibres_are_told_beside_what_was_found(tmp_path, monkeypatch):
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
     assert set(document["straight"]) == {name for name in document["terms"] if name.startswith("ambiguity")}
     assert told[1].startswith(
-        "  ambiguity {ambiguity_lost_0:.3f} / {ambiguity_lost_1:.3f} ".format(**document["terms"])
+        "  ambiguity {ambiguity_lost_0:#.3g} / {ambiguity_lost_1:#.3g} ".format(**document["terms"])
     )
-    assert told[2].split() == f"{straight[0]:.3f} / {straight[1]:.3f} with straight fibres".split()
+    assert told[2].split() == f"{straight[0]:#.3g} / {straight[1]:#.3g} with straight fibres".split()
 
 
 @pytest.fixture(scope="module")

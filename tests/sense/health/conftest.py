@@ -3,6 +3,7 @@
 import pytest
 
 from design import Morphology
+from design.settings import PUBLISHED_CONTACT
 from sense import Recording
 from sense import settings as sense_settings
 from sense.health.health_model import HealthModel
@@ -13,9 +14,8 @@ from tests.sense.health.pads import PRESSES, learn
 @pytest.fixture(scope="session")
 def pad() -> Recording:
     """The first PRESSES on a simulated pad of six fibres."""
-    whole = simulate(
-        Morphology.random(3, knots=3, seed=5), sense_settings.RigSettings(presses=900, seed=1, drift_mv=10)
-    )
+    rig = sense_settings.RigSettings(presses=900, seed=1, drift_mv=10)
+    whole = simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT)
     end = int(whole.begun[PRESSES])
     presses = {name: getattr(whole, name)[:PRESSES] for name in ("presses_mm", "begun", "lifted")}
     return Recording(whole.readings[:end], whole.times_s[:end], **presses)
