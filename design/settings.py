@@ -169,8 +169,9 @@ Lost = Annotated[
 ]
 
 
-NOISE = 0.015
-"""Scatter of the built pad's responses, share of full scale: within a held press 0.01, and some drift and creep."""
+NOISE = 0.05
+"""What an ambiguity can tell: the built pad's responses scatter by 0.01 to 0.02 of full scale, but among presses a fifth
+of a grid unit apart or more no confusions are left at that."""
 
 
 class SearchSettings(Settings):
@@ -203,7 +204,7 @@ class SearchSettings(Settings):
     @property
     def usual_contact(self) -> Contact:
         """What is designed for where nothing else is asked: the measured contact, by the published method its own."""
-        return Contact() if self.method == "descent" else PUBLISHED_CONTACT
+        return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
 
     @field_validator("lost")
     @classmethod

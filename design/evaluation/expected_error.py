@@ -28,7 +28,7 @@ from design.settings import Contact, Rectangle, Sensed, sensed_rectangle
 
 SIDE, WINDOW = 14, 5.0
 """Presses along a side of a lattice, and the longest side, grid units: presses further apart are seldom confused."""
-PAIRS, MOST_LOSSES = 4, 32
+PAIRS, MOST_LOSSES = 8, 32
 """Pairs of lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
 HARDER = 3.0
 """About how many times as great the error is with one more fibre lost: by its inverse each counts as much."""
