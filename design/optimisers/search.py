@@ -255,11 +255,11 @@ class _Judged:
     """A pad, the rules it breaks, and what the search minimises of it (contacts, losses)."""
 
     def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
-        self._problem, self._asked = problem, (problem.search.lost, problem.search.noise, problem.pad.sensed_mm)
-        self.pad = pad
+        self._problem, self.pad = problem, pad
         self.broken: list[Violation] = check_rules(pad, problem.rules) if problem.rules.enforce else []
         measure = expected_errors if problem.search.method == "error" else ambiguities
-        self.spread = [measure(pad, contact, *self._asked) for contact in problem.contacts]
+        asked, sensed_mm = (problem.search.lost, problem.search.noise), problem.pad.sensed_mm
+        self.spread = [measure(pad, contact, *asked, sensed_mm) for contact in problem.contacts]
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -273,7 +273,8 @@ class _Judged:
         """With 0, 1, ... lost, under the first contact."""
         if self._problem.search.method != "error":
             return self.spread[0]
-        return ambiguities(self.pad, self._problem.contacts[0], *self._asked)
+        search, contact = self._problem.search, self._problem.contacts[0]
+        return ambiguities(self.pad, contact, search.lost, search.noise, self._problem.pad.sensed_mm)
 
     def terms(self) -> dict[str, float]:
         """Ambiguities, and expected errors where they are minimised, by name."""

@@ -6,14 +6,20 @@ from typing import TYPE_CHECKING
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
 from design.pad.twin import Twin
-from design.settings import Contact, PadSettings
+from design.settings import Contact, PadSettings, SearchSettings
 
 if TYPE_CHECKING:
     from design.common.settings import Spec
 
+SEARCH = {"method": "error", "knots": 8, "starts": 2}
+"""How a twin is designed for: more knots than these, or more steps, do not find better pads of four fibres a family."""
+
 
 def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
     """The settings of `spec`, with the reach, the noise and the sensed rectangle of the `twin.json` at `path`.
+
+    What a press does and how noisy it is being known, the search is for the least expected error, unless `spec` states
+    another method.
 
     Its grid and pitch are the pad's as well, where `spec` states none, or those of `pad`, if one is given. Reach and
     rectangle stay as they are in mm on a pad of another pitch; of the rectangle what lies beyond a pad is left out.
@@ -24,6 +30,8 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
     twin = Twin.load(path)
     if spec.given(Contact) and spec.section(Contact) != Contact():
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
+    given = spec.given(SearchSettings)
+    method = given.get("method", SEARCH["method"])
     own = {"grid": twin.morphology.grid, "pitch_mm": twin.morphology.pitch_mm}
     stated = {name: value for name, value in spec.given(PadSettings).items() if name in own}
     if pad is not None:
@@ -36,6 +44,6 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         {
             "pad": own | stated | {"sensed_mm": [min(side, most) for side in twin.sensed_mm]},
             "contact": twin.contact(size.pitch_mm).model_dump(),
-            "search": {"noise": twin.noise},
+            "search": {**(SEARCH if method == SEARCH["method"] else {}), **given, "noise": twin.noise},
         }
     )
