@@ -65,6 +65,7 @@ class RigSettings(Settings):
     drift_mv: float = Field(default=40.0, ge=0, le=1000, description="simulated pad: spread of the drifting rest, mV")
     creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's answer that creeps")
     hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
+    hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: time in which that goes, s")
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
     converter_rate_hz: float = Field(

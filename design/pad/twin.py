@@ -23,6 +23,7 @@ from .morphology import Morphology
 
 FORMAT = "padforge-twin/1"
 MOST_VOLTS, MOST_MM = 1e3, 1e4
+MOST_LOOKS = 1e3
 MOST_CHANNELS, MOST_POINTS = 1024, 64
 LONGEST = 0.02
 """Longest element by which a laid fibre is summed, grid units."""
@@ -89,6 +90,30 @@ class TwinChannel:
 
 
 @dataclass(frozen=True)
+class TwinReadings:
+    """How the twin's readings run beside what presses answer, for simulations.
+
+    Attributes:
+        noise_mv: white noise of a reading. drift_mv: spread of the drifting rest; both standard deviations.
+        hysteresis: share of its answer that a press leaves behind, the other way round. hysteresis_s: in which time
+            that goes.
+        looks: all readings of a press together tell of its place (Fisher's information) so many times as much as the
+            twin's responses do with their `noise_v`; 1 or more.
+    """
+
+    noise_mv: float
+    drift_mv: float
+    hysteresis: float
+    hysteresis_s: float
+    looks: float = 1.0
+
+    def __post_init__(self) -> None:
+        limits = (("noise_mv", 0, 1e3), ("drift_mv", 0, 1e3), ("hysteresis", 0, 0.99), ("hysteresis_s", 0.01, 1e4))
+        for name, least, most in (*limits, ("looks", 1, MOST_LOOKS)):
+            object.__setattr__(self, name, real(name, getattr(self, name), least, most))
+
+
+@dataclass(frozen=True)
 class Twin:
     """A printed pad as presses have shown it.
 
@@ -102,7 +127,7 @@ class Twin:
         sensitivity: for each fibre how much a piece of it counts, (P - 1,) about 1; None where all count alike.
         noise: standard deviation of a response that neither place nor history explains, share of full scale.
         sensed_mm: width and height of what was pressed, along the axes of the plan.
-        presses: learnt from. provenance: free JSON.
+        presses: learnt from. provenance: free JSON. readings: how they run, None where nobody measured that.
 
     Raises:
         InputError: what does not fit together, or is out of range.
@@ -120,6 +145,7 @@ class Twin:
     angle_weight: Array | None = None
     sensitivity: tuple[Array | None, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    readings: TwinReadings | None = None
 
     def __post_init__(self) -> None:
         fibres = len(instance("morphology", self.morphology, Morphology).knots)
@@ -197,6 +223,7 @@ class Twin:
                 reach.get("angle_weight"),
                 None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
                 document.get("provenance", {}),
+                TwinReadings(**document["readings"]) if document.get("readings") else None,
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: no valid twin ({error!r})") from error
@@ -219,7 +246,7 @@ class Twin:
             "sensed_mm": list(self.sensed_mm),
             "presses": self.presses,
             "provenance": dict(self.provenance),
-        }
+        } | ({"readings": asdict(self.readings)} if self.readings else {})
         write_json(as_path("path", path), document)
 
 

@@ -23,8 +23,9 @@ drivers_option = click.option(
 @click.command()
 @rig_option
 @click.option(
-    "--morphology", type=FILE, help="morphology.json or published .mat (default: the straight grid of [pad])."
+    "--morphology", type=FILE, help="morphology.json or published .mat (default: the twin's, or straight fibres)."
 )
+@click.option("--twin", type=FILE, help="twin.json of a measured pad, which the simulated pad answers like.")
 @click.option("--presses", type=int, help="Presses to record.")
 @click.option("--plan", help="As [rig] plan: uniform, grid, boustrophedon, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
 @click.option("--model", type=FOLDER, help="Localizer that an adaptive plan is steered by.")
@@ -38,6 +39,7 @@ drivers_option = click.option(
 def record(
     rig: str,
     morphology: Path | None,
+    twin: Path | None,
     presses: int | None,
     plan: str | None,
     model: Path | None,
@@ -58,23 +60,31 @@ def record(
     --rig simulated --through-drivers   the same in real time, through emulated devices
     --rig ur5                           a UR robot and the board, as [rig] says
 
+    --twin twin.json, that identify wrote, makes the simulated pad the one that was measured: laid, wired, turned and
+    noisy as that was. With --morphology as well it is that pad as planned, with the reach, gain and noise of the twin.
+
     A recording that broke off keeps every finished press; --resume makes the others.
     Software is not the emergency stop: keep the robot's own one within reach.
     """
+    from design.pad.twin import Twin
     from design.settings import Contact, PadSettings
     from sense.recordings.recorder import START
     from sense.rig import operation
     from sense.rig.planning.setup import Setup
     from sense.settings import RigSettings
 
-    settings, target = common.load_spec(spec), out or common.pad_folder(morphology) / "recording"
+    settings, target = common.load_spec(spec), out or common.pad_folder(morphology or twin) / "recording"
+    if twin and (rig != "simulated" or through_drivers):
+        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --through-drivers")
+    like = Twin.load(twin) if twin else None
     pad = _pad(morphology, settings.section(PadSettings))
-    inputs = [path for path in (morphology, spec) if path is not None]
+    inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
     if rig == "simulated" and not through_drivers:
         if resume or dry_run or plan or model:
             raise InputError("--resume, --dry-run, --plan and --model need --through-drivers or --rig ur5")
-        recording = operation.record_simulated(settings, pad, target, overrides, inputs)
+        shown = like if like and not morphology else pad
+        recording = operation.record_simulated(settings, shown, target, overrides, inputs, like)
     else:
         options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]

@@ -92,6 +92,8 @@ def simulated(model: Path) -> SimulatedConverter:
     source = read_json(path, FORMAT).get("source")
     if not isinstance(source, dict) or source.get("kind") != "simulated":
         raise InputError(f"{path}: of no simulated pad, but --rig simulated needs one; --replay shows a recording")
+    if "twin" in source:
+        raise InputError(f"{path}: of a pad simulated by its twin, which is not live; --replay shows a recording")
     try:
         pad = Morphology(np.array(source["morphology"]["knots"]), source["morphology"]["pitch_mm"])
         contact, rig = dict(source["contact"]), dict(source["rig"])

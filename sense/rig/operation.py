@@ -14,6 +14,7 @@ from design.common.files import provenance
 from design.common.profiling import stage
 from design.common.settings import Spec
 from design.pad.morphology import Morphology
+from design.pad.twin import Twin
 from design.settings import Contact, PadSettings
 from sense.localizer.localizer import Localizer
 from sense.recordings.recorder import refuse_existing
@@ -33,18 +34,27 @@ SUPPLY_V = 3.3
 
 
 def record_simulated(
-    spec: Spec, pad: Morphology, out: Path, overrides: Mapping[str, Any], inputs: Sequence[Path] = ()
+    spec: Spec,
+    pad: Morphology | Twin,
+    out: Path,
+    overrides: Mapping[str, Any],
+    inputs: Sequence[Path] = (),
+    like: Twin | None = None,
 ) -> Recording:
     """Record presses on the simulated rig, at once, with the settings of `spec`, into the run directory `out`.
 
+    Args:
+        pad, like: see `simulate`.
+
     Raises:
-        InputError: settings that cannot be, or a recording in the way.
+        InputError: settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
     refuse_existing(out)
     options = spec.section(RigSettings, **overrides)
-    sensed_mm = spec.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm).sensed_mm
+    plan = pad.morphology if isinstance(pad, Twin) else pad
+    sensed_mm = spec.section(PadSettings, grid=plan.grid, pitch_mm=plan.pitch_mm).sensed_mm
     with stage("simulate"):
-        recording = simulate(pad, options, spec.section(Contact), sensed_mm)
+        recording = simulate(pad, options, spec.section(Contact), sensed_mm, like)
     recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
     return recording
 

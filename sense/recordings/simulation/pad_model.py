@@ -9,6 +9,7 @@ Strengths are of the order of that recording: answers up to some 0.2 V on a rest
 wandering by 0.04 V, noise of 1.6 mV.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +30,6 @@ DELAY_S = (0.08, 0.2)
 """Range of the time from the command to the touch, and to the start of the release."""
 CREEP_S = (0.4, 6.0)
 """Time constants of the creeping part of an answer, in equal shares."""
-OVERSHOOT_S = 2.5
-"""Time constant of the return from the overshoot after unloading."""
 DRIFT_S = 600.0
 """Correlation time of the rest."""
 REST_V = (1.7, 2.1)
@@ -48,6 +47,12 @@ class Cycle:
     def down_at(self) -> int:
         """Reading of the cycle at which the probe is sent down."""
         return self.readings // 2
+
+    @property
+    def held_at(self) -> int:
+        """Reading of the cycle from which on the probe is held down, at the latest its last one."""
+        arriving = math.ceil((DELAY_S[1] + TRAVEL_S) * self.rate_hz)
+        return min(self.down_at + arriving, self.readings - 1)
 
 
 def indentation(cycle: Cycle, delays_s: Array) -> Array:
@@ -78,13 +83,13 @@ class Answer:
 
     Args:
         rate_hz: readings a second. creep: share that follows by `CREEP_S`. hysteresis: overshoot as a share of the
-            strain lost.
+            strain lost. hysteresis_s: time constant of the return from it.
     """
 
-    def __init__(self, rate_hz: float, creep: float, hysteresis: float) -> None:
+    def __init__(self, rate_hz: float, creep: float, hysteresis: float, hysteresis_s: float) -> None:
         self._creep, self._hysteresis = creep, hysteresis
         self._lags = [Lag(rate_hz * time_constant) for time_constant in CREEP_S]
-        self._stay = np.exp(-1 / (rate_hz * OVERSHOOT_S))
+        self._stay = np.exp(-1 / (rate_hz * hysteresis_s))
         self._last: Array | None = None
         self._overshoot: Array | None = None
 
@@ -94,7 +99,8 @@ class Answer:
         for lag in self._lags:
             shown = shown + self._creep / len(self._lags) * lag(strained)
         last = strained[:1] if self._last is None else self._last
-        unloading = np.maximum(-np.diff(strained, axis=0, prepend=last), 0)
+        earlier = np.concatenate([last, strained[:-1]])
+        unloading = np.sign(earlier) * np.maximum(np.abs(earlier) - np.abs(strained), 0)
         before = np.zeros_like(last) if self._overshoot is None else self._overshoot
         over, self._overshoot = lfilter([1.0], [1.0, -self._stay], unloading, axis=0, zi=before)
         self._last = strained[-1:].copy()
@@ -140,27 +146,69 @@ def digitised(volts: Array) -> Array:
     return np.clip(np.rint(volts / SUPPLY_V * ADC_STEPS), 0, ADC_STEPS) * (SUPPLY_V / ADC_STEPS)
 
 
-def read_pad(signals: Array, cycle: Cycle, rig: RigSettings, rng: np.random.Generator) -> Array:
-    """(Q, C) signals of a plan of presses to (Q readings, C) volts as the ADC gives them."""
-    model = Divider(signals.shape[1], cycle.rate_hz, rig, rng)
-    indented = indentation(cycle, rng.uniform(*DELAY_S, (len(signals), 2)))
-    return model(rig.depth_mm / FULL_DEPTH_MM * strain(signals, indented))
+def read_pad(
+    answers: Array, cycle: Cycle, rig: RigSettings, rng: np.random.Generator, noise_v: Array | None = None
+) -> Array:
+    """What the ADC gives of a plan of presses at full depth.
+
+    Args:
+        answers: (Q, C) signals in grid units; or V, as measured, which is how a held press differs from the rest.
+        noise_v: (C,) by how much answers in V scatter in all, standard deviation; None for signals.
+
+    Returns:
+        (Q readings, C) V.
+    """
+    presses, channels = answers.shape
+    model = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
+    if noise_v is not None:
+        own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
+        answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)
+    indented = indentation(cycle, rng.uniform(*DELAY_S, (presses, 2)))
+    return model(rig.depth_mm / FULL_DEPTH_MM * strain(answers, indented))
+
+
+def held_share(cycle: Cycle, rig: RigSettings) -> float:
+    """What a press shows while it is held, on average, as a share of what it would settle at."""
+    pressed = np.zeros((cycle.readings, 1))
+    pressed[cycle.down_at :] = 1.0
+    return float(_answer(cycle.rate_hz, rig)(pressed)[cycle.held_at :].mean())
+
+
+def reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
+    """Standard deviation of a held press minus the rest before it by white noise and drift alone, V."""
+    held, rest = np.arange(cycle.held_at, cycle.readings), np.arange(cycle.down_at // 2, cycle.down_at)
+    times_s = np.append(held, rest) / cycle.rate_hz
+    weights = np.append(np.full(len(held), 1 / len(held)), np.full(len(rest), -1 / len(rest)))
+    alike = np.exp(-np.abs(times_s[:, None] - times_s) / DRIFT_S)
+    drift, white = weights @ alike @ weights, weights @ weights
+    return float(1e-3 * np.sqrt(rig.drift_mv**2 * drift + rig.noise_mv**2 * white))
+
+
+def _answer(rate_hz: float, rig: RigSettings) -> Answer:
+    return Answer(rate_hz, rig.creep, rig.hysteresis, rig.hysteresis_s)
 
 
 class Divider:
-    """The fibres of a simulated pad in their dividers, read by an ADC; may be asked bit by bit."""
+    """The fibres of a simulated pad in their dividers, read by an ADC; may be asked bit by bit.
 
-    def __init__(self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator) -> None:
+    Args:
+        linear: whether strains are what voltages change by, V, as measured ones are, and not relative to a fibre.
+    """
+
+    def __init__(
+        self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator, linear: bool = False
+    ) -> None:
         self._rest_v = rng.uniform(*REST_V, fibres)
-        self._answer = Answer(rate_hz, rig.creep, rig.hysteresis)
+        self._answer = _answer(rate_hz, rig)
         self._wander = Wander(fibres, rate_hz, rng)
-        self._rig, self._rng = rig, rng
+        self._rig, self._rng, self._linear = rig, rng, linear
 
     def __call__(self, strained: Array) -> Array:
         """(R, C) strain, 1 for a signal of 1 at full depth, going on from what was asked before, to (R, C) volts."""
         if not len(strained):
             return strained
-        volts = divider(self._rest_v, GAUGE * self._answer(strained))
+        shown = self._answer(strained)
+        volts = self._rest_v + shown if self._linear else divider(self._rest_v, GAUGE * shown)
         volts += self._rig.drift_mv * 1e-3 * self._wander(len(volts))
         volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
         return digitised(volts)

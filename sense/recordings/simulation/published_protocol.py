@@ -2,51 +2,61 @@
 
 import numpy as np
 
-from design import Contact, Morphology, signals
+from design import Contact, Morphology, Twin
 from design.common.errors import MOST_VALUES, InputError, instance, whole
 from design.common.settings import or_default
-from design.settings import PadSettings, Sensed, sensed_rectangle
+from design.settings import Sensed, sensed_rectangle
 from sense.recordings.processing.limits import MAX_FIBRES, Array
 from sense.recordings.recording import Recording
 from sense.settings import RigSettings
 
 from .pad_model import Cycle, read_pad
+from .simulated_pad import SimulatedPad, measured, measured_alike, planned
 
 JITTER = 0.1
 """Spread of the interval between readings, share of its mean: the loop of the recording is no clock."""
 
 
 def simulate(
-    pad: Morphology, rig: RigSettings | None = None, contact: Contact | None = None, sensed_mm: Sensed = "beyond"
+    pad: Morphology | Twin,
+    rig: RigSettings | None = None,
+    contact: Contact | None = None,
+    sensed_mm: Sensed = "beyond",
+    like: Twin | None = None,
 ) -> Recording:
     """Record presses at random places on a simulated pad.
 
     A press takes a cycle of readings: the probe goes down in its middle and up at its end.
 
     Args:
-        pad: course of the fibres. rig: length, rate, seed and strengths. contact: what a press deforms.
+        pad: course of the fibres; or a twin, which answers, and is pressed, as the pad it was measured on.
+        rig: length, rate, seed and strengths. contact: what a press deforms. What a twin has measured goes before both.
         sensed_mm: where it is pressed (`PadSettings`).
+        like: a twin of another pad, which `pad` is to answer like.
 
     Returns:
         The recording, the same for the same arguments.
 
     Raises:
-        InputError: more fibres or readings than a recording may hold, or presses beyond the pad.
+        InputError: more fibres or readings than a recording may hold, presses beyond the pad, or a twin of which no
+            channel reads a fibre.
     """
-    instance("pad", pad, Morphology)
-    rig, contact = or_default("rig", rig, RigSettings), or_default("contact", contact, Contact)
-    whole("fibres of the pad", 2 * pad.grid, 2, MAX_FIBRES)
-    size = PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm, sensed_mm=sensed_mm)
-    values = rig.presses * rig.readings_per_press * 2 * pad.grid
+    contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
+    channels = len(pad.channels) if isinstance(pad, Twin) else len(instance("pad", pad, Morphology).knots)
+    whole("fibres of the pad", channels, 1, MAX_FIBRES)
+    values = rig.presses * rig.readings_per_press * channels
     if values > MOST_VALUES:
         raise InputError(
-            f"[rig] presses is {rig.presses}: with {rig.readings_per_press} readings each of {2 * pad.grid} fibres "
+            f"[rig] presses is {rig.presses}: with {rig.readings_per_press} readings each of {channels} fibres "
             f"{values} values, allowed are {MOST_VALUES}"
         )
+    model = _modelled(pad, contact, sensed_mm, like)
+    rig = rig.model_copy(update=model.strengths)
     rng = np.random.default_rng(rig.seed)
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
-    places_mm = random_places(pad, rig.presses, rng, sensed_mm)
-    readings = read_pad(signals(pad, pad.to_grid(places_mm), contact), cycle, rig, rng)
+    low_mm, high_mm = model.pressed_mm
+    places_mm = rng.uniform(low_mm, high_mm, (rig.presses, 2))
+    readings = read_pad(model.answers(places_mm), cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
     first = cycle.readings * np.arange(rig.presses)
     return Recording(
@@ -55,13 +65,17 @@ def simulate(
         places_mm,
         begun=first + cycle.down_at,
         lifted=first + cycle.readings,
-        source={
-            "kind": "simulated",
-            "rig": rig.model_dump(mode="json"),
-            "contact": contact.model_dump(mode="json"),
-            "sensed_mm": size.model_dump(mode="json")["sensed_mm"],
-            "morphology": {"pitch_mm": pad.pitch_mm, "knots": pad.knots.tolist()},
-        },
+        source={"kind": "simulated", "rig": rig.model_dump(mode="json"), **model.source},
+    )
+
+
+def _modelled(pad: Morphology | Twin, contact: Contact, sensed_mm: Sensed, like: Twin | None) -> SimulatedPad:
+    if isinstance(pad, Twin):
+        return measured(pad)
+    return (
+        planned(pad, contact, sensed_mm)
+        if like is None
+        else measured_alike(pad, instance("like", like, Twin), sensed_mm)
     )
 
 

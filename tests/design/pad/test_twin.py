@@ -8,7 +8,7 @@ import pytest
 
 from design import InputError, Morphology, Twin, signals
 from design.pad.courses.curves import flatten
-from design.pad.twin import Frame, TwinChannel
+from design.pad.twin import Frame, TwinChannel, TwinReadings
 
 PAD = Morphology.random(2, knots=3, seed=5)
 DISTANCE = np.linspace(0, 1.6, 9)
@@ -111,3 +111,25 @@ def test_a_damaged_file_is_refused_in_one_line(twin, tmp_path, damage, said):
         Twin.load(tmp_path / "twin.json")
     assert "twin.json" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+READINGS = TwinReadings(noise_mv=2.0, drift_mv=18.0, hysteresis=0.3, hysteresis_s=14.0, looks=8.0)
+
+
+def test_how_readings_run_is_kept_and_may_be_missing(twin, tmp_path):
+    for readings in (READINGS, None):
+        replace(twin, readings=readings).save(tmp_path / "twin.json")
+        assert Twin.load(tmp_path / "twin.json").readings == readings
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("looks", 0.5), ("hysteresis", 1.0), ("drift_mv", -1), ("noise_mv", "much"), ("warmth", 3)]
+)
+def test_readings_that_cannot_be_are_one_line(twin, tmp_path, name, value):
+    path = tmp_path / "twin.json"
+    replace(twin, readings=READINGS).save(path)
+    document = json.loads(path.read_text())
+    document["readings"][name] = value
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=rf"^{path}: .*{name}"):
+        Twin.load(path)

@@ -127,6 +127,7 @@ def test_the_simulated_pad_is_that_of_the_model(model: Path, tmp_path: Path) -> 
     start = json.loads((model / "recording" / "start.json").read_text())
     for source, message in (
         ({"kind": "rig"}, "of no simulated pad"),
+        (start["source"] | {"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
         (start["source"] | {"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
         (start["source"] | {"morphology": {}}, "no pad that can be simulated"),
         (start["source"] | {"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "knots"),

@@ -75,7 +75,7 @@ def test_untouched_fibres_stay_within_noise() -> None:
 
 def one_press(creep: float, hysteresis: float) -> np.ndarray:
     indented = np.vstack([indentation(CYCLE, np.full((1, 2), 0.1)), np.zeros((9, 80))])
-    return Answer(CYCLE.rate_hz, creep, hysteresis)(strain(np.vstack([[1.0], np.zeros((9, 1))]), indented))[:, 0]
+    return Answer(CYCLE.rate_hz, creep, hysteresis, 2.5)(strain(np.vstack([[1.0], np.zeros((9, 1))]), indented))[:, 0]
 
 
 def test_without_creep_and_hysteresis_the_answer_is_the_indentation() -> None:
@@ -138,8 +138,8 @@ def test_the_rest_wanders_slowly_about_its_place() -> None:
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
 def test_asked_bit_by_bit_the_model_gives_the_same(pieces: list[int], seed: int) -> None:
     strained = np.random.default_rng(seed).uniform(0, 2, (sum(pieces), 3))
-    whole = Answer(13.3, 0.2, 0.3)(strained)
-    model = Answer(13.3, 0.2, 0.3)
+    whole = Answer(13.3, 0.2, 0.3, 2.5)(strained)
+    model = Answer(13.3, 0.2, 0.3, 2.5)
     parts = np.split(strained, np.cumsum(pieces)[:-1])
     assert np.allclose(np.vstack([model(part) for part in parts]), whole)
     drift, again = (Wander(2, 13.3, np.random.default_rng(seed)) for _ in range(2))

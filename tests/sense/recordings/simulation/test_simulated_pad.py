@@ -1,0 +1,129 @@
+"""A pad simulated by its twin answers as the twin says: wiring, frame, sizes, noise; and another pad alike."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from design import Contact, InputError, Morphology, Twin, signals
+from design.pad.twin import Frame, TwinChannel, TwinReadings
+from sense import Recording, RigSettings, simulate
+from sense.recordings.simulation.simulated_pad import measured
+
+PAD = Morphology.straight(2)
+GAINS = (-0.06, -0.04, -0.05)
+STILL: dict[str, Any] = {"noise_mv": 0.0, "drift_mv": 0.0}
+DISTANCE_MM, WEIGHT = 11.25 * np.linspace(0, 1.2, 9), np.append(np.exp(-0.5 * (np.linspace(0, 1.05, 8) / 0.5) ** 2), 0)
+
+
+def twin_of(frame: Frame | None = None, noise_v: float = 0.0, readings: TwinReadings | None = None) -> Twin:
+    """Channel 1 is dead; 0, 2 and 3 read the fibres 3, 0 and 1 of a straight pad."""
+    wired = [(3, GAINS[0]), (None, 0.0), (0, GAINS[1]), (1, GAINS[2])]
+    channels = [TwinChannel(c, fibre, gain, noise_v, 0.9) for c, (fibre, gain) in enumerate(wired)]
+    laid = [PAD.to_mm(line) for line in PAD.knots[[0, 1]]] + [None, PAD.to_mm(PAD.knots[3])]
+    return Twin(
+        PAD,
+        tuple(channels),
+        frame or Frame(),
+        DISTANCE_MM,
+        WEIGHT,
+        tuple(laid),
+        0.02,
+        (22.5, 22.5),
+        900,
+        readings=readings,
+    )
+
+
+def responses(recording: Recording) -> np.ndarray:
+    """(Q, C) V, means while held minus the rest before."""
+    cycles = recording.readings.reshape(len(recording.presses_mm), 40, -1)
+    return cycles[:, 25:40].mean(axis=1) - cycles[:, 8:20].mean(axis=1)
+
+
+def test_responses_have_the_sizes_and_signs_of_the_twin_on_the_channels_it_names() -> None:
+    twin = twin_of(Frame(turn_deg=5, shift_mm=(2, -1), scale=0.9))
+    recording = simulate(twin, RigSettings(presses=200, hysteresis=0, **STILL))
+    expected = np.zeros((200, 4))
+    expected[:, [0, 2, 3]] = GAINS * twin.laid_signals(recording.presses_mm)[:, [3, 0, 1]]
+    found = responses(recording)
+    assert found == pytest.approx(expected, abs=4e-3)  # creep of the press before, and steps of the converter
+    assert np.corrcoef(found[:, 0], expected[:, 0])[0, 1] > 0.999
+    assert found[:, [0, 2, 3]].min(axis=0) == pytest.approx(expected[:, [0, 2, 3]].min(axis=0), rel=0.05)
+
+
+def test_a_dead_channel_shows_the_noise_of_readings_alone() -> None:
+    recording = simulate(twin_of(noise_v=0.02), RigSettings(presses=200, drift_mv=0, noise_mv=2))
+    dead, live = recording.readings[:, 1], recording.readings[:, 0]
+    assert dead.std() == pytest.approx(2e-3, rel=0.05)
+    assert live.std() > 5 * dead.std()
+
+
+def test_a_mirrored_pad_answers_as_at_the_mirrored_place() -> None:
+    places = np.array([[4.0, 3.0], [-7.0, 1.0], [2.0, -9.0]])
+    plain, mirrored = (measured(twin_of(Frame(mirrored=mirrored))) for mirrored in (False, True))
+    assert mirrored.answers(places * [-1, 1]) == pytest.approx(plain.answers(places))
+    assert np.abs(mirrored.answers(places) - plain.answers(places)).max() > 0.01
+
+
+@pytest.mark.parametrize(("looks", "rig"), [(1.0, {}), (4.0, {}), (1.0, {"drift_mv": 100.0, "noise_mv": 5.0})])
+def test_responses_scatter_as_the_twin_says(looks: float, rig: dict) -> None:
+    """With 4 looks by half of it, since all that is read of a press deviates alike."""
+    readings = TwinReadings(
+        **{"noise_mv": 1.6, "drift_mv": 10.0, "hysteresis": 0.0, "hysteresis_s": 2.5} | rig, looks=looks
+    )
+    twin = twin_of(noise_v=0.012, readings=readings)
+    recording = simulate(twin, RigSettings(presses=1500, creep=0))
+    scatter = responses(recording) - measured(twin).answers(recording.presses_mm)
+    assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / looks**0.5, rel=0.08)
+
+
+def test_what_the_twin_has_measured_goes_before_the_settings() -> None:
+    readings = TwinReadings(noise_mv=3.0, drift_mv=7.0, hysteresis=0.3, hysteresis_s=12.0)
+    said = simulate(twin_of(readings=readings), RigSettings(presses=3, creep=0.05)).source["rig"]
+    assert {name: said[name] for name in ("noise_mv", "drift_mv", "hysteresis", "hysteresis_s", "creep")} == {
+        **{"noise_mv": 3.0, "drift_mv": 7.0, "hysteresis": 0.3, "hysteresis_s": 12.0},
+        "creep": 0.05,
+    }
+
+
+def test_it_is_pressed_where_the_printed_pad_was() -> None:
+    twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
+    for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
+        recording = simulate(replace(twin, frame=Frame(turn_deg=turn_deg)), RigSettings(presses=400))
+        assert np.ptp(recording.presses_mm, axis=0) == pytest.approx(sides, rel=0.02)
+    askew = replace(twin, frame=Frame(turn_deg=10, scale=0.8))
+    half = np.array(measured(askew).pressed_mm[1])
+    spans = np.ptp(askew.frame.to_plan(half * [[-1, -1], [-1, 1], [1, 1], [1, -1]]), axis=0)
+    assert spans == pytest.approx((20, 10))
+
+
+def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin() -> None:
+    twin, other = twin_of(Frame(mirrored=True, shift_mm=(3, 3))), Morphology.random(3, knots=2, seed=1, pitch_mm=9)
+    recording = simulate(other, RigSettings(presses=100, hysteresis=0, creep=0, **STILL), like=twin)
+    expected = -0.05 * signals(other, other.to_grid(recording.presses_mm), twin.contact(9))
+    assert responses(recording) == pytest.approx(expected, abs=1e-3)
+    assert recording.source["contact"] == twin.contact(9).model_dump(mode="json")
+    assert recording.source["twin"]["presses"] == 900
+    assert np.abs(recording.presses_mm).max() == pytest.approx(13.5, rel=0.02)
+
+
+def test_the_same_seed_gives_the_same_recording_and_another_another() -> None:
+    twin = twin_of(noise_v=0.01)
+    first = simulate(twin, RigSettings(presses=20, seed=3))
+    assert simulate(twin, RigSettings(presses=20, seed=3)) == first
+    assert simulate(twin, RigSettings(presses=20, seed=4)) != first
+    assert simulate(PAD, RigSettings(presses=20, seed=3), Contact(), like=twin) != first
+
+
+def test_a_twin_without_a_live_channel_is_refused() -> None:
+    dead = replace(twin_of(), channels=tuple(TwinChannel(c, None, 0.0, 0.0, 0.0) for c in range(2)))
+    for pad, like in ((dead, None), (PAD, dead)):
+        with pytest.raises(InputError, match="twin: none of its channels reads a fibre"):
+            simulate(pad, RigSettings(presses=3), like=like)
+
+
+def test_a_pad_of_too_many_fibres_is_refused() -> None:
+    with pytest.raises(InputError, match="fibres of the pad is 600, allowed is a whole number from 1 to 512"):
+        simulate(Morphology.straight(300), RigSettings(presses=3), like=twin_of())
