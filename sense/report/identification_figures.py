@@ -8,7 +8,7 @@ from matplotlib.patches import Rectangle
 
 from design.common.figures import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, head, save_figure, tidy
 from design.pad.courses.curves import flatten
-from sense.twin.identification import Identification
+from sense.twin.identified_pad import Identification
 
 COLUMNS = ("measured", "predicted", "left over")
 

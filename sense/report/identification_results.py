@@ -13,7 +13,8 @@ from design.common.profiling import stage
 from design.pad.morphology import Morphology
 from sense.recordings.processing.limits import Array, Mask
 from sense.recordings.recording import Recording
-from sense.twin.identification import Identification, identify
+from sense.twin.identification import identify
+from sense.twin.identified_pad import Identification
 
 FORMAT = "padforge-identification/1"
 STRANGER = 0.02
@@ -112,7 +113,7 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
         ),
         f"explained {document['explained']:.3f} of what presses held out show; on the plan as it is"
         f" {document['explained_on_plan']:.3f}; noise {document['noise']:.1%} of full scale",
-        f"laid {_mirrored(frame)}, turned {frame['turn_deg']:.1f} degrees, shifted {_shift(frame)} mm,"
+        f"laid {_mirrored(frame)}, turned {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm,"
         f" scale {frame['scale']:.3f}",
         *doubt_lines(document),
     ]
@@ -171,7 +172,7 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
             [
                 paragraph(
                     f"Found from {document['presses']} presses: it lay {_mirrored(frame)}, turned"
-                    f" {frame['turn_deg']:.1f} degrees, shifted {_shift(frame)} mm, scale {frame['scale']:.3f}."
+                    f" {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm, scale {frame['scale']:.3f}."
                     f" The twin explains {document['explained']:.0%} of what {document['held_out']} presses held out"
                     f" show, the plan as it is {document['explained_on_plan']:.0%}; noise is"
                     f" {document['noise']:.1%} of full scale."
@@ -202,5 +203,9 @@ def _mirrored(frame: Mapping[str, Any]) -> str:
 
 
 def _shift(frame: Mapping[str, Any]) -> str:
-    x, y = frame["shift_mm"]
-    return f"{x:.1f}, {y:.1f}"
+    return ", ".join(map(_tenths, frame["shift_mm"]))
+
+
+def _tenths(value: float) -> str:
+    """To one digit, 0 without a sign."""
+    return f"{round(value, 1) + 0.0:.1f}"

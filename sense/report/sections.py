@@ -28,6 +28,7 @@ def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSe
     source = document["source"]
     kind = source.get("kind")
     origin = {"simulated": "the simulated rig", "rig": "a rig"}.get(kind) or source.get("file", kind)
+    origin = f"{origin}, by the twin of a printed pad" if "twin" in source else origin
     rig = source.get("rig", {})
     how = f", {rig['rate_hz']:g} a second; presses {rig['depth_mm']:g} mm deep" if rig else ""
     return [PageSection("Recording", [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")])]

@@ -13,8 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices, Mask
 
 from .kernels.response import along_fibre
-from .laid_pad import ASIDE, AWAY, COUNTS, OWN, SENSITIVITY, SHARED, SPLINES, LaidPad, own_values
-from .plan import ELEMENTS
+from .laid_pad import ASIDE, AWAY, COUNTS, ELEMENTS, OWN, SENSITIVITY, SHARED, SPLINES, LaidPad, own_values
 from .responses import Responses
 
 SMOOTH = 0.3

@@ -1,22 +1,22 @@
 """System identification of a printed pad, from presses at known places alone."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from design import Morphology
 from design.common.errors import InputError, instance, whole
-from design.pad.twin import Twin, TwinChannel
-from sense.recordings.processing.limits import Array, Indices, Mask
+from design.pad.twin import MOST_LOOKS, TwinReadings
+from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
+from sense.recordings.simulation.strengths import strengths
 
 from .fitting import Fit, Freedom, fit
-from .laid_pad import LaidPad
-from .plan import Plan
-from .responses import Responses, responses
+from .identified_pad import Identification
+from .laid_pad import LaidPad, Plan
+from .responses import Responses, information, responses
 from .smooth import smooth_function
 from .wiring import Wiring, wirings
 
@@ -42,105 +42,9 @@ WORTH = 0.01
 LEAST_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else this is no recording of the pad."""
 
-POINTS, FELT = 13, 0.01
-"""Points of the reach in a twin, and the least weight that counts as felt."""
 
 Report = Callable[[str, int, int], None]
 """Hears what is done, and how many steps of it of how many."""
-
-
-@dataclass(frozen=True)
-class Identification:
-    """What was found.
-
-    Attributes:
-        pad: as it was planned. fit: as laid, with its certainty; its channels are the live ones.
-        live: (C',) which of the `channels` recorded these are.
-        explained: (C',) share of the variance of the responses on presses held out.
-        on_plan: the same if every fibre lay as planned, mean over the channels.
-        noise_v: (channels,) scatter of responses that neither the pad nor place nor history explains.
-        noise: of the live channels, share of full scale. full_scale_v: (C',) largest response of each.
-        doubts: other wirings that the presses cannot tell from the one found.
-        straight: what straight fibres explain that lie and are wired as suits them best; None where this pad's are.
-        learnt, held_out: responses of the live channels learnt from, and held out.
-    """
-
-    pad: Morphology
-    fit: Fit
-    live: Indices
-    explained: Array
-    on_plan: float
-    noise_v: Array
-    noise: float
-    full_scale_v: Array
-    doubts: list[Wiring]
-    straight: float | None
-    learnt: Responses
-    held_out: Responses
-
-    def laid_mm(self) -> list[tuple[Array, Array, Mask]]:
-        """For each live channel how far its fibre lies beside the plan, to its left, (F,) mm; how sure that is, (F,)
-        mm; and which of its elements lie within what was pressed, (F,)."""
-        laid, pitch_mm = self.fit.pad, self.pad.pitch_mm
-        pressed = laid.plan.to_grid(laid.frame.to_plan(self.learnt.places_mm))
-        low, high = pressed.min(axis=0), pressed.max(axis=0)
-        out = []
-        for row, fibre in enumerate(laid.fibres):
-            course, tangent = laid.plan.course[fibre], laid.plan.tangent[fibre]
-            off = laid.course(row)[0] - course
-            left = off[:, 1] * tangent[:, 0] - off[:, 0] * tangent[:, 1]
-            within = ((course >= low) & (course <= high)).all(axis=1)
-            out.append((pitch_mm * left, pitch_mm * self.fit.unsure(row), within))
-        return out
-
-    def twin(self, provenance: Mapping[str, Any] | None = None) -> Twin:
-        """What was found, as a twin."""
-        laid, pitch_mm = self.fit.pad, self.pad.pitch_mm
-        own = dict(zip(self.live.tolist(), range(len(self.live)), strict=True))
-        courses: list[Array | None] = [None] * len(self.pad.knots)
-        counts: list[Array | None] = list(courses)
-        gains = np.zeros(len(self.noise_v))
-        for channel, row in own.items():
-            line, counted = laid.course(row)
-            fibre, mean = laid.fibres[row], counted.mean()
-            ends = [1.5 * line[:1] - 0.5 * line[1:2], (line[1:] + line[:-1]) / 2, 1.5 * line[-1:] - 0.5 * line[-2:-1]]
-            courses[fibre], counts[fibre] = self.pad.to_mm(np.vstack(ends)), counted / mean
-            gains[channel] = laid.own[row, 0] * mean
-        distance, weights = _trimmed(laid)
-        pressed = laid.frame.to_plan(self.learnt.places_mm)
-        return Twin(
-            self.pad,
-            tuple(
-                TwinChannel(
-                    channel,
-                    laid.fibres[own[channel]] if channel in own else None,
-                    float(gains[channel]),
-                    float(noise_v),
-                    float(self.explained[own[channel]]) if channel in own else 0.0,
-                )
-                for channel, noise_v in enumerate(self.noise_v)
-            ),
-            laid.frame,
-            distance * pitch_mm,
-            weights[0],
-            tuple(courses),
-            self.noise,
-            tuple(np.ptp(pressed, axis=0).tolist()),
-            len(self.learnt),
-            weights[1] if weights[1].any() else None,
-            tuple(counts),
-            provenance or {},
-        )
-
-
-def _trimmed(laid: LaidPad) -> tuple[Array, Array]:
-    """Distances (POINTS,), grid units, up to where a press is felt no more, and w and v there (2, POINTS)."""
-    fine = np.linspace(0, laid.end, 400)
-    felt = np.flatnonzero(np.abs(laid.weights(fine)).max(axis=0) > FELT)
-    distance = np.linspace(0, min(fine[felt[-1]] * (1 + 1 / POINTS), laid.end), POINTS)
-    weights = laid.weights(distance)
-    weights[:, -1] = 0.0
-    return distance, weights / np.abs(weights[0]).max()
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -176,20 +80,8 @@ def identify(
     compared = learnt.of(np.arange(min(PATCHES, len(learnt))))
     plan = Plan.of(pad)
     candidates = _on_plan(plan, learnt, compared, rng, report)
-    if candidates[0][0].match < LEAST_MATCH:
-        raise InputError(
-            f"the recording does not go with this pad: its fibres explain {candidates[0][0].match:.0%} of the"
-            f" responses, allowed is {LEAST_MATCH:.0%} or more"
-        )
-    laid = [(wiring, fit(bare.pad, compared, FIRST)) for wiring, bare in candidates]
-    most = max(each.evidence for _, each in laid)
-    # of those that are as good as one another, as on a pad of straight fibres, the one that is turned least
-    laid.sort(
-        key=lambda pair: (
-            abs(pair[1].pad.frame.turn_deg) if pair[1].evidence > most - ALIKE else 360,
-            -pair[1].evidence,
-        )
-    )
+    _refuse_stranger(candidates[0][0].match)
+    laid = _laid(candidates, compared)
     best = laid[0][1]
     plain = Plan.of(Morphology.straight(pad.grid, pad.pitch_mm))
     straight = [] if np.allclose(plain.course, plan.course) else _on_plan(plain, learnt, compared, rng, report)
@@ -208,6 +100,7 @@ def identify(
         full_scale_v,
         [wiring for wiring, each in laid[1:] if best.evidence - each.evidence < DOUBT],
         _explained_on_plan([bare for _, bare in straight], learnt, held_out) if straight else None,
+        _readings(recording, live, found.pad, noise_v, learnt.places_mm),
         learnt,
         held_out,
     )
@@ -227,6 +120,14 @@ def _refuse_places(places_mm: Array, pad: Morphology) -> None:
         )
 
 
+def _refuse_stranger(match: float) -> None:
+    if match < LEAST_MATCH:
+        raise InputError(
+            f"the recording does not go with this pad: its fibres explain {match:.0%} of the responses, allowed is"
+            f" {LEAST_MATCH:.0%} or more"
+        )
+
+
 def _live(certainty: Array, fibres: int) -> Indices:
     live = np.flatnonzero(certainty > LIVE)
     if not len(live):
@@ -243,6 +144,21 @@ def _on_plan(
     found = wirings(plan, learnt, rng, lambda done, of: report("wiring", done, of))[:TRIED]
     starts = [LaidPad.on_plan(plan, wiring.fibres, wiring.frame, wiring.width) for wiring in found]
     return [(wiring, fit(start, compared, Freedom())) for wiring, start in zip(found, starts, strict=True)]
+
+
+def _laid(candidates: list[tuple[Wiring, Fit]], compared: Responses) -> list[tuple[Wiring, Fit]]:
+    """The candidates with the pad fitted as laid, the most probable first.
+
+    Of those that are as good as one another, as on a pad of straight fibres, the one that is turned least comes first.
+    """
+    laid = [(wiring, fit(bare.pad, compared, FIRST)) for wiring, bare in candidates]
+    most = max(each.evidence for _, each in laid)
+
+    def rank(pair: tuple[Wiring, Fit]) -> tuple[float, float]:
+        found = pair[1]
+        return abs(found.pad.frame.turn_deg) if found.evidence > most - ALIKE else 360.0, -found.evidence
+
+    return sorted(laid, key=rank)
 
 
 def _explained_on_plan(fits: list[Fit], learnt: Responses, held_out: Responses) -> float:
@@ -274,6 +190,17 @@ def _caution(pad: LaidPad, presses: Responses) -> Array:
     noise = smooth_function(left, pad.plan.pitch_mm).noise ** 2
     alike = np.maximum(left.spread - noise, 0)
     return np.sqrt((noise + alike * max(len(presses) / PATCHES, 1)) / (noise + alike))
+
+
+def _readings(
+    recording: Recording, live: Indices, pad: LaidPad, noise_v: Array, places_mm: Array
+) -> TwinReadings | None:
+    """How readings run beside what presses answer, if that can be told."""
+    found = strengths(recording)
+    if not found:
+        return None
+    told = information(recording, live).sum() / (pad.steepness(places_mm) / noise_v[live] ** 2).sum()
+    return TwinReadings(**found, looks=float(np.clip(told, 1, MOST_LOOKS)))
 
 
 def _noise(alone: Array, pad: LaidPad, learnt: Responses, live: Indices) -> Array:

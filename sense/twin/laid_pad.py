@@ -11,23 +11,65 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from design import Morphology
+from design.pad.courses.curves import flatten
 from design.pad.twin import Frame
 from sense.recordings.processing.limits import Array, Indices
 
 from .kernels.response import along_fibre, channel_response
-from .plan import ELEMENTS, Plan
 from .responses import Responses
 
+ELEMENTS = 160
+"""Elements of a fibre."""
+FLAT = 1e-3
+"""Tolerance of the polyline they lie on, grid units."""
 SPLINES = 9
 """Splines of the reach."""
 NARROW = 0.36
 """Their distance, as a share of the standard deviation of the Gaussian reach that fits best."""
+STEP_MM = 0.5
+"""Half of the way over which is told how volts change with the place."""
 ASIDE, SENSITIVITY = 12, 8
 """Splines of a fibre's way beside its plan, and of its sensitivity."""
 SHARED, OWN = 4 + 2 * SPLINES, 2 + 2 * ASIDE + SENSITIVITY
 """Values that all channels share: the frame's, and two profiles; and those of each channel."""
 AWAY, COUNTS = slice(2, 2 + 2 * ASIDE), slice(2 + 2 * ASIDE, OWN)
 """Of the values of a channel those of its way beside the plan, in x and then in y, and of its sensitivity."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Elements of F a fibre, evenly spaced along each.
+
+    Attributes:
+        course: (2M, F, 2) their middles. tangent: (2M, F, 2) of unit length. length: (2M, F). pitch_mm, grid: as of the
+            morphology.
+    """
+
+    course: Array
+    tangent: Array
+    length: Array
+    pitch_mm: float
+    grid: int
+
+    @classmethod
+    def of(cls, pad: Morphology) -> "Plan":
+        """Of a morphology."""
+        course, tangent, length = [], [], []
+        for line in flatten(pad, FLAT):
+            run = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
+            ends = np.linspace(0, run[-1], ELEMENTS + 1)
+            points = np.column_stack([np.interp(ends, run, line[:, axis]) for axis in range(2)])
+            along = np.diff(points, axis=0)
+            size = np.hypot(*along.T)
+            course.append((points[:-1] + points[1:]) / 2)
+            tangent.append(along / size[:, None])
+            length.append(size)
+        return cls(np.array(course), np.array(tangent), np.array(length), pad.pitch_mm, pad.grid)
+
+    def to_grid(self, places_mm: Array) -> Array:
+        """(Q, 2) mm on the plan, from its middle, to grid units from its corner."""
+        return places_mm / self.pitch_mm + (self.grid + 1) / 2
 
 
 @dataclass(frozen=True)
@@ -94,6 +136,12 @@ class LaidPad:
     def predict(self, places_mm: Array) -> Array:
         """(Q, C) volts for presses (Q, 2) mm as the arm counts."""
         return self.parts(places_mm)[0]
+
+    def steepness(self, places_mm: Array) -> Array:
+        """(C,) V^2/mm^2, squares of how volts change with the place, mean over places (Q, 2) mm as the arm counts."""
+        steps = STEP_MM * np.eye(2)
+        rates = [(self.predict(places_mm + step) - self.predict(places_mm - step)) / (2 * STEP_MM) for step in steps]
+        return np.sum(np.square(rates), axis=0).mean(axis=0)
 
     def settled(self) -> "LaidPad":
         """The same pad, with what all its fibres have in common of their ways beside the plan told by the frame."""

@@ -1,16 +1,25 @@
-"""What each channel of a recording answers to each press: one number, with what came before taken off."""
+"""What each channel of a recording answers to each press: one number, with what came before taken off.
+
+That number scatters, but the other windows of the press, of the probe's sinking in and of its release, tell of the
+place once more. By how much is told by Fisher's information: J' S^-1 J, with J the change of the windows with the
+place by the response model, and S the covariance of what that model leaves of presses it has not seen.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from sense.localizer.features import DOWN, press_inputs
-from sense.localizer.response_model import ResponseModel, settled
+from sense.localizer.response_model import STEPS, ResponseModel, settled
 from sense.recordings.processing.limits import Array, Indices, Mask
 from sense.recordings.recording import Recording
 
 HELD = 3
 """First window of the press that counts as held: the tip has come to rest in the silicone."""
+HOLD = np.array([(end - first) * (k >= HELD) for k, (first, end) in enumerate(DOWN)], float)
+HOLD /= HOLD.sum()
+"""(9,) what makes one number of the windows of a press."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +66,51 @@ def responses(recording: Recording, learnt: Mask) -> Responses:
     known = recording.known
     inputs = press_inputs(recording.readings, recording.begun[known], recording.lifted[known], "causal")
     places = recording.presses_mm[known]
-    middle = (places.min(axis=0) + places.max(axis=0)) / 2
-    about = (places - middle) / np.abs(places - middle).max()
+    about = _about(places)
     model = ResponseModel.fit(about[learnt], inputs.windows[learnt], inputs.history[learnt], inputs.alive[learnt])
     windows = settled(inputs.windows, inputs.history, model.memory, model.usual)
-    widths = np.array([end - first for first, end in DOWN[HELD:]], float)
-    return Responses(places, windows[:, :, HELD:] @ (widths / widths.sum()), inputs.alive)
+    return Responses(places, windows @ HOLD, inputs.alive)
+
+
+def information(recording: Recording, channels: Indices) -> Array:
+    """(C',) 1/mm^2, what all windows of a press tell of its place: Fisher's information, mean over all places.
+
+    Args:
+        channels: (C',) which ones, each by the presses in which it gave enough readings.
+    """
+    known = recording.known
+    inputs = press_inputs(recording.readings, recording.begun[known], recording.lifted[known], "full")
+    places = _about(recording.presses_mm[known])
+    side_mm = np.ptp(recording.presses_mm[known], axis=0).max()
+    told = []
+    for channel in channels.tolist():
+        there = inputs.alive[:, channel]
+        told.append(_told(places[there], inputs.windows[there, channel], inputs.history[there, channel]))
+    return np.array(told) * (2 / side_mm) ** 2
+
+
+def _told(places: Array, windows: Array, history: Array) -> float:
+    """Fisher's information, of places (Q, 2) within [-1, 1], in windows (Q, F) V after a history (Q, J) V.
+
+    Of two response models, each of half the presses, what is left over of the other half and the product of their
+    slopes are taken: noise that a model takes for a slope is not in the other one.
+    """
+    windows, history, alive = windows[:, None], history[:, None], np.ones((len(places), 1), bool)
+    grid, odd = np.linspace(-1, 1, STEPS + 1), np.arange(len(places)) % 2 == 1
+    left, tables = np.empty_like(windows), []
+    for seen in (odd, ~odd):
+        model = ResponseModel.fit(places[seen], windows[seen], history[seen], alive[seen])
+        expected = RegularGridInterpolator((grid, grid), model.table)(places[~seen])
+        left[~seen] = settled(windows[~seen], history[~seen], model.memory, model.usual) - expected
+        tables.append(model.table[:, :, 0])
+    precision, told = np.linalg.inv(np.cov(left[:, 0].T)), 0.0
+    for axis in (0, 1):
+        one, other = (np.asarray(np.gradient(table, 2 / STEPS, axis=axis)) for table in tables)
+        told += float(np.einsum("xyf,fg,xyg->xy", one, precision, other).mean())
+    return max(told, 0.0)
+
+
+def _about(places_mm: Array) -> Array:
+    """(Q, 2) places to the square [-1, 1] about all of them."""
+    middle = (places_mm.min(axis=0) + places_mm.max(axis=0)) / 2
+    return (places_mm - middle) / np.abs(places_mm - middle).max()

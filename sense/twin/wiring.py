@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from design.pad.twin import Frame
 from sense.recordings.processing.limits import Array, Mask
 
-from .plan import Plan
+from .laid_pad import Plan
 from .responses import Responses
 
 WIDTH = 0.55

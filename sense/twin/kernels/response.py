@@ -69,16 +69,14 @@ def channel_response(
     end = (splines + 1) * step
     signal, by_profile, by_place = np.zeros(presses), np.zeros((presses, 2, splines)), np.zeros((presses, 2))
     by_aside, by_sensitivity = np.zeros((presses, 2, aside.shape[1])), np.zeros((presses, sensitivity.shape[1]))
-    off, off_first, off_share = along_fibre(aside, elements)
+    (off, off_first, off_share), here = along_fibre(aside, elements), np.empty((2, 4))
     gain, gain_first, gain_share = along_fibre(sensitivity, elements)
-    here = np.empty((2, 4))
     for i in range(elements):
         at_x, at_y = course[i, 0] + off[0, 0, i], course[i, 1] + off[0, 1, i]
         tx, ty = length[i] * tangent[i, 0] + off[1, 0, i], length[i] * tangent[i, 1] + off[1, 1, i]
         laid = math.sqrt(tx * tx + ty * ty)
         tx, ty = tx / laid, ty / laid
-        factor = math.exp(gain[0, 0, i])
-        counts = factor * laid
+        factor, counts = math.exp(gain[0, 0, i]), math.exp(gain[0, 0, i]) * laid
         for q in range(presses):
             x, y = at_x - places[q, 0], at_y - places[q, 1]
             square = x * x + y * y
@@ -102,13 +100,13 @@ def channel_response(
             pull = counts * rate / (step * max(far, 1e-9))
             twist = counts * turning * 4 * along / (square + CENTRE)
             shrink = pull - twist * along / (square + CENTRE)
-            rate_x, rate_y = shrink * x + twist * tx, shrink * y + twist * ty
-            by_place[q, 0] -= rate_x
-            by_place[q, 1] -= rate_y
-            stretch_x = factor * weight * tx + twist * (x - along * tx) / laid
-            stretch_y = factor * weight * ty + twist * (y - along * ty) / laid
+            for axis in range(2):
+                aim, way = (tx, x) if axis == 0 else (ty, y)
+                moved = shrink * way + twist * aim
+                stretched = factor * weight * aim + twist * (way - along * aim) / laid
+                by_place[q, axis] -= moved
+                for j in range(4):
+                    by_aside[q, axis, off_first[i] + j] += moved * off_share[0, i, j] + stretched * off_share[1, i, j]
             for j in range(4):
-                by_aside[q, 0, off_first[i] + j] += rate_x * off_share[0, i, j] + stretch_x * off_share[1, i, j]
-                by_aside[q, 1, off_first[i] + j] += rate_y * off_share[0, i, j] + stretch_y * off_share[1, i, j]
                 by_sensitivity[q, gain_first[i] + j] += counts * weight * gain_share[0, i, j]
     return signal, by_profile, by_aside, by_sensitivity, by_place

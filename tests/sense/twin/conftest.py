@@ -5,7 +5,7 @@ import pytest
 
 from design import Morphology
 from design.pad.twin import Twin
-from sense.twin.printed_worlds import printed_pad
+from sense.twin.benchmark import printed_pad
 from sense.twin.responses import Responses
 
 PLAN = Morphology.random(2, knots=3, seed=5)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sense.twin.fitting import Freedom, fit
-from sense.twin.laid_pad import AWAY, COUNTS, LaidPad
-from sense.twin.plan import Plan
+from sense.twin.laid_pad import AWAY, COUNTS, LaidPad, Plan
 
 from .conftest import PLAN, responses_of
 

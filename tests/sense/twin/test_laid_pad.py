@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from design.pad.twin import Frame
-from sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, own_values
-from sense.twin.plan import Plan
+from sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, Plan, own_values
 
 from .conftest import PLAN
 
@@ -31,6 +30,13 @@ def test_derivatives_are_those_of_the_prediction(pad):
             columns = np.concatenate([np.arange(SHARED), own_values(channel)])
             found = rates[channel][:, columns == at].sum(axis=1)
             assert slope[:, channel] == pytest.approx(found, abs=1e-6)
+
+
+def test_steepness_is_how_far_volts_change_with_the_place(pad):
+    far, mm = np.zeros((40, 3)), 1e-3
+    for step in mm * np.eye(2):
+        far += ((pad.predict(PLACES + step) - pad.predict(PLACES)) / mm) ** 2
+    assert pad.steepness(PLACES) == pytest.approx(far.mean(axis=0), rel=0.05)
 
 
 def test_the_reach_is_1_at_its_largest_whatever_was_fitted(pad):

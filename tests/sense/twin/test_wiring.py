@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sense.twin.plan import Plan
+from sense.twin.laid_pad import Plan
 from sense.twin.responses import Responses
 from sense.twin.wiring import assigned, wirings
 

@@ -1,0 +1,51 @@
+"""How much presses tell of their place, against what is known of a simulated pad."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from design import Twin
+from design.pad.twin import TwinReadings
+from sense import Recording, RigSettings, simulate
+from sense.twin.responses import information
+
+QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
+
+
+def known_information(twin: Twin, places_mm: np.ndarray) -> np.ndarray:
+    """(C',) 1/mm^2 of the live channels: squares of how answers change with the place, over their noise."""
+    live = [channel for channel in twin.channels if channel.fibre is not None]
+    steps = [twin.laid_signals(places_mm + step) - twin.laid_signals(places_mm - step) for step in 0.5 * np.eye(2)]
+    slopes = np.sum(np.square(steps), axis=0).mean(axis=0)
+    return np.array([slopes[c.fibre] * (c.gain_v / c.noise_v) ** 2 for c in live])
+
+
+@pytest.fixture(scope="module")
+def noisy(printed: Twin) -> Twin:
+    """As noisy as pads are that were built, which is more than what the response model smooths away."""
+    channels = tuple(replace(channel, noise_v=4 * channel.noise_v) for channel in printed.channels)
+    return replace(printed, channels=channels, readings=QUIET)
+
+
+@pytest.fixture(scope="module")
+def recording(noisy: Twin) -> Recording:
+    return simulate(noisy, RigSettings(presses=1000, creep=0))
+
+
+def test_where_all_of_a_press_deviates_alike_it_tells_what_its_answer_tells(noisy: Twin, recording: Recording) -> None:
+    live = np.flatnonzero([channel.fibre is not None for channel in noisy.channels])
+    found = information(recording, live)
+    known = known_information(noisy, recording.presses_mm[:200])
+    assert found.sum() == pytest.approx(known.sum(), rel=0.2)
+    assert found == pytest.approx(known, rel=0.6)
+
+
+def test_presses_in_which_a_channel_gave_nothing_do_not_count(noisy: Twin, recording: Recording) -> None:
+    channel = next(c.channel for c in noisy.channels if c.fibre is not None)
+    readings = np.array(recording.readings)
+    readings[: recording.begun[300], channel] = np.nan
+    presses = {name: getattr(recording, name) for name in ("presses_mm", "begun", "lifted")}
+    spoilt = Recording(readings, recording.times_s, **presses)
+    only = np.array([channel])
+    assert information(spoilt, only) == pytest.approx(information(recording, only), rel=0.35)
