@@ -6,8 +6,7 @@ as well: `padforge.search`, `padforge.build`, `padforge.calibrate`, with the set
 
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -211,6 +210,7 @@ def _check_ahead(spec: "Spec", out: Path) -> None:
 
 def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     """All stages into `out`, each with its summary on stdout; the exit code: 0, 1 if a rule or check fails, or 130."""
+    from design.report.contact_section import compare_contacts, contact_line
     from design.report.files import run_search, search_lines
     from fabricate import FabricationSettings, build
     from fabricate.cli import mould_lines
@@ -235,6 +235,7 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     click.echo(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {recorded}")
     calibration = run_calibration(spec, recording, out, seeds)
     click.echo("\n".join(f"  {line}" for line in calibration_lines(calibration)))
+    click.echo(contact_line(compare_contacts(spec, found.morphology, out, seed)))
     return int(bool(found.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))
 
 
@@ -244,8 +245,9 @@ def write_report(folder: Path) -> Path:
     Raises:
         InputError: no stage has left anything, or a file is damaged.
     """
-    from design.common.files import read_json, write_text
+    from design.common.files import as_written, read_json, write_text
     from design.common.page.elements import PageSection, page
+    from design.report.contact_section import contact_sections
     from design.report.sections import design_sections, provenance_row, provenance_section
     from fabricate.report.sections import fabrication_sections
     from sense.report import sections as sensed
@@ -258,18 +260,19 @@ def write_report(folder: Path) -> Path:
         ("identification", folder / "identification.json", identification_sections),
         ("calibration", folder / "calibration.json", sensed.calibration_sections),
         ("fibre-loss", folder / "fibre_loss.json", sensed.fibre_loss_sections),
+        ("contacts", folder / "contacts.json", contact_sections),
     )
     sections: list[PageSection] = []
     origins: list[list[object]] = []
     for name, path, made_of in stages:
         if path.exists():
             document = read_json(path, f"padforge-{name}/1")
-            with _as_written(path):
+            with as_written(path):
                 sections += made_of(folder, document)
                 origins.append(provenance_row(folder, name, document))
     studies: list[str] = []
     for path, document in sensed.find_studies(folder):
-        with _as_written(path):
+        with as_written(path):
             studies += sensed.study_pieces(path, document)
             origins.append(provenance_row(folder, f"study {path.stem}", document))
     if not origins:
@@ -280,17 +283,6 @@ def write_report(folder: Path) -> Path:
     title = f"Pad report: {folder.resolve().name}"
     write_text(folder / "report.html", page(title, lead, [*sections, provenance_section(origins)]))
     return folder / "report.html"
-
-
-@contextmanager
-def _as_written(path: Path) -> Iterator[None]:
-    """Blame a document that is not as padforge writes it on its file."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"{path}: not as padforge writes it ({error!r})") from error
 
 
 def main() -> None:

@@ -141,6 +141,17 @@ UNFINISHED = ".unfinished-"
 
 
 @contextmanager
+def as_written(path: Path) -> Iterator[None]:
+    """Blame a document that is not as padforge writes it on its file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{path}: not as padforge writes it ({error!r})") from error
+
+
+@contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turn what the system has against writing `path` into one line.
 

@@ -49,7 +49,7 @@ def test_run_makes_everything(chain):
     assert names >= {
         *("morphology.json", "design.json", "design.svg", "design.png"),
         *("mould.stl", "mould.step", "tracks.svg", "mould.png", "tracks.png", "laying.md", "fabrication.json"),
-        *("recording", "localizer.safetensors", "localizer.json", "calibration.json"),
+        *("recording", "localizer.safetensors", "localizer.json", "calibration.json", "contacts.json"),
         *("error_map.png", "error_by_loss.png", "report.html"),
     }
     mesh = trimesh.load_mesh(out / "mould.stl")
@@ -64,6 +64,15 @@ def test_run_makes_everything(chain):
         document = json.loads((out / f"{name}.json").read_text())
         assert document["format"] == f"padforge-{name}/{2 if name == 'localizer' else 1}"
         assert set(document["provenance"]) >= {"command", "seed", "versions", "inputs"}
+
+
+def test_errors_are_told_under_other_contacts_than_the_one_believed(chain):
+    folder, result = chain
+    document = json.loads((folder / "out/pad/contacts.json").read_text())
+    assert {row["pad"] for row in document["rows"]} == {"designed", "straight"}
+    assert len(document["rows"]) == 8
+    assert all(len(row["errors_mm"]) == 4 and 0 < min(row["errors_mm"]) < 20 for row in document["rows"])
+    assert result.out.count("\ncontact: the pad errs by ") == 1
 
 
 def test_the_report_is_one_page_with_its_pictures(chain):

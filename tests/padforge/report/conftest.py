@@ -11,7 +11,14 @@ from design.report.plan_drawing import draw_plan
 from design.settings import Contact
 from fabricate import build
 from padforge import write_report
-from tests.padforge.report.documents import PAD, calibration_document, design_document, study_document, written
+from tests.padforge.report.documents import (
+    PAD,
+    calibration_document,
+    contacts_document,
+    design_document,
+    study_document,
+    written,
+)
 
 
 @pytest.fixture(scope="session")
@@ -23,6 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_figure(draw_plan(PAD, Contact()), folder / "design.svg")
     written(folder / "design.json", design_document())
     written(folder / "calibration.json", calibration_document())
+    written(folder / "contacts.json", contacts_document())
     source = {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}}
     made_by = provenance("padforge sense record")
     start = {"format": "padforge-recording/1", "fibres": 4, "source": source, "provenance": made_by}

@@ -53,6 +53,14 @@ def calibration_document() -> dict:
     }
 
 
+def contacts_document() -> dict:
+    """Of a pad that errs by half as much as straight fibres, but not under the published disc."""
+    errors = {("as believed", "designed"): [0.5, 0.75], ("as believed", "straight"): [1.0, 1.5]}
+    errors |= {("published disc, K = 0.6", "designed"): [4.0, 6.0], ("published disc, K = 0.6", "straight"): [3.0, 5.0]}
+    rows = [{"contact": contact, "pad": pad, "errors_mm": each} for (contact, pad), each in errors.items()]
+    return {"format": "padforge-contacts/1", "noise": 0.02, "rows": rows, "provenance": provenance("padforge run")}
+
+
 def study_document() -> dict:
     return {
         "format": "padforge-study-drift/1",

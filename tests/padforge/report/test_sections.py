@@ -10,8 +10,16 @@ from markupsafe import escape
 
 from design.common.errors import InputError
 from design.common.files import provenance
+from design.report.contact_section import contact_line
 from padforge import write_report
-from tests.padforge.report.documents import HOSTILE, design_document, errors, study_document, written
+from tests.padforge.report.documents import (
+    HOSTILE,
+    contacts_document,
+    design_document,
+    errors,
+    study_document,
+    written,
+)
 
 MOST_PAGE_BYTES = 8_000_000
 
@@ -19,8 +27,8 @@ MOST_PAGE_BYTES = 8_000_000
 def test_every_stage_has_its_section_and_a_link_to_it(page: Path) -> None:
     text = page.read_text()
     titles = re.findall(r'<h2 id="(.*?)">(.*?)</h2>', text)
-    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Studies", "Provenance"]
-    assert [title for _, title in titles] == names
+    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "The contact believed"]
+    assert [title for _, title in titles] == [*names, "Studies", "Provenance"]
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
     assert text.count("data:image/") == 4  # plan, mould, tracks, and the study's figure
     assert page.stat().st_size < MOST_PAGE_BYTES
@@ -165,3 +173,14 @@ def test_a_torn_picture_is_named(pad: Path) -> None:
     (pad / "mould.png").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"mould\.png: not a picture"):
         write_report(pad)
+
+
+def test_errors_stand_by_the_contact_believed(page: Path) -> None:
+    assert contact_line(contacts_document()) == (
+        "contact: the pad errs by 0.50 mm as believed, 4.00 to 4.00 mm otherwise; straight fibres by 1.00 mm as"
+        " believed, 3.00 to 3.00 mm otherwise"
+    )
+    section = page.read_text().split("The contact believed</h2>")[1].split("</section>")[0]
+    rows = [re.findall(r"<td.*?>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section, re.S)]
+    assert ["published disc, K = 0.6", "designed", "4.00", "6.00"] in rows
+    assert len([row for row in rows if row]) == 4
