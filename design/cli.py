@@ -138,6 +138,7 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     """
     from design.criteria.rules import check_rules
     from design.criteria.score import score as score_terms
+    from design.evaluation.expected_error import error_terms, expected_errors
     from design.pad.morphology import Morphology
     from design.report.twin_settings import settings_for_twin
 
@@ -148,6 +149,9 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
         settings = settings_for_twin(settings, twin, pad)
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
     size = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm)
-    terms = score_terms(pad, settings.section(Contact), search.lost, search.noise, rules, size.sensed_mm)
+    asked = settings.section(Contact), search.lost, search.noise
+    terms = score_terms(pad, *asked, rules, size.sensed_mm)
+    if search.method == "error":
+        terms |= error_terms(expected_errors(pad, *asked, size.sensed_mm))
     found = [asdict(violation) for violation in check_rules(pad, rules)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)

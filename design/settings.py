@@ -170,8 +170,8 @@ Lost = Annotated[
 
 
 NOISE = 0.05
-"""What an ambiguity can tell: the built pad's responses scatter by 0.01 to 0.02 of full scale, but at that no confusions
-are left among presses a fifth of a grid unit apart."""
+"""What an ambiguity can tell: the built pad's responses scatter by 0.01 to 0.02 of full scale, but at that
+no confusions are left among presses a fifth of a grid unit apart."""
 
 
 class SearchSettings(Settings):

@@ -54,7 +54,7 @@ class GradientSearch:
     Attributes:
         step: steps done. objective: what is minimised, but for the rules, at the last step. done: whether nothing is
             left to do.
-        scale: full scale of the signals, grid units.
+        scale: full scale of the signals of the first pad, grid units.
     """
 
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
@@ -208,8 +208,13 @@ class GradientSearch:
         return measure
 
     def _expected_error(self) -> Measure:
-        """The expected error on presses, losses and noise drawn once for all contacts of a step."""
+        """The expected error on presses, losses and noise drawn once for all contacts of a step.
+
+        Noise is a share of full scale, which passes from that of the first pad to that of the pad itself: with its own
+        from the beginning fibres hardly leave their straight course, and with the first to the end mere length counts.
+        """
         search, pad = self.problem.search, self.problem.pad
+        own = self.step / search.steps
         places, step = two_lattices(pad.sensed, self.rng)
         kept, weight = draw_losses(2 * pad.grid, balanced(loss_shares(search.lost)), self.rng)
         white = self.rng.standard_normal((2 * pad.grid, len(places)))
@@ -218,8 +223,9 @@ class GradientSearch:
         )
 
         def measure(signals_at: SignalsAt, noise: float) -> Tensor:
-            found = signals_at(places).to(search.device) / self.scale
-            return expected_error(found, there, apart, losses, shares, heard, noise)
+            found = signals_at(places).to(search.device)
+            scale = self.scale ** (1 - own) * found.amax(dim=1).mean() ** own
+            return expected_error(found / scale, there, apart, losses, shares, heard, noise)
 
         return measure
 

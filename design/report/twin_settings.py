@@ -1,5 +1,6 @@
 """Settings to design by what presses have shown of a printed pad."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,11 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         {
             "pad": own | stated | {"sensed_mm": [min(side, most) for side in twin.sensed_mm]},
             "contact": twin.contact(size.pitch_mm).model_dump(),
-            "search": {**(SEARCH if method == SEARCH["method"] else {}), **given, "noise": twin.noise},
+            "search": {**(SEARCH if method == SEARCH["method"] else {}), **given, "noise": _noise(twin)},
         }
     )
+
+
+def _noise(twin: Twin) -> float:
+    """What blurs a place by all that is read of a press: its onset and release tell of it besides how it is held."""
+    return twin.noise / math.sqrt(twin.readings.looks) if twin.readings else twin.noise

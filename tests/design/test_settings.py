@@ -120,7 +120,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     search = SearchSettings().model_dump()
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
-    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.015, 0.0)
+    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.05, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -116,3 +116,16 @@ def test_each_further_rule_is_kept(rules, as_usual):
     asked = RulesSettings(**rules)
     assert check_rules(as_usual, asked) != []
     assert check_rules(found_within(asked), asked) == []
+
+
+def test_noise_passes_from_a_share_of_the_first_full_scale_to_one_of_the_pads_own():
+    settings = SearchSettings(method="error", knots=3, starts=1, steps=1000)
+
+    def objective(step: int, louder: float) -> float:
+        run = gradient_search.GradientSearch(SearchProblem(PadSettings(), (Contact(),), settings, RulesSettings()), 0)
+        run.step, run.scale = step, louder * run.scale
+        run.advance(1)
+        return run.objective
+
+    assert objective(0, 2.0) > 1.2 * objective(0, 1.0)
+    assert objective(999, 2.0) == pytest.approx(objective(999, 1.0), rel=0.01)
