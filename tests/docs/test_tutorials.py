@@ -26,7 +26,7 @@ from tests.docs.pages import BLOCK, ROOT, relative
 from tests.helpers.effort import few
 from tests.stress.door import call
 
-TUTORIALS = [ROOT / "docs" / f"tutorial-{stage}.md" for stage in ("design", "fabricate", "sense", "study")]
+TUTORIALS = [ROOT / "docs" / f"tutorial-{stage}.md" for stage in ("design", "fabricate", "sense", "study", "twin")]
 REWRITE = "REWRITE_DOCS" in os.environ
 SHORTER = 1 if REWRITE or few(1).max_examples > 1 else 10
 """What finds faults learns for this share of its time, which no page shows, but in the stress profile."""
