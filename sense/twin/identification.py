@@ -143,7 +143,8 @@ def _on_plan(
     """The wirings that go best with the presses, best first, each with the pad fitted that lies on its plan."""
     found = wirings(plan, learnt, rng, lambda done, of: report("wiring", done, of))[:TRIED]
     starts = [LaidPad.on_plan(plan, wiring.fibres, wiring.frame, wiring.width) for wiring in found]
-    return [(wiring, fit(start, compared, Freedom())) for wiring, start in zip(found, starts, strict=True)]
+    fits = [fit(start.with_gains(compared), compared, Freedom()) for start in starts]
+    return list(zip(found, fits, strict=True))
 
 
 def _laid(candidates: list[tuple[Wiring, Fit]], compared: Responses) -> list[tuple[Wiring, Fit]]:

@@ -7,6 +7,7 @@ import pytest
 
 from design.pad.twin import Frame
 from sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, Plan, own_values
+from sense.twin.responses import Responses
 
 from .conftest import PLAN
 
@@ -61,3 +62,11 @@ def test_what_all_fibres_share_of_their_way_is_the_frames(pad):
 def test_a_turn_that_all_fibres_share_is_the_frames(pad):
     turned = pad.settled()
     assert turned.predict(PLACES) == pytest.approx(pad.predict(PLACES), abs=0.02 * np.ptp(pad.predict(PLACES)))
+
+
+def test_gains_and_rests_are_those_of_the_answers(pad):
+    own = pad.own[:, :2].copy()
+    answers = Responses(PLACES, pad.predict(PLACES), np.ones((40, 3), bool))
+    other = pad.values.copy()
+    other[SHARED:].reshape(-1, OWN)[:, :2] = [1.0, 0.0]
+    assert replace(pad, values=other).with_gains(answers).own[:, :2] == pytest.approx(own)
