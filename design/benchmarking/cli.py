@@ -28,7 +28,8 @@ def bench_command(benches: Mapping[str, str]) -> click.Command:
 
         \b
         padforge bench                                all of them, some minutes
-        padforge bench contact filter                 of contact, objective, search, networks, filter, localizer, mould
+        padforge bench contact filter                 of contact, objective, search, networks, filter,
+                                                      localizer, twin, mould
         padforge bench --against before/bench.json    what has become slower or less accurate, by ratio
 
         Writes NAME.json, NAME.csv and NAME.png for each, and bench.json and bench.csv with the summary.

@@ -21,6 +21,15 @@ def lost_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...
     return sorted(drawn)
 
 
+def loss_masks(fibres: int, lost: int, most: int) -> Array:
+    """`lost_subsets` as masks (L, 2M): 1 for a fibre that works, 0 for a lost one."""
+    losses = lost_subsets(fibres, lost, most)
+    kept = np.ones((len(losses), fibres))
+    for row, loss in enumerate(losses):
+        kept[row, list(loss)] = 0
+    return kept
+
+
 def loss_shares(lost: int | tuple[float, ...]) -> tuple[float, ...]:
     """P(k), k = 0, 1, ...: equal up to a number of lost fibres, or the given weights scaled to the sum 1."""
     weights = (1.0,) * (lost + 1) if isinstance(lost, int) else lost

@@ -18,7 +18,7 @@ from design.settings import (
     sensed_rectangle,
 )
 
-from .fibre_loss import loss_shares, lost_subsets
+from .fibre_loss import loss_masks, loss_shares
 from .information import idle_share, information
 from .published_objective import published_terms
 
@@ -46,11 +46,8 @@ def ambiguities(
     fibres = 2 * pad.grid
     spread = []
     for k in range(min(len(loss_shares(lost)), fibres)):
-        losses = lost_subsets(fibres, k, MOST_LOSSES)
-        kept = torch.ones(len(losses), fibres)
-        for row, loss in enumerate(losses):
-            kept[row, list(loss)] = 0
-        equal = torch.full((len(losses),), 1 / len(losses))
+        kept = torch.tensor(loss_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)
+        equal = torch.full((len(kept),), 1 / len(kept))
         spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
     return spread
 

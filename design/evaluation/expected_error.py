@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from design.criteria.ambiguity import full_scale
-from design.criteria.fibre_loss import loss_shares, lost_subsets
+from design.criteria.fibre_loss import loss_masks, loss_shares
 from design.pad.contact import signals as exact_signals
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
@@ -49,18 +49,16 @@ def expected_errors(
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     rectangle = sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm)
-    errors = np.zeros((PAIRS, min(len(loss_shares(lost)), fibres)))
+    levels = range(min(len(loss_shares(lost)), fibres))
+    masks = [torch.tensor(loss_masks(fibres, k, MOST_LOSSES)) for k in levels]
+    errors = np.zeros((PAIRS, len(masks)))
     for pair in errors:
         places, step = two_lattices(rectangle, rng)
         found = torch.tensor(exact_signals(pad, places, contact).T)
         white = torch.tensor(rng.standard_normal(found.shape))
         given = found / full_scale(found), torch.tensor(places), torch.tensor(step)
-        for k in range(len(pair)):
-            losses = lost_subsets(fibres, k, MOST_LOSSES)
-            kept = torch.ones(len(losses), fibres, dtype=torch.float64)
-            for row, loss in enumerate(losses):
-                kept[row, list(loss)] = 0
-            equal = torch.full((len(losses),), 1 / len(losses), dtype=torch.float64)
+        for k, kept in enumerate(masks):
+            equal = torch.full((len(kept),), 1 / len(kept), dtype=torch.float64)
             pair[k] = expected_error(*given, kept, equal, white, noise).item()
     return errors.mean(axis=0).tolist()
 
@@ -76,15 +74,25 @@ def balanced(shares: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(weight / sum(weights) for weight in weights)
 
 
+def cells(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """SIDE x SIDE cells over a part of what is pressed, all of it unless it is large.
+
+    Returns:
+        Low corner and size (2,) of the part, grid units, and column and row (SIDE^2, 2) of each cell.
+    """
+    low, high = np.array(rectangle)
+    size = np.minimum(high - low, WINDOW)
+    corner = low + rng.random(2) * (high - low - size)
+    side = np.arange(SIDE, dtype=float)
+    return corner, size, np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+
+
 def two_lattices(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array]:
     """Presses (2 SIDE^2, 2) on two lattices, each shifted by up to a cell, and their step (2,), grid units.
 
     They lie over a part of what is pressed, all of it unless it is large.
     """
-    low, high = np.array(rectangle)
-    size = np.minimum(high - low, WINDOW)
-    corner = low + rng.random(2) * (high - low - size)
-    cell = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+    corner, size, cell = cells(rectangle, rng)
     return corner + size * np.concatenate([cell + rng.random(2) for _ in range(2)]) / SIDE, size / SIDE
 
 

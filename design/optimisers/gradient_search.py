@@ -21,7 +21,7 @@ from design.criteria.differentiable import pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
 from design.criteria.rules import check_rules
-from design.evaluation.expected_error import balanced, expected_error, two_lattices
+from design.evaluation.expected_error import SIDE, balanced, cells, expected_error, two_lattices
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
 from design.settings import Rectangle
@@ -29,9 +29,7 @@ from design.settings import Rectangle
 from .parametrization import Fibres, border_of, first_course, nearly_straight
 from .problem import SearchProblem
 
-SIDE = 14  # presses per row and column of the stratified sample a step looks at
 SCALE_SIDE = 24  # presses per row and column by which full scale is known
-WINDOW = 5.0  # side of the part of the pad a step looks at, grid units: presses further apart are seldom confused
 LOUDER = 2.0  # noise of the first step as a multiple of the last one's
 RATE = 0.02
 PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
@@ -236,8 +234,5 @@ class GradientSearch:
 
 def stratified(rectangle: Rectangle, rng: np.random.Generator) -> NDArray[np.float64]:
     """One press in each of SIDE x SIDE cells over a part of what is pressed, (SIDE^2, 2): all of it unless large."""
-    low, high = np.array(rectangle)
-    size = np.minimum(high - low, WINDOW)
-    corner = low + rng.random(2) * (high - low - size)
-    cell = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+    corner, size, cell = cells(rectangle, rng)
     return corner + size * (cell + rng.random(cell.shape)) / SIDE

@@ -24,7 +24,7 @@ from .morphology import Morphology
 FORMAT = "padforge-twin/1"
 MOST_VOLTS, MOST_MM = 1e3, 1e4
 MOST_LOOKS = 1e3
-MOST_CHANNELS, MOST_POINTS = 1024, 64
+MOST_CHANNELS = 1024
 LONGEST = 0.02
 """Longest element by which a laid fibre is summed, grid units."""
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from design.common.files import provenance, write_json
 from design.common.page.elements import PageSection, paragraph, table
 from design.common.profiling import stage
-from design.evaluation.contacts_believed import NOISE, contacts_in_question, errors_by_contact
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, SearchSettings
 
@@ -26,6 +25,8 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     Returns:
         The document: rows of contact, pad and mean errors in mm with 0, 1, ... fibres lost.
     """
+    from design.evaluation.contacts_believed import NOISE, contacts_in_question, errors_by_contact
+
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm)
     believed = spec.section(Contact) if spec.given(Contact) else settings.usual_contact

@@ -3,18 +3,20 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from design.common.files import provenance, refuse_unwritable, staged, write_json
 from design.common.page.elements import PageSection, figures, paragraph, table
 from design.common.profiling import stage
-from design.pad.morphology import Morphology
 from sense.recordings.processing.limits import Array, Mask
-from sense.recordings.recording import Recording
-from sense.twin.identification import identify
-from sense.twin.identified_pad import Identification
+
+if TYPE_CHECKING:
+    from design.pad.morphology import Morphology
+    from design.pad.twin import Twin
+    from sense.recordings.recording import Recording
+    from sense.twin.identified_pad import Identification
 
 FORMAT = "padforge-identification/1"
 STRANGER = 0.02
@@ -23,8 +25,8 @@ COMMAND = "padforge sense identify"
 
 
 def identify_into(
-    recording: Recording,
-    pad: Morphology,
+    recording: "Recording",
+    pad: "Morphology",
     out: Path,
     seed: int = 0,
     *,
@@ -38,11 +40,14 @@ def identify_into(
     Raises:
         InputError: as `identify`, or `out` cannot be written.
     """
+    from sense.twin.identification import identify  # here, so that a report that only tells of it does without
+
     refuse_unwritable(out)
     with stage("identify"):
         found = identify(recording, pad, seed, report)
     origin = provenance(COMMAND, seed, inputs or [])
-    twin, document = found.twin(origin), identification_document(found) | {"provenance": origin}
+    twin = found.twin(origin)
+    document = identification_document(found, twin) | {"provenance": origin}
     with staged(out) as folder, stage("figures"):
         from .identification_figures import draw_laid_plan, draw_responses
 
@@ -53,9 +58,9 @@ def identify_into(
     return document
 
 
-def identification_document(found: Identification) -> dict[str, Any]:
-    """What was found, as JSON: fibres count from 0, None where no fibre explains a channel."""
-    twin, laid = found.twin(), found.laid_mm()
+def identification_document(found: "Identification", twin: "Twin") -> dict[str, Any]:
+    """What was found, and told as a twin, as JSON: fibres count from 0, None where no fibre explains a channel."""
+    laid = found.laid_mm()
     return {
         "format": FORMAT,
         "presses": len(found.learnt),
@@ -76,7 +81,7 @@ def identification_document(found: Identification) -> dict[str, Any]:
     }
 
 
-def _laid(found: Identification, laid: Sequence[tuple[Array, Array, Mask]], channel: int) -> dict[str, float]:
+def _laid(found: "Identification", laid: Sequence[tuple[Array, Array, Mask]], channel: int) -> dict[str, float]:
     """How far the fibre of a channel lies beside its plan within what was pressed, and how sure that is, mm."""
     rows = np.flatnonzero(found.live == channel)
     if not len(rows):
@@ -87,7 +92,7 @@ def _laid(found: Identification, laid: Sequence[tuple[Array, Array, Mask]], chan
     return {"aside_mm": float(np.sqrt((aside[within] ** 2).mean())), "unsure_mm": float(unsure[within].mean())}
 
 
-def _others(found: Identification, channel: int) -> list[int]:
+def _others(found: "Identification", channel: int) -> list[int]:
     """Fibres that a channel may read as well, by the wirings that cannot be told from the one found."""
     rows = np.flatnonzero(found.live == channel)
     if not len(rows):

@@ -21,8 +21,8 @@ from .smooth import smooth_function
 from .wiring import Wiring, wirings
 
 LEAST_PRESSES = 60
-LEAST_SIDE = 1.0
-"""Least width and height of what was pressed, as a share of half the square on which fibres lie."""
+LEAST_SIDE = 0.5
+"""Least width and height of what was pressed, as a share of the square half a pitch beyond the outermost fibres."""
 HELD_OUT = 0.15
 """Share of the presses that are kept back to say how much is explained."""
 MOST_PRESSES = 2000
@@ -113,7 +113,7 @@ def _refuse_places(places_mm: Array, pad: Morphology) -> None:
             f"the recording has {len(places_mm)} presses of known place, allowed are {LEAST_PRESSES} or more"
         )
     width, height = np.subtract(*np.quantile(places_mm, [0.95, 0.05], axis=0))
-    least = LEAST_SIDE * pad.grid * pad.pitch_mm / 2
+    least = LEAST_SIDE * pad.grid * pad.pitch_mm
     if min(width, height) < least:
         raise InputError(
             f"the presses lie within {width:.0f} x {height:.0f} mm, allowed is what spans {least:.0f} mm both ways"

@@ -5,7 +5,7 @@ of squared correlations of one sign, each channel given another fibre (the assig
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -77,8 +77,7 @@ class Matcher:
         if self._there.all():
             return _centred(signals).T @ self._volts
         columns = [
-            _centred(np.where(self._there[:, c, None], signals, np.nan), self._there[:, c, None]).T @ self._volts[:, c]
-            for c in range(self._volts.shape[1])
+            _centred(signals, self._there[:, c, None]).T @ self._volts[:, c] for c in range(self._volts.shape[1])
         ]
         return np.column_stack(columns)
 
@@ -115,8 +114,8 @@ def wirings(
     tried = []
     for mirrored, quarter, x, y in product((False, True), range(4), SHIFTS, SHIFTS):
         lying = Frame(mirrored, 90.0 * quarter)
-        shift = np.array([x, y]) * plan.pitch_mm - _of_a_kind(middle, lying, plan)
-        tried.append(matcher(Frame(mirrored, 90.0 * quarter, tuple(shift.tolist())), WIDTH))
+        shift = np.array([x, y]) * plan.pitch_mm - _off_middle(middle, lying, plan)
+        tried.append(matcher(replace(lying, shift_mm=tuple(shift.tolist())), WIDTH))
     tried.sort(key=lambda wiring: -wiring.match)
     best: dict[tuple[bool, tuple[int, ...]], Wiring] = {}
     for number, wiring in enumerate(tried[:REFINED]):
@@ -127,7 +126,7 @@ def wirings(
     return sorted(best.values(), key=lambda wiring: -wiring.match)
 
 
-def _of_a_kind(middle: Array, lying: Frame, plan: Plan) -> Array:
+def _off_middle(middle: Array, lying: Frame, plan: Plan) -> Array:
     """The middle of what was pressed, as a shift that is undone where it lies far off the pad's own middle."""
     turned = lying.turned(middle[None])[0]
     return turned if np.abs(turned).max() > plan.pitch_mm else np.zeros(2)
