@@ -67,6 +67,7 @@ class RigSettings(Settings):
     hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
     hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: time in which that goes, s")
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
+    board: str = Field(default="due", min_length=1, max_length=100, description="what reads the fibres, by its name")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
     converter_rate_hz: float = Field(
         default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz"

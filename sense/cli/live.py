@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sense.health.health_model import HealthModel
     from sense.live.pipeline import Event
     from sense.localizer.localizer import Localizer
-    from sense.rig.devices import Converter
+    from sense.rig.devices.protocols import Converter
 
     Show = Callable[[dict[str, Any], Sequence[Event]], None]
     """Takes what there is to show, see `Live.view`, and what has just come to light."""
@@ -104,12 +104,11 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
         from sense.live.sources import simulated
 
         return simulated(model)
-    from sense.rig.arduino.driver import Arduino
-    from sense.rig.arduino.serial_link import port_of
+    from sense.rig.devices.plugins import device
     from sense.settings import RigSettings
 
     options = load_spec(spec).section(RigSettings)
-    return Arduino(port_of(options), options.converter_rate_hz, localizer.fibres)
+    return device("padforge.boards", options.board)(options, range(localizer.fibres))
 
 
 def _health(model: Path) -> "HealthModel | None":

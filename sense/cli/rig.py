@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from design.pad.morphology import Morphology
     from design.settings import PadSettings
 
-rig_option = click.option("--rig", type=click.Choice(["simulated", "ur5"]), default="simulated", show_default=True)
+rig_option = click.option(
+    "--rig", metavar="NAME", default="simulated", show_default=True, help="simulated, ur5, or an arm that is installed."
+)
 drivers_option = click.option(
     "--through-drivers", is_flag=True, help="The simulated rig in real time, through the drivers of the real one."
 )

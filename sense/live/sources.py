@@ -15,7 +15,7 @@ from design.settings import PadSettings
 from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.recording import Recording
-from sense.rig.devices import Converter
+from sense.rig.devices.protocols import Converter
 from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.rig.session.averaging import Averager
 from sense.settings import RigSettings

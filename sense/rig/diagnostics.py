@@ -8,7 +8,7 @@ import numpy as np
 
 from sense.recordings.processing.limits import Array
 
-from .devices import Arm, Converter, RigFault
+from .devices.protocols import Arm, Converter, RigFault
 
 Status = Literal["ok", "warn", "fail"]
 

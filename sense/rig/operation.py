@@ -22,7 +22,7 @@ from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate
 from sense.settings import RigSettings
 
-from .devices import Arm, Converter
+from .devices.protocols import Arm, Converter
 from .diagnostics import Diagnosis, examine_arm, examine_converter
 from .planning.adaptive_plan import Steering
 from .planning.press_plan import PressPlan
@@ -61,7 +61,7 @@ def record_simulated(
 
 @contextmanager
 def opened_rig(kind: str, setup: Setup) -> Iterator[tuple[Arm, Converter, RigSettings]]:
-    """Arm and converter of a rig, "simulated" or "ur5", not yet connected, and the settings for them."""
+    """Arm and converter of a rig, "simulated" or the name of an arm, not yet connected, and the settings for them."""
     if kind == "simulated":
         from .emulators.whole_rig import emulated, emulated_rig
 
@@ -69,9 +69,9 @@ def opened_rig(kind: str, setup: Setup) -> Iterator[tuple[Arm, Converter, RigSet
         with emulated(setup.pad, setup.contact, chosen) as (arm, converter, _, _):
             yield arm, converter, chosen
         return
-    from .arduino.driver import Arduino
-    from .arduino.serial_link import port_of
-    from .ur5.driver import UR5
+    from .arms.ur5.driver import UR5
+    from .boards.due.driver import Arduino
+    from .boards.due.serial_link import port_of
 
     arm, converter = UR5(setup.rig.host), Arduino(port_of(setup.rig), setup.rig.converter_rate_hz, setup.rig.channels)
     try:
@@ -130,7 +130,7 @@ def _steering(setup: Setup, rig: RigSettings, model: Path | None) -> Callable[[P
 
 def look_over(kind: str, setup: Setup) -> list[Diagnosis]:
     """What to know of a rig, see `opened_rig`, before a long run; nothing moves."""
-    from .arduino.serial_link import find_ports
+    from .boards.due.serial_link import find_ports
 
     ports = [f"{port.device} ({port.kind})" for port in find_ports()]
     found = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]

@@ -9,7 +9,7 @@ from typing import NoReturn
 
 from sense.settings import RigSettings
 
-from .devices import Arm, ArmState, RigFault
+from .devices.protocols import Arm, ArmState, RigFault
 
 Vector = tuple[float, float, float]
 DOWN: Vector = (0.0, math.pi, 0.0)

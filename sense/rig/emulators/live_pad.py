@@ -12,7 +12,7 @@ from design.settings import Sensed
 from sense.recordings.processing.limits import Array
 from sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
 from sense.recordings.simulation.published_protocol import random_places
-from sense.rig.devices import ConverterSamples, RigFault
+from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.settings import RigSettings
 
 

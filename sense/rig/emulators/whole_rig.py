@@ -8,13 +8,13 @@ import numpy as np
 from design import Contact, Morphology, signals
 from sense.recordings.processing.limits import Array
 from sense.recordings.simulation.pad_model import LivePad
-from sense.rig.arduino.driver import Arduino
+from sense.rig.arms.ur5.driver import UR5
+from sense.rig.boards.due.driver import Arduino
 from sense.rig.session.pad_frame import Frame
-from sense.rig.ur5.driver import UR5
 from sense.settings import RigSettings
 
-from .board import EmulatedBoard
-from .ur import HOST, UrEmulator
+from .due_board import EmulatedBoard
+from .ur.emulator import HOST, UrEmulator
 
 
 @contextmanager

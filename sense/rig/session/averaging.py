@@ -3,7 +3,7 @@
 import numpy as np
 
 from sense.recordings.processing.limits import Array
-from sense.rig.devices import ConverterSamples
+from sense.rig.devices.protocols import ConverterSamples
 
 
 class Averager:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sense.recordings.processing.limits import Array
-from sense.rig.devices import Pose, RigFault
+from sense.rig.devices.protocols import Pose, RigFault
 from sense.settings import RigSettings
 
 

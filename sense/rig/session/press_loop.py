@@ -13,7 +13,7 @@ import numpy as np
 
 from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import Recorder
-from sense.rig.devices import Arm, Converter, Pose, RigFault
+from sense.rig.devices.protocols import Arm, Converter, Pose, RigFault
 from sense.rig.planning.press_plan import PressPlan
 from sense.rig.safety import POLL_S, Limits, require_safe, wait_until_still, watch
 from sense.settings import RigSettings

@@ -12,7 +12,7 @@ from sense import Recording
 from sense.cli.live import view_lines
 from sense.live.page_server import LivePage
 from sense.recordings.simulation.published_protocol import simulate
-from sense.rig.devices import ConverterSamples, RigFault
+from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.settings import RigSettings
 
@@ -51,9 +51,9 @@ def test_a_recording_is_shown(live, brief: Recording, tmp_path: Path) -> None:
 
 
 def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sense.rig.arduino.serial_link
+    import sense.rig.boards.due.serial_link
 
-    monkeypatch.setattr(sense.rig.arduino.serial_link, "find_ports", list)
+    monkeypatch.setattr(sense.rig.boards.due.serial_link, "find_ports", list)
     other = simulate(Morphology.straight(3), RigSettings(presses=3))
     other.save(tmp_path / "other", {})
     with LivePage(0) as page:

@@ -14,9 +14,9 @@ from design.settings import PUBLISHED_CONTACT
 from sense import Recording
 from sense.live.sources import connected, replayed, simulated
 from sense.recordings.simulation.published_protocol import simulate
-from sense.rig.arduino.driver import Arduino
-from sense.rig.devices import ConverterSamples, RigFault
-from sense.rig.emulators.board import EmulatedBoard
+from sense.rig.boards.due.driver import Arduino
+from sense.rig.devices.protocols import ConverterSamples, RigFault
+from sense.rig.emulators.due_board import EmulatedBoard
 from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.settings import RigSettings
 

@@ -10,11 +10,11 @@ from typing import IO
 
 import pytest
 
+from sense.rig.arms.ur5.driver import UR5
 from sense.rig.emulators import whole_rig
-from sense.rig.emulators.ur import UrEmulator
-from sense.rig.emulators.ur_controller import Series
-from sense.rig.ur5.driver import UR5
-from tests.sense.rig.ur5.arms import Robots
+from sense.rig.emulators.ur.controller import Series
+from sense.rig.emulators.ur.emulator import UrEmulator
+from tests.sense.rig.arms.ur5.arms import Robots
 
 WAIT_S = 180.0
 ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]

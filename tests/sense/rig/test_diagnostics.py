@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from sense.rig.devices import RigFault
+from sense.rig.devices.protocols import RigFault
 from sense.rig.diagnostics import examine_arm, examine_converter
-from tests.sense.rig.fakes import RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 
 def found(diagnoses):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.rig.devices import ArmState, Pose, RigFault
+from sense.rig.devices.protocols import ArmState, Pose, RigFault
 from sense.rig.safety import Limits, require_safe, tilt_deg, wait_until_still, watch
 from sense.settings import RigSettings
 

@@ -12,7 +12,7 @@ import pytest
 import padforge
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recording import Recording
-from sense.rig.ur5.rtde_frames import RTDE_PORT
+from sense.rig.arms.ur5.rtde_frames import RTDE_PORT
 from tests.helpers.effort import few
 
 pytest.importorskip("rtde_control")

@@ -16,8 +16,8 @@ from design.settings import PUBLISHED_CONTACT
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
-from sense.rig.arduino import driver as arduino
-from sense.rig.devices import RigFault
+from sense.rig.boards.due import driver as arduino
+from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators.whole_rig import emulated, emulated_rig
 from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.pad_frame import Frame

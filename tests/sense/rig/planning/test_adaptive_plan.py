@@ -7,7 +7,7 @@ from sense.rig.planning.adaptive_plan import EVERY, Steering, uncertainty
 from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.press_loop import Session
 from sense.settings import LocalizerSettings
-from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 
 def test_presses_go_where_errors_are_large_and_nothing_was_pressed():

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.rig.devices import ConverterSamples
+from sense.rig.devices.protocols import ConverterSamples
 from sense.rig.session.averaging import Averager
 from tests.helpers.effort import few
 

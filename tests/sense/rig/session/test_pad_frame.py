@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sense.rig.devices import RigFault
+from sense.rig.devices.protocols import RigFault
 from sense.rig.session.pad_frame import Frame
-from tests.sense.rig.fakes import RIG
+from tests.sense.rig.devices.fakes import RIG
 
 TURNED = RIG.model_copy(update={"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2)})
 

@@ -8,10 +8,10 @@ import pytest
 from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
-from sense.rig.devices import RigFault
+from sense.rig.devices.protocols import RigFault
 from sense.rig.planning.press_plan import PressPlan
 from sense.rig.session.press_loop import Session, require_safe_plan
-from tests.sense.rig.fakes import RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
 FOUR = PressPlan(PLAN.places_mm[:4], PLAN.depths_mm[:4])

@@ -10,10 +10,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sense.rig.arduino import framing
-from sense.rig.ur5 import messages as ur5_wire
-from sense.rig.ur5 import rtde_frames as ur_frames
-from sense.rig.ur5.rtde_reader import VARIABLES, RtdeReader
+from sense.rig.arms.ur5 import messages as ur5_wire
+from sense.rig.arms.ur5 import rtde_frames as ur_frames
+from sense.rig.arms.ur5.rtde_reader import VARIABLES, RtdeReader
+from sense.rig.boards.due import framing
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.sense.cases import seeds

@@ -1,0 +1,1 @@
+"""Arms that press: one folder for each kind."""

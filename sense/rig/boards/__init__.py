@@ -1,0 +1,1 @@
+"""Boards that read the fibres: one folder for each kind."""

@@ -1,0 +1,196 @@
+"""The sketch itself, compiled for this computer with a stand-in for the chip; the program's decoder reads it."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sense.rig.boards.due import framing
+from sense.rig.boards.due.framing import (
+    Ack,
+    Block,
+    BoardSettings,
+    Decoder,
+    Frame,
+    Identity,
+    Kind,
+    Request,
+    Status,
+    encode,
+)
+from sense.rig.emulators.due_board import judge_settings
+
+HERE = Path(__file__).parent
+FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"
+ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]
+"""Of inputs A0 to A11."""
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("there is no g++")
+    path = tmp_path_factory.mktemp("firmware") / "board"
+    folders = ["-I", str(HERE / "stub"), "-I", str(FIRMWARE)]
+    warnings = ["-std=gnu++11", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([compiler, *warnings, *folders, str(HERE / "stub" / "board.cpp"), "-o", str(path)], check=True)
+    return path
+
+
+class Board:
+    """A script for the stand-in, run as a whole."""
+
+    def __init__(self, program: Path) -> None:
+        self.program = program
+        self.script: list[str] = []
+
+    def host(self, *frames: Request | BoardSettings) -> "Board":
+        self.script += [f"host {encode(frame).hex()}" for frame in frames]
+        return self
+
+    def do(self, *lines: str) -> "Board":
+        self.script += lines
+        return self
+
+    def bytes(self) -> bytes:
+        script = "\n".join(self.script).encode()
+        return subprocess.run([self.program], input=script, capture_output=True, check=True, timeout=20).stdout
+
+    def frames(self) -> list[Frame]:
+        decoder = Decoder()
+        frames = decoder.feed(self.bytes())
+        assert decoder.damaged == 0
+        return frames
+
+
+@pytest.fixture
+def board(program: Path) -> Board:
+    return Board(program)
+
+
+START, STOP, IDENTIFY = Request(Kind.START), Request(Kind.STOP), Request(Kind.IDENTIFY)
+
+
+def expected(first: int, samples: int, inputs: list[int], averaging: int) -> np.ndarray:
+    """What the stand-in's ADC gives, summed."""
+    turns = first * averaging + np.arange(samples * averaging)
+    channel = np.array([ADC_CHANNEL[i] for i in inputs])
+    return ((256 * channel + turns[:, None]) % 4096).reshape(samples, averaging, -1).sum(1)
+
+
+def check_blocks(blocks: list[Block], wanted: BoardSettings) -> None:
+    inputs = [i for i in range(12) if wanted.mask >> i & 1]
+    samples = min(max(20_000_000 // wanted.period_ns, 1), 16)
+    for number, block in enumerate(blocks):
+        assert (block.sequence, block.first, block.overruns) == (number, number * samples, 0)
+        assert (block.mask, block.averaging) == (wanted.mask, wanted.averaging)
+        assert np.array_equal(block.counts, expected(block.first, samples, inputs, wanted.averaging))
+    elapsed = np.diff([block.time_us for block in blocks]) % 2**32
+    assert np.allclose(elapsed, samples * wanted.period_ns / 1000, rtol=0.02)
+
+
+def test_the_board_says_what_it_is(board: Board) -> None:
+    (identity,) = board.host(IDENTIFY).frames()
+    assert identity == Identity((1, 0, 0), 12, 12, "padforge-due", b"serial-of-a-chip")
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        BoardSettings(1_000_000, 0xFF, 1),
+        BoardSettings(1_000_000, 0xFFF, 8),
+        BoardSettings(100_000, 0xFF, 1),
+        BoardSettings(75_000_000, 0b1000_0000_0101, 16),
+        BoardSettings(100_000_000, 1, 1),
+    ],
+)
+def test_blocks_hold_every_conversion_in_its_place(board: Board, wanted: BoardSettings) -> None:
+    board.host(wanted, START)
+    triggers = 16 * wanted.averaging
+    ack, started, *blocks = board.do(*[f"trigger {triggers}", "loop 20"] * 8, "loop 200").frames()
+    assert ack == Ack(Kind.SETTINGS, Status.OK, wanted)
+    assert started == Ack(Kind.START, Status.OK, wanted)
+    found = [block for block in blocks if isinstance(block, Block)]
+    assert len(found) == len(blocks) == 8 * 16 // len(found[0].counts)
+    check_blocks(found, wanted)
+
+
+def test_the_period_in_force_is_what_the_timer_can_keep(board: Board) -> None:
+    (ack,) = board.host(BoardSettings(1_000_000_000 // 1300, 0xFF, 7)).frames()
+    assert isinstance(ack, Ack)
+    ticks = round(1e9 / 1300 * 0.042 / 7)
+    assert ack.settings.period_ns == round(ticks * 7 / 0.042)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "status"),
+    [
+        (BoardSettings(1_000_000, 0, 1), Status.BAD_SETTINGS),
+        (BoardSettings(1_000_000, 0x1000, 1), Status.BAD_SETTINGS),
+        (BoardSettings(1_000_000, 1, 0), Status.BAD_SETTINGS),
+        (BoardSettings(1_000_000, 1, 17), Status.BAD_SETTINGS),
+        (BoardSettings(0, 1, 1), Status.BAD_SETTINGS),
+        (BoardSettings(2_000_000_000, 1, 1), Status.BAD_SETTINGS),
+        (BoardSettings(47_000, 0xFF, 1), Status.TOO_FAST),
+        (BoardSettings(1_000_000, 0xFFF, 16), Status.TOO_FAST),
+    ],
+)
+def test_settings_it_cannot_keep_are_refused_as_the_emulated_board_does(
+    board: Board, wanted: BoardSettings, status: Status
+) -> None:
+    (ack,) = board.host(wanted).frames()
+    assert ack == Ack(Kind.SETTINGS, status, BoardSettings(1_000_000, 0xFF, 1))
+    assert judge_settings(wanted) == status
+
+
+def test_start_twice_goes_on_and_settings_wait_for_stop(board: Board) -> None:
+    default, other = BoardSettings(1_000_000, 0xFF, 1), BoardSettings(2_000_000, 3, 1)
+    board.host(START).do("trigger 16", "loop 2").host(START, other).do("trigger 16", "loop 2")
+    frames = board.host(STOP, other, START).do("trigger 10", "loop 2").frames()
+    acks = [(ack.command, ack.status) for ack in frames if isinstance(ack, Ack)]
+    assert acks[:3] == [(Kind.START, Status.OK), (Kind.START, Status.OK), (Kind.SETTINGS, Status.RUNNING)]
+    assert acks[3:] == [(Kind.STOP, Status.OK), (Kind.SETTINGS, Status.OK), (Kind.START, Status.OK)]
+    blocks = [block for block in frames if isinstance(block, Block)]
+    check_blocks(blocks[:2], default)
+    assert [(block.first, block.mask) for block in blocks] == [(0, 0xFF), (16, 0xFF), (0, 3)]
+
+
+def test_a_host_too_slow_costs_whole_blocks_and_they_are_counted(board: Board) -> None:
+    board.host(START).do(f"trigger {16 * 70}", "loop 100", "trigger 16", "loop 2")
+    blocks = [block for block in board.frames() if isinstance(block, Block)]
+    assert [block.first for block in blocks[:64]] == list(range(0, 1024, 16))
+    assert [(block.first, block.overruns, block.sequence) for block in blocks[64:]] == [(1120, 96, 64)]
+
+
+@pytest.mark.parametrize("trouble", [["slip", "trigger 64"], ["masked 64"]])
+def test_lost_conversions_stop_the_board_rather_than_give_wrong_values(board: Board, trouble: list[str]) -> None:
+    frames = board.host(START).do("trigger 16", "loop 2", *trouble, "loop 20", "trigger 64", "loop 20").frames()
+    assert [block.first for block in frames if isinstance(block, Block)] == [0]
+    assert isinstance(frames[-1], Ack)
+    assert (frames[-1].command, frames[-1].status) == (Kind.STOP, Status.HALTED)
+
+
+def test_it_stops_when_the_host_closes_the_port(board: Board) -> None:
+    frames = board.host(START).do("trigger 16", "loop 2", "close", "trigger 64", "loop 20").frames()
+    assert sum(isinstance(frame, Block) for frame in frames) == 1
+
+
+def test_damaged_commands_are_passed_over(board: Board) -> None:
+    wanted = encode(BoardSettings(2_000_000, 3, 2))
+    for i in range(len(wanted)):
+        for damaged in (wanted[:i] + bytes([wanted[i] ^ 0x10]) + wanted[i + 1 :], wanted[:i] + wanted[i + 1 :]):
+            board.do(f"host {damaged.hex()}")
+    frames = board.do(f"host {'55' * 100}").host(IDENTIFY).frames()
+    whole = Ack(Kind.SETTINGS, Status.OK, BoardSettings(2_000_000, 3, 2))
+    assert [frame for frame in frames if frame != whole] == [
+        Identity((1, 0, 0), 12, 12, "padforge-due", b"serial-of-a-chip")
+    ]
+    assert frames.count(whole) <= 2  # a zero too few between two frames harms neither
+
+
+def test_both_sides_write_the_same_bytes(board: Board) -> None:
+    sent = board.host(BoardSettings(1_000_000, 0xFFF, 4), START).do("trigger 256", "loop 20").bytes()
+    assert sent == b"".join(map(encode, Decoder().feed(sent)))

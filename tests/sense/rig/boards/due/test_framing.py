@@ -1,0 +1,213 @@
+"""The wire format: whatever is sent comes back, and damage costs the frames it touches and never gives a wrong one."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sense.rig.boards.due.framing import (
+    FULL_SCALE,
+    MAX_AVERAGING,
+    MAX_CHANNELS,
+    MAX_SAMPLES,
+    Ack,
+    Block,
+    BoardSettings,
+    Decoder,
+    Frame,
+    Identity,
+    Kind,
+    Request,
+    cobs_decode,
+    cobs_encode,
+    encode,
+)
+
+U8, U16, U32 = st.integers(0, 2**8 - 1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
+NAMES = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=16)
+SETTINGS = st.builds(BoardSettings, U32, U16, U8)
+
+
+@st.composite
+def blocks(draw: st.DrawFn) -> Block:
+    mask = draw(st.integers(1, 2**MAX_CHANNELS - 1))
+    samples, averaging = draw(st.integers(1, MAX_SAMPLES)), draw(st.integers(1, MAX_AVERAGING))
+    least = draw(st.sampled_from([0, 0, 255, FULL_SCALE]))  # zeros and full scale are the hard cases of COBS
+    most = draw(st.sampled_from([least, averaging * FULL_SCALE]))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    counts = rng.integers(min(least, most), most + 1, (samples, mask.bit_count())).astype(np.uint16)
+    return Block(counts, averaging, mask, draw(U16), draw(U32), draw(U32), draw(U32))
+
+
+FRAMES = st.one_of(
+    st.sampled_from([Request(Kind.IDENTIFY), Request(Kind.START), Request(Kind.STOP)]),
+    SETTINGS,
+    st.builds(Identity, st.tuples(U8, U8, U8), U8, U8, NAMES, st.binary(min_size=16, max_size=16)),
+    st.builds(Ack, U8, U8, SETTINGS),
+    blocks(),
+)
+
+
+def payloads(frames: list[Frame]) -> list[bytes]:
+    return [frame.pack() for frame in frames]
+
+
+def stream(count: int) -> list[bytes]:
+    """Frames of blocks as a board sends them, 8 channels with noise on a rest."""
+    rng = np.random.default_rng(count)
+    counts = (2000 + rng.integers(-300, 300, (count, MAX_SAMPLES, 8))).astype(np.uint16)
+    counts[:, :, 3] = 0  # a dead channel: COBS has much to do
+    return [encode(Block(c, 1, 0xFF, i, 16 * i, 16_000 * i, 0)) for i, c in enumerate(counts)]
+
+
+@given(st.binary(max_size=800) | st.binary(max_size=3).map(lambda piece: piece * 270))
+def test_cobs_takes_out_the_zeros_and_puts_them_back(payload: bytes) -> None:
+    coded = cobs_encode(payload)
+    assert 0 not in coded
+    assert len(coded) <= len(payload) + 1 + len(payload) // 254
+    assert cobs_decode(coded) == payload
+
+
+@given(st.lists(FRAMES, max_size=8), st.data())
+def test_frames_come_back_whatever_the_portions(frames: list[Frame], data: st.DataObject) -> None:
+    sent = b"".join(map(encode, frames))
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(sent)), max_size=20)))
+    decoder = Decoder()
+    edges = [0, *cuts, len(sent)]
+    found = [frame for a, b in pairwise(edges) for frame in decoder.feed(sent[a:b])]
+    assert payloads(found) == payloads(frames)
+    assert decoder.damaged == 0
+
+
+def test_a_block_keeps_every_number_and_takes_at_most_18_bytes_a_sample() -> None:
+    counts = np.arange(128, dtype=np.uint16).reshape(16, 8) * 500
+    sent = encode(Block(counts, 16, 0xFF, 65535, 2**32 - 16, 2**32 - 1, 7))
+    (block,) = Decoder().feed(sent)
+    assert isinstance(block, Block)
+    assert np.array_equal(block.counts, counts)
+    assert (block.averaging, block.mask, block.sequence) == (16, 0xFF, 65535)
+    assert (block.first, block.time_us, block.overruns) == (2**32 - 16, 2**32 - 1, 7)
+    assert len(sent) / 16 < 18
+
+
+@pytest.mark.parametrize("averaging", [1, 2, MAX_AVERAGING])
+def test_the_largest_block_with_every_count_at_its_limit_comes_back(averaging: int) -> None:
+    """No number in it has a zero byte, so that COBS has most to add."""
+    counts = np.full((MAX_SAMPLES, MAX_CHANNELS), averaging * FULL_SCALE, np.uint16)
+    block = Block(counts, averaging, 2**MAX_CHANNELS - 1, 0x0101, 0x01010101, 0x01010101, 0x01010101)
+    decoder = Decoder()
+    assert payloads(decoder.feed(encode(block))) == [block.pack()]
+    assert decoder.damaged == 0
+
+
+def damage_in_one_place(sent: bytes) -> Iterator[bytes]:
+    for i in range(len(sent)):
+        yield from (sent[:i] + bytes([sent[i] ^ 1 << bit]) + sent[i + 1 :] for bit in range(8))
+        yield sent[:i] + sent[i + 1 :]
+        yield from (sent[:i] + bytes([value]) + sent[i:] for value in (0x00, 0x01, 0x80, 0xFF, sent[i]))
+
+
+def test_every_flipped_bit_dropped_byte_and_inserted_byte_costs_one_block_at_most() -> None:
+    frames = stream(3)
+    whole = payloads(Decoder().feed(b"".join(frames)))
+    for damaged in damage_in_one_place(frames[1]):
+        decoder = Decoder()
+        found = payloads(decoder.feed(frames[0] + damaged + frames[2]))
+        assert found in (whole, [whole[0], whole[2]])
+        assert decoder.damaged > 0 or found == whole
+
+
+def test_every_burst_of_up_to_sixteen_bits_is_found() -> None:
+    (frame,) = stream(1)
+    rng = np.random.default_rng(5)
+    for _ in range(4000):
+        length = int(rng.integers(2, 17))
+        burst = (int(rng.integers(2**16)) | 1) & (2**length - 1) | 1 << length - 1
+        shift = int(rng.integers(8, 8 * len(frame) - 8 - length))
+        damaged = (int.from_bytes(frame, "big") ^ burst << shift).to_bytes(len(frame), "big")
+        assert Decoder().feed(damaged) == []
+
+
+@settings(max_examples=30)
+@given(st.sampled_from([1e-3, 1e-2, 0.1]), st.integers(0, 10**6))
+def test_no_amount_of_damage_gives_a_wrong_frame(share: float, seed: int) -> None:
+    frames = stream(60)
+    whole = payloads(Decoder().feed(b"".join(frames)))
+    rng = np.random.default_rng(seed)
+    data = np.frombuffer(b"".join(frames), np.uint8).copy()
+    hit = rng.random(len(data)) < share
+    data[hit] = rng.integers(0, 256, hit.sum())
+    data = np.delete(data, np.flatnonzero(rng.random(len(data)) < share / 2))
+    found = payloads(Decoder().feed(data.tobytes()))
+    left = iter(whole)
+    assert all(payload in left for payload in found)  # a subsequence: right, in order, none twice
+
+
+def test_noise_without_an_edge_neither_grows_nor_passes() -> None:
+    decoder = Decoder()
+    for _ in range(1000):
+        assert decoder.feed(b"\x55" * 1000) == []
+    assert len(decoder._rest) < 1000
+    (frame,) = stream(1)
+    assert len(decoder.feed(frame)) == 1
+    assert decoder.damaged == 1
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x01\x00",
+        b"\x77",
+        b"\x02\x00",
+        b"\x90\x01",
+        Block(np.full((1, 8), 4096, np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.array([[0] * 7 + [4096]], np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.array([[0] * 7 + [4 * 4095 + 1]], np.uint16), 4, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 8), np.uint16), 0, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 8), np.uint16), 17, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((0, 8), np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 0), np.uint16), 1, 0, 0, 0, 0, 0).pack(),
+        Block(np.zeros((1, 1), np.uint16), 1, 0x1000, 0, 0, 0, 0).pack(),
+        Block(np.zeros((17, 8), np.uint16), 1, 0xFF, 0, 0, 0, 0).pack(),
+        Block(np.zeros((2, 8), np.uint16), 1, 0x7F, 0, 0, 0, 0).pack(),
+        Block(np.zeros((2, 8), np.uint16), 1, 0xFF, 0, 0, 0, 0).pack()[:-1],
+    ],
+)
+def test_a_payload_that_is_no_frame_counts_as_damaged_although_its_check_is_right(payload: bytes) -> None:
+    class Forged(Request):
+        def pack(self) -> bytes:
+            return payload
+
+    decoder = Decoder()
+    assert decoder.feed(encode(Forged(Kind.STOP))) == []
+    assert decoder.damaged == 1
+
+
+def test_the_bytes_of_a_frame_are_as_documented() -> None:
+    """A board of another make relies on them. CRC-16/CCITT-FALSE of "123456789" is 29B1."""
+    assert encode(Request(Kind.START)) == b"\0\x02\x03" + _check_bytes(b"\x02\x03") + b"\0"
+    for period in range(1, 4000, 7):
+        coded = cobs_encode(BoardSettings(period, 0x0FF, 4).pack())
+        assert encode(BoardSettings(period, 0x0FF, 4)) == b"\0" + coded + _check_bytes(coded) + b"\0"
+    assert _check_bytes(b"123456789") == bytes([0x80, 0x80 | 0x29B1 >> 7 & 0x7F, 0x80 | 0x29B1 & 0x7F])
+    assert BoardSettings(1_000_000, 0x0FF, 4).pack() == bytes.fromhex("02 40420f00 ff00 04")
+    assert Ack(3, 1, BoardSettings(1, 2, 3)).pack() == bytes.fromhex("82 03 01 01000000 0200 03")
+    block = Block(np.array([[1, 2], [3, 4]], np.uint16), 5, 0x0011, 6, 7, 8, 9)
+    head = bytes.fromhex("90 02 05 1100 0600 07000000 08000000 09000000")
+    assert block.pack() == head + bytes.fromhex("0100 0200 0300 0400")
+    identity = Identity((1, 2, 3), 12, 8, "pad", bytes(range(16)))
+    assert identity.pack() == b"\x81\x01\x02\x03\x0c\x08pad" + bytes(13) + bytes(range(16))
+
+
+def _check_bytes(coded: bytes) -> bytes:
+    """CRC-16/CCITT-FALSE bit by bit, in 2, 7 and 7 bits with the top bit set."""
+    crc = 0xFFFF
+    for byte in coded:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return bytes([0x80 | crc >> 14, 0x80 | crc >> 7 & 0x7F, 0x80 | crc & 0x7F])

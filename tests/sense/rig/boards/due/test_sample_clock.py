@@ -1,0 +1,134 @@
+"""The sample clock against simulated truth: jitter, stalls, a board that is off by up to 200 ppm and drifts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from sense.rig.boards.due import sample_clock as clock
+from sense.rig.boards.due.sample_clock import SampleClock
+from tests.helpers.effort import few
+
+SETTLE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Link:
+    """Blocks of `block` samples at `rate_hz` for `seconds` from a board whose period is `skew` too long."""
+
+    rate_hz: float
+    block: int
+    seconds: float
+    skew: float
+    seed: int
+    jitter_s: float = 8e-3
+    stall_s: float = 50e-3
+
+    def blocks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Index of the last sample of each block, when it was taken, when it arrived."""
+        rng = np.random.default_rng(self.seed)
+        last = (np.arange(int(self.seconds * self.rate_hz / self.block)) + 1) * self.block - 1
+        nominal = last / self.rate_hz
+        warming = 20e-6 * 300 * (1 - np.cos(nominal / 300))  # the quartz wanders by 20 ppm within half an hour
+        taken = 1e5 + nominal * (1 + self.skew) + warming
+        arrived = taken + rng.uniform(0, self.jitter_s, len(taken))
+        for begin in rng.uniform(taken[0], taken[-1], int(self.seconds / 3)):
+            held = (arrived >= begin) & (arrived < begin + self.stall_s)
+            arrived[held] = begin + self.stall_s
+        return last, taken, np.maximum.accumulate(arrived)
+
+
+def run(link: Link) -> tuple[np.ndarray, SampleClock]:
+    """Error of the time of each block's last sample; checks that all times ascend and are given as blocks come."""
+    last, taken, arrived = link.blocks()
+    clock, before, errors = SampleClock(1 / link.rate_hz), -np.inf, []
+    given_to = 0
+    for i in range(len(last)):
+        clock.observe(int(last[i]), arrived[i])
+        if arrived[i] < arrived[0] + SETTLE_S:
+            continue
+        for j in range(given_to, i + 1):
+            times = clock.times(int(last[j]) - link.block + 1, link.block)
+            assert times[0] > before
+            assert (np.diff(times) > 0).all()
+            before = times[-1]
+            errors.append(before - taken[j])
+        given_to = i + 1
+    return np.array(errors), clock
+
+
+@settings(max_examples=20)
+@given(
+    rate=st.sampled_from([(1000.0, 16), (100.0, 2), (40.0, 1)]),
+    skew=st.floats(-200e-6, 200e-6),
+    jitter_s=st.floats(0, 8e-3),
+    seed=st.integers(0, 1000),
+)
+def test_times_are_within_5_ms_from_the_first_and_half_a_ms_soon(
+    rate: tuple[float, int], skew: float, jitter_s: float, seed: int
+) -> None:
+    errors, clock = run(Link(*rate, 40.0, skew, seed, jitter_s))
+    assert np.abs(errors).max() < 5e-3
+    assert np.abs(errors[len(errors) // 2 :]).max() < 5e-4
+    assert clock.skew_ppm == pytest.approx(skew * 1e6, abs=60)
+
+
+def test_times_hold_for_hours_in_bounded_memory() -> None:
+    """An hour, two under stress."""
+    errors, clock = run(Link(40.0, 8, min(few(1).max_examples, 2) * 3600.0, 200e-6, seed=1))
+    assert np.abs(errors).max() < 2e-3
+    assert np.abs(errors[500:]).max() < 1e-3
+    assert len(clock._buckets) <= 60
+
+
+@given(start_s=st.floats(0, 1e7), period_s=st.floats(1e-4, 0.1), count=st.integers(1, 50), first=st.integers(0, 2**40))
+def test_without_delay_the_times_are_the_arrivals(start_s: float, period_s: float, count: int, first: int) -> None:
+    clock = SampleClock(period_s)
+    for block in range(1, 40):
+        last = first + block * count
+        clock.observe(last, start_s + block * count * period_s)
+        times = clock.times(last - count + 1, count)
+        assert times[-1] == pytest.approx(start_s + block * count * period_s, abs=1e-6)
+        assert (np.diff(times) > 0).all()
+
+
+def test_a_gap_in_the_samples_is_a_gap_in_the_times() -> None:
+    clock = SampleClock(1e-3)
+    clock.observe(15, 100.015)
+    early = clock.times(0, 16)
+    clock.observe(1015, 101.015)
+    late = clock.times(1000, 16)
+    assert late[0] - early[-1] == pytest.approx(0.985)
+
+
+def test_a_step_of_the_delay_is_caught_up_with_without_ever_going_back() -> None:
+    clock, before = SampleClock(1e-3), -np.inf
+    for first in range(0, 3200, 16):
+        clock.observe(first + 15, (first + 15) * 1e-3 + (0.3 if first < 320 else 0.0))
+        times = clock.times(first, 16)
+        assert times[0] > before
+        before = times[-1]
+    assert before == pytest.approx(3.199, abs=1e-3)
+
+
+def test_there_is_no_time_before_the_first_block() -> None:
+    with pytest.raises(ValueError, match="no block"):
+        SampleClock(1e-3).times(0, 1)
+
+
+@few(40)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
+def test_the_line_under_the_points_is_the_highest_at_their_middle(seed: int, count: int, size: float) -> None:
+    """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
+    rng = np.random.default_rng(seed)
+    x, y = np.sort(rng.uniform(0, 100, count)), size * rng.uniform(0, 1, count)
+    offset, slope = clock._line_under(list(zip(x.tolist(), y.tolist(), strict=True)))
+    steepest = clock._MAX_SKEW
+    below = np.column_stack([np.ones(count), x])
+    best = linprog([-1, -x.mean()], below, y, bounds=[(None, None), (-steepest, steepest)])
+    assert abs(slope) <= steepest
+    assert (offset + slope * x <= y + 1e-12).all()
+    assert offset + slope * x.mean() == pytest.approx(-best.fun, abs=1e-9)

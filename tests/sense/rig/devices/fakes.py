@@ -1,0 +1,143 @@
+"""An arm and a converter in virtual time, on one simulated pad: minutes of pressing take moments."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design import Morphology
+from design.settings import PUBLISHED_CONTACT
+from sense.recordings.recorder import STATE_COLUMNS
+from sense.recordings.simulation.pad_model import LivePad
+from sense.rig.devices.protocols import ArmState, ConverterSamples, Pose, RigFault
+from sense.rig.session.pad_frame import Frame
+from sense.settings import RigSettings
+
+PAD = Morphology.straight(2)
+RIG = RigSettings(
+    presses=6,
+    rate_hz=100,
+    converter_rate_hz=1000,
+    readings_per_press=40,
+    channels=4,
+    contact_mm=50.0,
+    box_mm=(-100, 100, -500, -300, 40, 120),
+    travel_mm_s=400,
+    press_mm_s=100,
+    acceleration_mm_s2=2000,
+)
+
+
+@dataclass
+class Time:
+    """A clock that only goes on when someone sleeps, and then by `least_s`: the longer, the fewer polls."""
+
+    now: float = 100.0
+    least_s: float = 0.008
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += max(seconds, self.least_s)
+
+
+@dataclass
+class FakeArm:
+    """Moves straight and at once at full speed; `hook` is called with every poll and may break things."""
+
+    time: Time
+    pose: Pose = (0.0, -400.0, 100.0, 0.0, 3.141592653589793, 0.0)
+    protective_stop: bool = False
+    emergency_stop: bool = False
+    lost: bool = False
+    force_n: float | None = None
+    stops: int = 0
+    moves: list[Pose] = field(default_factory=list)
+    hook: Callable[["FakeArm"], None] = lambda arm: None
+    _from: tuple[Pose, Pose, float, float] | None = None
+
+    def connect(self) -> dict[str, str]:
+        return {"model": "fake"}
+
+    def state(self) -> ArmState:
+        self.hook(self)
+        if self.lost:
+            raise RigFault("lost", "the arm is gone")
+        self._advance()
+        stopped = self.protective_stop or self.emergency_stop
+        return ArmState(
+            self.time(), self.pose, 0.0, self.force_n, self.protective_stop, self.emergency_stop,
+            self._from is not None and not stopped,
+        )  # fmt: skip
+
+    def drain(self) -> NDArray[np.float64]:
+        if self.lost:
+            raise RigFault("lost", "the arm is gone")
+        self._advance()
+        row = [self.time(), *self.pose, 0.0, np.nan, float(not self.protective_stop)]
+        return np.array([row]).reshape(1, len(STATE_COLUMNS))
+
+    def move(self, pose: Pose, speed_mm_s: float, acceleration_mm_s2: float) -> None:
+        self.moves.append(pose)
+        if self.protective_stop or self.emergency_stop:
+            return
+        way = float(np.linalg.norm(np.subtract(pose[:3], self.pose[:3])))
+        self._from = (self.pose, pose, self.time(), self.time() + way / speed_mm_s)
+
+    def stop(self) -> None:
+        self.stops += 1
+        self._advance()
+        self._from = None
+
+    def close(self) -> None:
+        self.stop()
+
+    def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 6) poses; the past is not kept, so that of now."""
+        self._advance()
+        return np.tile(self.pose, (len(times_s), 1))
+
+    def _advance(self) -> None:
+        if self._from is None or self.protective_stop or self.emergency_stop:
+            return
+        start, end, begun, done = self._from
+        share = 1.0 if done <= begun else min((self.time() - begun) / (done - begun), 1.0)
+        x, y, z = (np.array(start[:3]) + share * np.subtract(end[:3], start[:3])).tolist()
+        self.pose = (x, y, z, *end[3:])
+        if share == 1.0:
+            self._from = None
+
+
+class FakeConverter:
+    """Samples the simulated pad under a fake arm; samples may be lost, and the board may stall or go."""
+
+    def __init__(self, arm: FakeArm, rig: RigSettings = RIG, pad: Morphology = PAD) -> None:
+        self.arm, self.rig, self.frame = arm, rig, Frame.of(rig)
+        self.model = LivePad(pad, PUBLISHED_CONTACT, rig, rig.converter_rate_hz, np.random.default_rng(1))
+        self.rate_hz, self.taken_s = rig.converter_rate_hz, arm.time()
+        self.lose = 0
+        self.lost = self.stalled = False
+
+    def connect(self) -> dict[str, float]:
+        return {"rate_hz": self.rate_hz}
+
+    def read(self) -> ConverterSamples:
+        if self.lost:
+            raise RigFault("lost", "the board is gone")
+        if self.stalled and self.arm.time() - self.taken_s > 1:
+            raise RigFault("stale", "the board has been silent for 1 s")
+        count = 0 if self.stalled else int((self.arm.time() - self.taken_s) * self.rate_hz)
+        skipped = min(self.lose, count)
+        self.lose -= skipped
+        times = self.taken_s + np.arange(1 + skipped, count + 1) / self.rate_hz
+        self.taken_s += count / self.rate_hz
+        missing = np.zeros(len(times), np.int64)
+        if len(times):
+            missing[0] = skipped
+        places, depths = self.frame.tip(self.arm.pose_at(times))
+        return ConverterSamples(times, self.model.volts(places, depths), missing)
+
+    def close(self) -> None:
+        pass
