@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from sense.recordings.import_export import FOUND
+from sense.recordings.formats.assembly import FOUND
 from sense.recordings.recording import Recording
 
 from .health_model import COMMANDED, DETECTED, HealthModel

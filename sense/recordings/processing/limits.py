@@ -8,12 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from design.common.errors import InputError, shown
 
 MAX_FIBRES = 512
-MAX_VOLTS, MAX_MM, MAX_S = 1e3, 1e5, 1e10
-"""Greatest reading, place and time, by amount (seconds since 1970 are 2e9)."""
+MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
+"""Greatest reading, place, time and force, by amount (seconds since 1970 are 2e9)."""
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
-MAX_VALUES = 2**30
-"""Greatest number of values in an array of a file: 8 GiB of them."""
-MAX_BYTES = 8 * MAX_VALUES
+MAX_BYTES = 2**33
 """Size of the largest file of a recording."""
 MAX_INDEX = 2**53
 """Greatest index that float64 holds exactly."""

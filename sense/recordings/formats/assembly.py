@@ -1,0 +1,201 @@
+"""A recording put together from arrays that a mapping has named, however presses are told in them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.common.errors import InputError
+from sense.recordings.processing.limits import Array, Indices, Mask, as_numbers
+from sense.recordings.recording import Recording
+
+from .csv_table import UNKNOWN
+from .mapping import Part
+
+MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
+"""Quantities of which each press has one, and what they are called in a `Recording`."""
+FOUND = {"presses": "found"}
+"""What the source of a recording says whose presses were found in its readings."""
+
+
+class _Presses(NamedTuple):
+    """(Q,) readings at which presses begin and end, as in a `Recording`, and how they are known."""
+
+    begun: Indices
+    lifted: Indices
+    source: Mapping[str, str]
+
+
+def assembled(path: Path, found: Sequence[tuple[Part, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
+    """The recording in the arrays of a file, each with the part of a mapping that it belongs to.
+
+    `time` has R values, `fibres` is (R, C), (C, R) or R values of one fibre, in one array or several. `press` has R
+    values. Places are (2, n) or (n, 2), or x and y of n values, for n = R readings or n = Q presses. Presses are where
+    `begun` and `lifted` say so, else `press`, else where places stand that are missing between presses; or they are
+    found in the readings. Where places, depths or forces are given a reading, that of a press is the one in the middle
+    of it.
+
+    Raises:
+        InputError: shapes that do not fit together, no press, or as `Recording`; the message names the file.
+    """
+    try:
+        return _assembled(found, source)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _assembled(found: Sequence[tuple[Part, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
+    given: dict[str, Array] = {}
+    fibres: list[Array] = []
+    for part, array in found:
+        factor = 1.0 if part.factor is None else part.factor
+        numbers = _numbers(part.quantity, array)
+        numbers = numbers if factor == 1 else _scaled(numbers, factor)
+        if part.quantity == "fibres":
+            fibres.append(numbers)
+        else:
+            given[part.quantity] = numbers if part.quantity == "places" else _vector(part.quantity, numbers)
+    times = given["time"]
+    columns = [_oriented(each, len(times)) for each in fibres]
+    readings = columns[0] if len(columns) == 1 else np.column_stack(columns)
+    places = _places(given)
+    timed = {part.quantity for part, _ in found if part.factor is not None}
+    for name in ("begun", "lifted"):
+        if name in timed:
+            given[name] = _first_at(times, given[name]).astype(np.float64)
+    presses = _told(given, places, len(times)) or _found(readings, times, source)
+    measures: dict[str, Any] = {
+        attribute: _of_presses(name, given[name], presses, len(times))
+        for name, attribute in MEASURES.items()
+        if name in given
+    }
+    said = {**source, **presses.source}
+    return Recording(readings, times, _pressed(places, presses, len(times)), *presses[:2], said, **measures)
+
+
+def _first_at(times_s: Array, events_s: Array) -> Indices:
+    """First of (R,) readings at or after each of (n,) times.
+
+    Times that were turned into another unit and back are off by a rounding, so the last thousandth of an interval
+    before an event counts as at it.
+    """
+    steps = np.diff(times_s)
+    return np.searchsorted(times_s, events_s - (1e-3 * np.median(steps) if len(steps) else 0.0))
+
+
+def _numbers(name: str, values: NDArray[Any]) -> Array:
+    values = np.asarray(values)
+    return as_numbers(values.astype(np.uint8) if values.dtype.kind == "b" else values, np.float64, name, copy=False)
+
+
+def _scaled(numbers: Array, factor: float) -> Array:
+    """Numbers in another unit; what stands for an unknown place stays what it is."""
+    with np.errstate(over="ignore"):  # what becomes infinite is refused as such
+        return np.where(numbers == UNKNOWN, UNKNOWN, numbers * factor)
+
+
+def _vector(name: str, values: Array) -> Array:
+    if values.size not in values.shape:
+        raise InputError(f"{name} has shape {values.shape}, expected one row or column")
+    return values.ravel()
+
+
+def _oriented(readings: Array, count: int) -> Array:
+    """Readings (R, c) of R = `count`, from such, (c, R) or (R,)."""
+    if readings.ndim in (1, 2) and len(readings) == count:
+        return readings[:, None] if readings.ndim == 1 else readings
+    if readings.ndim == 2 and readings.shape[1] == count:
+        return readings.T
+    raise InputError(f"fibres have shape {readings.shape}, expected ({count}, C) or (C, {count}), as time has it")
+
+
+def _places(given: Mapping[str, Array]) -> Array | None:
+    """Places (n, 2) of readings or presses; None where there are none."""
+    if "x" in given:
+        if len(given["x"]) != len(given["y"]):
+            raise InputError(f"x has {len(given['x'])} values and y {len(given['y'])}, expected as many")
+        return np.column_stack([given["x"], given["y"]])
+    places = given.get("places")
+    if places is not None and (places.ndim != 2 or 2 not in places.shape):
+        raise InputError(f"places have shape {places.shape}, expected (n, 2) or (2, n)")
+    return places if places is None or places.shape[1] == 2 else places.T
+
+
+def _told(given: Mapping[str, Array], places: Array | None, count: int) -> _Presses | None:
+    """Presses as the arrays tell them; None where they do not."""
+    if "begun" in given:
+        begun, lifted = (as_numbers(given[name], np.int64, name) for name in ("begun", "lifted"))
+        if len(begun) != len(lifted):
+            raise InputError(f"begun has {len(begun)} values and lifted {len(lifted)}, expected as many")
+        return _Presses(begun, lifted, {})
+    if "press" in given:
+        press = given["press"]
+        if len(press) != count:
+            raise InputError(f"press has {len(press)} values, expected {count}, one a reading")
+        return _runs(press[:, None], _contact(press))
+    if places is None or len(places) != count:
+        return None
+    empty = np.isnan(places)
+    half = empty[:, 0] != empty[:, 1]
+    if half.any():
+        raise InputError(f"places have one of x and y in row {int(np.argmax(half))}, expected both or neither")
+    down = ~empty[:, 0]
+    return _runs(places, down) if down.any() and not down.all() else None
+
+
+def _contact(press: Array) -> Mask:
+    """(R,) whether the pad is pressed: where `press` is not 0, or where it is neither missing nor below 0."""
+    none, zero = ~(press >= 0), press == 0
+    if none.any() and zero.any():
+        raise InputError(
+            f"press is missing or negative in row {int(np.argmax(none))} and 0 in row {int(np.argmax(zero))}, "
+            f"expected one of both where the pad is not pressed"
+        )
+    down = ~(none | zero)
+    if down.all() or not down.any():
+        what = "0, missing or negative" if down.all() else "above 0"
+        raise InputError(f"press is nowhere {what}; without it, presses are found in the readings")
+    return down
+
+
+def _runs(values: Array, down: Mask) -> _Presses:
+    """Presses that last while the pad is `down` (R,) and `values` (R, k) stay the same."""
+    before = np.vstack([np.full((1, values.shape[1]), np.nan), values[:-1]])
+    begun = np.flatnonzero(down & (values != before).any(axis=1))
+    ends = np.append(np.flatnonzero(~down), len(values))
+    lifted = np.minimum(ends[np.searchsorted(ends, begun)], np.append(begun[1:], len(values)))
+    return _Presses(begun, lifted, {})
+
+
+def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _Presses:
+    """Presses that the readings show."""
+    from sense.recordings.processing.press_detection import as_commanded, find_presses
+
+    first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
+    Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)
+    presses = find_presses(readings, times_s)
+    if len(presses.touched) == 0:
+        raise InputError("has no press: no place or number tells one, and none is found in the readings")
+    return _Presses(*as_commanded(presses, times_s), FOUND)
+
+
+def _pressed(places: Array | None, presses: _Presses, count: int) -> Array:
+    """(Q, 2) places of presses, NaN where they are unknown."""
+    if places is None:
+        return np.full((len(presses.begun), 2), np.nan)
+    places = _of_presses("places", places, presses, count)
+    return np.where(places == UNKNOWN, np.nan, places)
+
+
+def _of_presses(name: str, values: Array, presses: _Presses, count: int) -> Array:
+    """(Q, ...) values of presses, from such, or from (R, ...) of readings, R = `count`."""
+    if len(values) == len(presses.begun):
+        return values
+    if len(values) != count:
+        raise InputError(
+            f"{name} are {len(values)}, expected one for each of {len(presses.begun)} presses or {count} readings"
+        )
+    middle = (presses.begun + presses.lifted) // 2
+    return values[np.clip(middle, 0, count - 1)]

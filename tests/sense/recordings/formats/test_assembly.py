@@ -1,0 +1,135 @@
+"""Recordings put together from arrays, whichever way presses are told in them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design.common.errors import InputError
+from sense import Recording
+from sense.recordings.formats.assembly import FOUND, assembled
+from sense.recordings.formats.mapping import Part
+
+TIMES = np.arange(12) / 10
+VOLTS = np.arange(24.0).reshape(12, 2)
+PRESSED = np.array([0, 0, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0])
+PLACES = np.array([[1.0, 2], [-3, 4]])
+EDGES = {"begun": np.array([2, 7]), "lifted": np.array([5, 9])}
+AT = PLACES[[0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1]]
+"""Where the probe was meanwhile."""
+
+
+def made(arrays: Mapping[str, np.ndarray], **factors: float) -> Recording:
+    content = {"time": TIMES, "fibres": VOLTS} | dict(arrays)
+    return assembled(Path("f"), [(Part(name, "?", factors.get(name)), content[name]) for name in content], {})
+
+
+NUMBERED = PRESSED * np.array([5] * 6 + [3] * 6)
+MISSING = np.where(PRESSED, NUMBERED, np.nan)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        EDGES | {"places": PLACES},
+        EDGES | {"x": PLACES[:, 0], "y": PLACES[None, :, 1]},
+        EDGES | {"places": AT},
+        EDGES | {"places": AT.T},
+        {"press": PRESSED, "places": PLACES},
+        {"press": PRESSED.astype(bool)[:, None], "places": AT},
+        {"press": NUMBERED, "x": AT[:, 0], "y": AT[:, 1]},
+        {"press": MISSING, "places": AT},
+        {"press": np.where(PRESSED, NUMBERED, -1), "places": PLACES.T.astype(np.float32)},
+        {"places": np.where(PRESSED[:, None], AT, np.nan)},
+        {"x": np.where(PRESSED, AT[:, 0], np.nan), "y": np.where(PRESSED, AT[:, 1], np.nan)},
+    ],
+)
+def test_presses_are_told_in_many_ways(arrays: dict[str, np.ndarray]) -> None:
+    recording = made(arrays)
+    assert recording.begun.tolist() == [2, 7]
+    assert recording.lifted.tolist() == [5, 9]
+    # two places for two presses may lie either way; then rows are taken
+    assert recording.presses_mm.tolist() == (PLACES.T if arrays.get("places", AT).dtype == "f4" else PLACES).tolist()
+
+
+def test_readings_lie_one_way_or_the_other() -> None:
+    assert np.array_equal(made(EDGES | {"fibres": VOLTS.T}).readings, VOLTS)
+    one = made(EDGES | {"fibres": VOLTS[:, 0], "time": TIMES[None]})
+    assert np.array_equal(one.readings, VOLTS[:, :1])
+    parts = [(Part("time", ""), TIMES), (Part("fibres", ""), VOLTS[:, 1]), (Part("fibres", "", 2.0), VOLTS.T)]
+    several = assembled(Path("f"), [*parts, *((Part(name, ""), EDGES[name]) for name in EDGES)], {})
+    assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
+
+
+def test_units_are_put_right() -> None:
+    recording = made(
+        {
+            "time": 1000 * TIMES,
+            "fibres": (1000 * VOLTS).astype(np.int32),
+            "places": PLACES / 10,
+            "begun": np.array([150, 601]),
+            "lifted": np.array([500, 801]),
+        },
+        **{"time": 1e-3, "fibres": 1e-3, "places": 10, "begun": 1e-3, "lifted": 1e-3},
+    )
+    expected = made(EDGES | {"places": PLACES})
+    for name in ("times_s", "readings", "presses_mm", "begun", "lifted"):
+        np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
+
+
+def test_times_of_presses_may_be_a_rounding_off_those_of_readings() -> None:
+    times, begun = 0.0751879 * np.arange(4000), np.arange(20, 3900, 40)
+    told = {"time": times, "fibres": np.ones((4000, 1)), "places": np.zeros((len(begun), 2))}
+    recording = made(told | {"begun": 1000 * times[begun], "lifted": 1000 * times[begun + 20]}, begun=1e-3, lifted=1e-3)
+    assert np.array_equal(recording.begun, begun)
+    assert np.array_equal(recording.lifted, begun + 20)
+
+
+def test_presses_that_nothing_tells_are_found(recording: Recording) -> None:
+    at = np.full((len(recording.readings), 2), np.nan)
+    for place, begun in zip(recording.presses_mm, recording.begun, strict=True):
+        at[begun - 10 :] = place
+    at[:10] = recording.presses_mm[0]
+    content = {"time": recording.times_s[:800], "fibres": recording.readings[:800]}
+    for places in (recording.presses_mm[:20], at[:800]):
+        found = made(content | {"places": places})
+        assert np.array_equal(found.presses_mm, recording.presses_mm[:20])
+        assert np.abs(found.begun - recording.begun[:20]).max() <= 3
+        assert FOUND.items() <= found.source.items()
+    with pytest.raises(InputError, match="places are 19, expected one for each of 20 presses or 800 readings"):
+        made(content | {"places": recording.presses_mm[:19]})
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"time": np.ones((3, 4))}, r"time has shape \(3, 4\), expected one row or column"),
+        ({"time": np.float64(1)}, r"time has shape \(\)"),
+        ({"time": np.array(["a", "b"])}, "time are"),
+        ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), as time has it"),
+        ({"fibres": np.ones((12, 2, 2))}, "fibres have shape"),
+        ({"fibres": VOLTS * 1j}, "fibres are"),
+        ({"press": PRESSED[:11]}, "press has 11 values, expected 12, one a reading"),
+        (
+            {"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))},
+            "press is missing or negative in row 11 and 0",
+        ),
+        ({"press": 0 * PRESSED}, "press is nowhere above 0; without it, presses are found"),
+        ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
+        ({"press": 1 - PRESSED}, "press 0 goes from reading 0"),
+        ({"press": np.array([0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0, 0])}, "press 1 goes from reading 4"),
+        (EDGES | {"lifted": np.array([5])}, "begun has 2 values and lifted 1"),
+        (EDGES | {"begun": np.array([2.5, 7])}, "begun are .* whole numbers"),
+        (EDGES | {"begun": np.array([2, 4])}, "press 1 goes from reading 4"),
+        (EDGES | {"lifted": np.array([5, 10**9])}, "press 1 goes from"),
+        (EDGES | {"places": np.ones((3, 2))}, "places are 3, expected one for each of 2 presses or 12 readings"),
+        (EDGES | {"places": np.ones((2, 2, 2))}, r"places have shape \(2, 2, 2\)"),
+        (EDGES | {"x": np.ones(2), "y": np.ones(3)}, "x has 2 values and y 3"),
+        ({"places": np.where(np.arange(24).reshape(12, 2) == 6, 1.0, np.nan)}, "places have one of x and y in row 3"),
+        ({}, "has no press"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_one_line(arrays: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(InputError, match=f"f: {message}"):
+        made(arrays)

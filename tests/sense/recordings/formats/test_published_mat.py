@@ -1,0 +1,197 @@
+"""Recordings in MATLAB files: the published one, such as are cut off or go on, and files that are neither."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from design.common.errors import InputError
+from design.pad.morphology import Morphology
+from sense import RigSettings, import_mat, simulate
+
+MAT = "para5_long_first4500.mat"
+
+
+def test_the_published_recording_comes_in_as_it_is(published: Path) -> None:
+    recording = import_mat(published / MAT)
+    content = scipy.io.loadmat(published / MAT)
+    assert np.array_equal(recording.readings, content["voltage"])
+    assert np.array_equal(recording.presses_mm, content["pos"].T)
+    assert np.array_equal(recording.times_s, content["tim"].ravel())
+    assert recording.begun[:3].tolist() == [20, 60, 100]
+    assert recording.lifted[:3].tolist() == [40, 80, 120]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.99999])
+def test_a_truncated_recording_is_refused(published: Path, tmp_path: Path, share: float) -> None:
+    content = (published / MAT).read_bytes()
+    (tmp_path / "cut.mat").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match=r"cut\.mat"):
+        import_mat(tmp_path / "cut.mat")
+
+
+def good() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "voltage": rng.uniform(1, 2, (120, 4)),
+        "pos": rng.uniform(-9, 9, (2, 3)),
+        "tim": np.arange(120.0)[None] / 13,
+    }
+
+
+@pytest.mark.parametrize(
+    ("rows", "presses", "whole", "note"),
+    [
+        (120, 3, 3, None),
+        (111, 3, 2, "the last of 3 presses is left out, with 31 of 40 readings"),
+        (81, 3, 2, "the last of 3 presses is left out, with 1 of 40 readings"),
+        (80, 3, 2, "the last of 3 presses is left out, with 0 of 40 readings"),
+        (100, 2, 2, "the last 20 readings belong to no press"),
+        (120, 1, 1, "the last 80 readings belong to no press"),
+    ],
+)
+def test_presses_and_readings_may_end_apart(
+    tmp_path: Path, rows: int, presses: int, whole: int, note: str | None
+) -> None:
+    content = good()
+    cut = {"pos": content["pos"][:, :presses], "voltage": content["voltage"][:rows], "tim": content["tim"][:, :rows]}
+    scipy.io.savemat(tmp_path / "r.mat", cut)
+    recording = import_mat(tmp_path / "r.mat")
+    assert np.array_equal(recording.readings, cut["voltage"])
+    assert np.array_equal(recording.presses_mm, cut["pos"].T[:whole])
+    assert recording.lifted.tolist() == [40, 80, 120][:whole]
+    assert recording.source.get("note") == note
+
+
+def test_a_recording_of_1500_presses_that_ends_9_readings_early_comes_in(tmp_path: Path) -> None:
+    whole = simulate(Morphology.straight(2), RigSettings(presses=1500))
+    count = 40 * 1500 - 9
+    content = {"voltage": whole.readings[:count], "tim": whole.times_s[None, :count], "pos": whole.presses_mm.T}
+    scipy.io.savemat(tmp_path / "long.mat", content)
+    recording = import_mat(tmp_path / "long.mat")
+    assert len(recording.begun) == 1499
+    assert np.array_equal(recording.begun, whole.begun[:-1])
+    assert recording.source["note"] == "the last of 1500 presses is left out, with 31 of 40 readings"
+
+
+def newer(path: Path, content: dict[str, np.ndarray]) -> Path:
+    """A file as MATLAB writes it from version 7.3 on: HDF5 behind 512 bytes of text, all arrays transposed."""
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in content.items():
+            file.create_dataset(name, data=np.atleast_2d(values).T, chunks=True, compression="gzip")
+        file["name"] = np.frombuffer("pad".encode("utf-16-le"), np.uint16)[:, None]
+        file["cells"] = np.array([[file["name"].ref]], dtype=h5py.ref_dtype)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + b"\x00\x02IM")
+    return path
+
+
+def test_files_of_matlab_7_3_hold_the_same(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "old.mat", good())
+    new = newer(tmp_path / "new.mat", good())
+    assert import_mat(new) == import_mat(tmp_path / "old.mat")
+    lacking = newer(tmp_path / "lacking.mat", {"tim": good()["tim"]})
+    with pytest.raises(InputError, match=r"lacking\.mat: has no variable voltage \(found name, tim\)"):
+        import_mat(lacking)
+
+
+def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
+    content = good()
+    pressed = np.repeat(np.arange(120) % 40 >= 20, 1)
+    lab = {"t": 1000 * content["tim"], "U": content["voltage"].T, "c": pressed[None] * 1.0, "P": content["pos"] / 10}
+    mapping = "time=t:ms,fibres=U,press=c,places=P:cm"
+    scipy.io.savemat(tmp_path / "old.mat", lab)
+    for path in (tmp_path / "old.mat", newer(tmp_path / "new.mat", lab)):
+        recording = import_mat(path, mapping)
+        assert np.array_equal(recording.readings, content["voltage"])
+        np.testing.assert_allclose(recording.presses_mm, content["pos"].T)
+        assert recording.begun.tolist() == [20, 60, 100]
+    with pytest.raises(InputError, match=r"old\.mat: time is 'z', expected one of 't', 'U', 'c', 'P'"):
+        import_mat(tmp_path / "old.mat", "time=z,fibres=U")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("voltage", np.ones((79, 4)), r"voltage has shape \(79, 4\), expected 40 rows for each of the 3 presses"),
+        ("voltage", np.ones((4, 120)), "voltage has shape"),
+        ("voltage", np.full((120, 4), np.nan), "readings are all missing"),
+        ("voltage", np.ones((120, 4)) * 1j, "expected real numbers"),
+        ("voltage", np.array(["a", "b"], dtype=object), "expected real numbers"),
+        ("voltage", np.ones((39, 4)), r"voltage has shape \(39, 4\), expected at least 40 rows"),
+        ("voltage", np.ones((20, 6, 4)), "voltage has shape"),
+        ("voltage", scipy.sparse.csc_matrix(np.ones((120, 4))), "voltage is a csc_.*, expected a full matrix"),
+        ("voltage", {"volts": 1.0}, "expected real numbers"),
+        ("voltage", np.full((120, 4), 1e200), "readings hold 1e"),
+        ("pos", np.ones((3, 3)), r"pos has shape \(3, 3\)"),
+        ("pos", np.ones((1, 3)), r"pos has shape \(1, 3\), expected \(2, presses\)"),
+        ("pos", np.ones((2, 0)), "pos has shape"),
+        (
+            "pos",
+            np.ones((2, 5)),
+            "each of the 5 presses of pos, 200 in all; only the last may be cut off",
+        ),
+        ("pos", np.array([[1, 2, np.nan], [1, 2, 3]]), "press 2 has one of x and y"),
+        ("tim", np.where(np.arange(120) == 7, np.nan, np.arange(120)), r"times hold NaN .*first in row 7"),
+        ("tim", np.where(np.arange(120) == 7, 6, np.arange(120)), "times do not ascend at reading 7"),
+        ("tim", np.zeros((1, 120)), "do not ascend at reading 1"),
+        ("tim", np.arange(100.0), "times have shape"),
+    ],
+)
+def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value: np.ndarray, message: str) -> None:
+    scipy.io.savemat(tmp_path / "bad.mat", good() | {name: value})
+    with pytest.raises(InputError, match=message) as caught:
+        import_mat(tmp_path / "bad.mat")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mat_may_hold_what_real_rigs_give(tmp_path: Path) -> None:
+    content = good()
+    volts = content["voltage"]
+    holed = volts.copy()
+    holed[:, 1] = 3.3
+    holed[:, 2] = np.nan
+    holed[50:55] = np.nan
+    uneven = np.cumsum(np.random.default_rng(1).exponential(0.07, 120))[None]
+    for change in (
+        {"voltage": np.rint(volts * 1000 / 5).astype(np.uint16)},
+        {"voltage": volts.astype(np.float32)},
+        {"voltage": holed},
+        {"tim": uneven},
+        {"tim": content["tim"].T},
+        {"pos": content["pos"].T},
+    ):
+        scipy.io.savemat(tmp_path / "r.mat", content | change)
+        recording = import_mat(tmp_path / "r.mat")
+        assert np.array_equal(recording.readings, (content | change)["voltage"], equal_nan=True)
+        assert np.array_equal(recording.times_s, (content | change)["tim"].ravel())
+        assert np.array_equal(recording.presses_mm, content["pos"].T)
+
+
+def test_a_mat_of_one_press_comes_in(tmp_path: Path) -> None:
+    content = {name: values[..., :40] for name, values in good().items() if name == "tim"}
+    scipy.io.savemat(tmp_path / "r.mat", content | {"voltage": good()["voltage"][:40], "pos": [[1.0], [2.0]]})
+    recording = import_mat(tmp_path / "r.mat")
+    assert recording.presses_mm.tolist() == [[1, 2]]
+    assert (recording.begun.tolist(), recording.lifted.tolist()) == ([20], [40])
+
+
+def test_an_unrelated_mat_is_refused(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "other.mat", {"apples": 3})
+    with pytest.raises(InputError, match=r"no variable voltage, tim \(found apples\)"):
+        import_mat(tmp_path / "other.mat")
+
+
+def test_a_mat_without_places_has_presses_of_unknown_place(tmp_path: Path) -> None:
+    content = good()
+    scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
+    blind = import_mat(tmp_path / "blind.mat")
+    assert not blind.known.any()
+    assert blind.begun.tolist() == [20, 60, 100]
+    pos = np.array(content["pos"], dtype=float)
+    pos[:, 1] = np.nan
+    scipy.io.savemat(tmp_path / "partly.mat", content | {"pos": pos})
+    assert import_mat(tmp_path / "partly.mat").known.tolist() == [True, False, True]
