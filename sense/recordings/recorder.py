@@ -3,12 +3,14 @@
 It holds `start.json` (what was recorded, with what), `readings.bin` and, of a real or emulated arm, `states.bin`
 (see `block_file`), and `journal.ndjson`: one line as a press begins, with its place and the index of its first
 reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done, so
-after a kill every press the journal calls done can be used, and the others are repeated.
+after a kill every press the journal calls done can be used, and the others are repeated. `start.json` comes last when a
+recording is born: a folder without it holds nothing, and a recording can begin there.
 """
 
 import contextlib
 import json
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, shown, whole
-from design.common.files import lock, read_json, refuse_unwritable, write_json, writing
+from design.common.files import UNFINISHED, lock, read_json, refuse_unwritable, sync, write_json, writing
 from sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, write_at
@@ -25,6 +27,9 @@ from .press_journal import cut_torn_line, read_journal
 
 FORMAT = "padforge-recording/1"
 START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+_UNBORN = UNFINISHED + START
+_BIRTH = (JOURNAL, READINGS, _UNBORN)
+"""What is made before `start.json`, in this order."""
 
 
 class Recorder:
@@ -33,38 +38,39 @@ class Recorder:
     Nothing is promised to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
 
     Attributes:
+        fibres: C, values of a reading.
         done: numbers of the presses that are done.
         readings: how many readings there are.
         last_s: time of the last reading or state, s; -inf where there is none.
 
     Raises:
-        InputError: `path` exists and is not an empty directory, or cannot be written, or too few or many fibres.
+        InputError: `path` is in the way, see `refuse_begun`, or cannot be written, or too few or many fibres.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
         fibres = whole("fibres", fibres, 1, MAX_FIBRES)
-        refuse_existing(path)
+        refuse_begun(path)
         document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-            try:  # of two that start at once, one makes this file
-                self._stream: BinaryIO = (path / READINGS).open("xb", buffering=0)
-            except FileExistsError:
-                refuse_existing(path)
-                raise
-            try:
-                write_json(path / START, document)
-                self._journal: BinaryIO = (path / JOURNAL).open("xb", buffering=0)
-                lock(self._journal, _busy(path))
-            except BaseException:
-                self._stream.close()
-                for name in (JOURNAL, START, READINGS):  # a part of a recording would be in the way of another try
-                    (path / name).unlink(missing_ok=True)
-                raise
+            there = {file.name for file in path.iterdir()}
+            self._journal: BinaryIO = _claimed(path)
+            with contextlib.ExitStack() as undo:
+                undo.callback(self._journal.close)  # the last thing, for it lets others in
+                for name in {*_BIRTH, START} - there:
+                    undo.callback((path / name).unlink, missing_ok=True)
+                self._stream: BinaryIO = _opened(path / READINGS)
+                undo.callback(self._stream.close)
+                write_json(path / _UNBORN, document)
+                sync(path / _UNBORN)
+                (path / _UNBORN).replace(path / START)
+                sync(path)
+                sync(path.parent)
+                undo.pop_all()
         self._begin_with(path, BlockWriter(self._stream, fibres), 0)
 
     def _begin_with(self, path: Path, blocks: BlockWriter, noted: int) -> None:
-        self._path, self._blocks, self._fibres = path, blocks, blocks.fibres
+        self._path, self._blocks, self.fibres = path, blocks, blocks.fibres
         self._noted = noted  # bytes of the journal
         self._states: tuple[BlockWriter, BinaryIO] | None = None
         self._lines: list[str] = []
@@ -81,6 +87,10 @@ class Recorder:
             InputError: no run directory, or damage elsewhere than at its end.
         """
         fibres = fibres_of(path)
+        if _unborn(path):  # broken off before the first reading
+            with writing(path):
+                for name in (JOURNAL, READINGS):
+                    (path / name).touch()
         done = read_journal(path / JOURNAL)
         self = cls.__new__(cls)
         with writing(path):
@@ -116,10 +126,10 @@ class Recorder:
             OSError: the disk is full or gone; then nothing was added.
         """
         times, volts = as_numbers(times_s, np.float64, "times"), as_numbers(readings, np.float64, "readings")
-        if times.ndim != 1 or volts.shape != (len(times), self._fibres) or not np.isfinite(times).all():
+        if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
             raise InputError(
                 f"times have shape {times.shape} and readings {volts.shape}, expected (n,) finite numbers and "
-                f"(n, {self._fibres})"
+                f"(n, {self.fibres})"
             )
         rows = np.column_stack([times, volts])
         self._blocks.append(rows)
@@ -212,6 +222,34 @@ def _busy(path: Path) -> str:
     return f"{path}: another program is recording into it"
 
 
+def _opened(path: Path) -> BinaryIO:
+    path.touch()
+    return path.open("r+b", buffering=0)
+
+
+def _claimed(path: Path) -> BinaryIO:
+    """The journal of a recording that is to be born in `path`, kept from others; of several that come, one gets it."""
+    journal = _opened(path / JOURNAL)
+    try:
+        lock(journal, _busy(path))
+        if not os.path.samestat(os.fstat(journal.fileno()), (path / JOURNAL).stat()):
+            raise InputError(_busy(path))  # who had it first gave up and took it away
+        refuse_begun(path)
+    except BaseException:
+        journal.close()
+        raise
+    return journal
+
+
+def _unborn(path: Path) -> bool:
+    """Whether a folder holds nothing but what is made before `start.json`, and that itself; no reading, no press."""
+    return all(
+        file.name in (START, _UNBORN)
+        or (file.name in _BIRTH and stat.S_ISREG(file.lstat().st_mode) and file.stat().st_size == 0)
+        for file in path.iterdir()
+    )
+
+
 def fibres_of(path: Path) -> int:
     """The number of fibres a run directory was recorded of.
 
@@ -224,6 +262,13 @@ def fibres_of(path: Path) -> int:
     if type(fibres) is not int or not 1 <= fibres <= MAX_FIBRES:
         raise InputError(f"{path / START}: fibres is {fibres!r}, allowed is 1 to {MAX_FIBRES}")
     return fibres
+
+
+def refuse_begun(path: Path) -> None:
+    """As `refuse_existing`, but for a recording that was broken off while it was being born: one can begin there."""
+    refuse_unwritable(path)
+    if path.exists() and ((path / START).exists() or not _unborn(path)):
+        refuse_existing(path)
 
 
 def refuse_existing(path: Path) -> None:

@@ -1,6 +1,7 @@
 """Whatever is left of a run directory, it goes on from there: no finished press lost, nothing else taken for one."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from design.common.errors import InputError
 from sense.recordings.block_file import block_dtype
 from sense.recordings.press_journal import read_journal
-from sense.recordings.recorder import JOURNAL, READINGS, STATES, Recorder
+from sense.recordings.recorder import JOURNAL, READINGS, START, STATES, Recorder
 from sense.recordings.recording import Recording
 from tests.helpers.effort import few
 
@@ -176,3 +177,65 @@ def test_presses_without_a_number_count_on_from_the_last(tmp_path):
         recorder.begin((0, 0), recorder.readings)
         recorder.finish(recorder.readings)
         assert recorder.done == {0, 1, 2, 7, 8}
+
+
+def die_being_born(path, step):
+    """Begin a recording in a process that ends where it puts something on the disk for the `step`th time."""
+    if os.fork() == 0:
+        left = iter(range(step))
+        os.fsync = lambda file: None if next(left, None) is not None else os._exit(0)
+        Recorder(path, FIBRES, {}, {})
+        os._exit(0)
+    os.wait()
+
+
+def test_a_recording_that_was_killed_while_being_born_can_be_made_again(tmp_path):
+    """Until `start.json` is there it begins anew, then it goes on."""
+    begun = []
+    for step in range(4):
+        path = tmp_path / str(step) / "run"
+        path.parent.mkdir()
+        die_being_born(path, step)
+        begun.append((path / START).exists())
+        with Recorder.resume(path) if begun[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
+            record(recorder, range(2), 0.0)
+        assert len(Recording.open(path).presses_mm) == 2
+        assert {file.name for file in path.iterdir()} == {START, READINGS, STATES, JOURNAL}
+    assert begun == [False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("files", "resumes"), [((READINGS,), False), ((READINGS, JOURNAL), False), ((READINGS, START), True)]
+)
+def test_what_is_left_of_a_birth_is_in_nobodys_way(tmp_path, files, resumes):
+    whole = made(tmp_path, presses=0)
+    (tmp_path / "half").mkdir()
+    for name in files:
+        (tmp_path / "half" / name).write_bytes((whole / START).read_bytes() if name == START else b"")
+    if resumes:
+        with pytest.raises(InputError, match="never written over"):
+            Recorder(tmp_path / "half", FIBRES, {}, {})
+    with Recorder.resume(tmp_path / "half") if resumes else Recorder(tmp_path / "half", FIBRES, {}, {}) as recorder:
+        record(recorder, range(2), 0.0)
+    assert len(Recording.open(tmp_path / "half").presses_mm) == 2
+
+
+@pytest.mark.parametrize("name", [READINGS, "notes.txt", ".unfinished-0123456789abcdef.json"])
+def test_what_another_left_is_in_the_way_and_stays(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    (tmp_path / JOURNAL).touch()
+    with pytest.raises(InputError, match="exists and is not empty"):
+        Recorder(tmp_path, FIBRES, {}, {})
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "mine", JOURNAL: ""}
+
+
+def test_a_birth_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    def full(file):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(InputError, match="No space left"):
+            Recorder(tmp_path / "run", FIBRES, {}, {})
+    assert list((tmp_path / "run").iterdir()) == []
+    made(tmp_path)
