@@ -23,7 +23,8 @@ def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path | None
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, sd_x_mm, sd_y_mm (standard
-    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases).
+    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
+    of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
     from sense.health.model_folder import examined, has_health
     from sense.localizer import locating

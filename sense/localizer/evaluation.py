@@ -1,7 +1,8 @@
 """Evaluation: how far off a localizer is, by sets of lost fibres, by place, and whether its radii hold."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
 from .features import bridged, window_inputs
-from .localizer import Found, Localizer
+from .localizer import Found, Localizer, Measured
 
 FORMAT = "padforge-calibration/1"
 CELLS = 5
@@ -29,9 +30,10 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     Returns:
         A document with "errors", one row per level: how many sets of lost fibres were tried; mean, standard deviation
         and greatest of their mean errors; median and 95th percentile over all their presses, mm; shares of presses
-        within the radii of 50 and 90 %. Besides "split" ("none" for another recording), "test_presses", "by_subset"
-        (mean error of each set), "by_place" (`by_place`), "idle_share" of each fibre, and "test" (places pressed, and
-        found with all fibres).
+        within the radii of 50 and 90 %; where they were learnt and are known, the mean and 95th percentile of the error
+        of depths and forces, and the share within their r90. Besides "split" ("none" for another recording),
+        "test_presses", "by_subset" (mean error of each set), "by_place" (`by_place`), "idle_share" of each fibre, and
+        "test" (places, depths and forces pressed, and found with all fibres).
 
     Raises:
         InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
@@ -54,7 +56,9 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     if len(test) == 0:
         raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
     inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
-    rows, by_subset = errors_by_loss(localizer.fibres, levels, partial(localizer.locate, inputs), places_mm)
+    measures = {name: values[test] for name, values in recording.measures.items()}
+    locate = partial(localizer.locate, inputs)
+    rows, by_subset = errors_by_loss(localizer.fibres, levels, locate, places_mm, measures)
     whole = localizer.locate(inputs)
     return {
         "format": FORMAT,
@@ -69,6 +73,7 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
             "pressed_mm": places_mm.tolist(),
             "found_mm": whole.places_mm.tolist(),
             "r90_mm": whole.r90_mm.tolist(),
+            **_measures_told(whole, measures),
         },
         "provenance": dict(localizer.provenance),
     }
@@ -89,14 +94,31 @@ def held_back(localizer: Localizer, recording: Recording) -> Indices:
     return np.array(localizer.test, dtype=np.int64)
 
 
+def _measures_told(found: Found, measures: Mapping[str, Array]) -> dict[str, Any]:
+    """Depths and forces found, their `r90`, and what they were, None where that is not known; by name."""
+    return {
+        name: {
+            "pressed": [None if isnan(value) else value for value in measures[name].tolist()],
+            "found": each.values.tolist(),
+            "r90": each.r90.tolist(),
+        }
+        for name, each in found.measures.items()
+    }
+
+
 def errors_by_loss(
-    fibres: int, levels: Iterable[int], locate: Callable[[tuple[int, ...]], Found], places_mm: Array
+    fibres: int,
+    levels: Iterable[int],
+    locate: Callable[[tuple[int, ...]], Found],
+    places_mm: Array,
+    measures: Mapping[str, Array] | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """ "errors" and "by_subset" as `evaluate` gives them.
 
     Args:
         fibres: how many there are. levels: how many are lost.
         locate: finds the presses without the fibres given by index. places_mm: (Q, 2) where they were.
+        measures: (Q,) how deep and forceful they were, see `Recording.measures`.
 
     Raises:
         InputError: a level that leaves no fibre.
@@ -106,7 +128,7 @@ def errors_by_loss(
         level = whole("lost", level, 0, fibres - 1)
         subsets = lost_subsets(fibres, level)
         found = [locate(subset) for subset in subsets]
-        rows.append(error_row(level, found, places_mm))
+        rows.append(error_row(level, found, places_mm, measures))
         by_subset += [
             {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
             for subset, each in zip(subsets, found, strict=True)
@@ -119,8 +141,10 @@ def distances(found_mm: Array, pressed_mm: Array) -> Array:
     return np.hypot(*(found_mm - pressed_mm).T)
 
 
-def conformal(found: Sequence[Found], places_mm: Array) -> Array:
-    """(3,) factors by which standard deviations and the radii of 50 and 90 % must grow to be right for these presses.
+def conformal(found: Sequence[Found], places_mm: Array, measures: Mapping[str, Array] | None = None) -> Array:
+    """(3 + T,) factors by which standard deviations, the radii of 50 and 90 %, and the r90 of T measures must grow.
+
+    They are then right for these presses.
 
     The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
     distance over radius on presses never trained on, a rank higher than their share, as if the next were one; so of few
@@ -128,13 +152,30 @@ def conformal(found: Sequence[Found], places_mm: Array) -> Array:
 
     Args:
         found: the Q presses, with each of some sets of lost fibres. places_mm: (Q, 2).
+        measures: (Q,) of those that were learnt; where none is known its factor is 1.
     """
     off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
     errors = [distances(each.places_mm, places_mm) for each in found]
     share = 1 + 1 / len(places_mm)
     r50 = np.quantile([error / each.r50_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.5 * share))
     r90 = np.quantile([error / each.r90_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.9 * share))
-    return np.array([np.sqrt(np.square(off).mean()), r50, r90])
+    more = [_conformal_r90(each) for each in _paired(found, measures).values()]
+    return np.array([np.sqrt(np.square(off).mean()), r50, r90, *more])
+
+
+def _conformal_r90(pairs: list[tuple[Measured, Array]]) -> float:
+    """The factor of `conformal` of the r90 of a measure."""
+    ratios = np.array([np.abs(each.values - true) / each.r90 for each, true in pairs])
+    ratios = ratios[:, np.isfinite(ratios).all(axis=0)]
+    presses = ratios.shape[1]
+    return float(np.quantile(ratios, min(1.0, 0.9 * (1 + 1 / presses)))) if presses else 1.0
+
+
+def _paired(found: Sequence[Found], measures: Mapping[str, Array] | None) -> dict[str, list[tuple[Measured, Array]]]:
+    """Of each measure learnt, how it was found with each set of lost fibres, and what it was; NaN if unknown."""
+    names = list(found[0].measures)
+    unknown = np.full(len(found[0].places_mm), np.nan)
+    return {name: [(each.measures[name], (measures or {}).get(name, unknown)) for each in found] for name in names}
 
 
 def by_place(found_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
@@ -166,8 +207,10 @@ def idle_share(recording: Recording) -> Array:
     return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
 
 
-def error_row(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]:
-    """A row of "errors" from what was found with each set of so many lost fibres."""
+def error_row(
+    lost: int, found: list[Found], places_mm: Array, measures: Mapping[str, Array] | None = None
+) -> dict[str, Any]:
+    """A row of "errors" from what was found with each set of so many lost fibres, and what was pressed."""
     errors = np.stack([distances(each.places_mm, places_mm) for each in found])
     means = errors.mean(axis=1)
     return {
@@ -180,4 +223,22 @@ def error_row(lost: int, found: list[Found], places_mm: Array) -> dict[str, Any]
         "p95_mm": float(np.percentile(errors, 95)),
         "within_r50": float(np.mean([error <= each.r50_mm for error, each in zip(errors, found, strict=True)])),
         "within_r90": float(np.mean([error <= each.r90_mm for error, each in zip(errors, found, strict=True)])),
+        **_measure_errors(found, measures),
     }
+
+
+def _measure_errors(found: Sequence[Found], measures: Mapping[str, Array] | None) -> dict[str, float]:
+    """What a row of "errors" says of the measures that were learnt and are known."""
+    out = {}
+    for name, pairs in _paired(found, measures).items():
+        kind, unit = name.rsplit("_", 1)
+        known = ~np.isnan(pairs[0][1])
+        if known.any():
+            errors = np.stack([np.abs(each.values - true)[known] for each, true in pairs])
+            within = [error <= each.r90[known] for error, (each, _) in zip(errors, pairs, strict=True)]
+            out |= {
+                f"{kind}_mean_{unit}": float(errors.mean()),
+                f"{kind}_p95_{unit}": float(np.percentile(errors, 95)),
+                f"{kind}_within_r90": float(np.mean(within)),
+            }
+    return out

@@ -1,7 +1,10 @@
-"""The localizer: from the readings of a press to its place, with any fibres lost. Needs no torch."""
+"""The localizer: from the readings of a press to its place, with any fibres lost. Needs no torch.
+
+Where it has learnt from presses of several depths, it finds their depth too, and their force where that was known.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from sense.recordings.recording import Recording
 
 from .features import SIZES, Inputs, press_inputs
 from .network import Weights, forward, masked, pooled, refuse_unsound
-from .normalization import Normalization, Scaled
+from .normalization import Normalization, Scaled, Target
 from .schema import FORMAT, read_document
 
 NAME = "localizer"
@@ -29,18 +32,43 @@ _CHUNK = 8192
 
 
 @dataclass(frozen=True)
+class Measured:
+    """A measure of Q presses, and how sure it is.
+
+    Attributes:
+        values: (Q,). r90: (Q,) half the width around it that holds the press's own in 90 % of cases.
+    """
+
+    values: Array
+    r90: Array
+
+
+@dataclass(frozen=True)
 class Found:
     """Places found for Q presses, and how sure they are.
 
     Attributes:
         places_mm: (Q, 2). sd_mm: (Q, 2) standard deviation in x and in y.
         r50_mm, r90_mm: (Q,) radius around the place that holds the press in 50 % and in 90 % of cases.
+        measures: depth and force, by the names of `Recording.measures`, where they were learnt.
     """
 
     places_mm: Array
     sd_mm: Array
     r50_mm: Array
     r90_mm: Array
+    measures: Mapping[str, Measured] = field(default_factory=dict)
+
+
+def joined(parts: Sequence[Found]) -> Found:
+    """What was found in several parts, at least one, by localizers that learnt the same."""
+
+    def whole(of: Sequence[object]) -> dict[str, Array]:
+        names = [name for name, value in vars(of[0]).items() if isinstance(value, np.ndarray)]
+        return {name: np.concatenate([getattr(part, name) for part in of]) for name in names}
+
+    measures = {name: Measured(**whole([part.measures[name] for part in parts])) for name in parts[0].measures}
+    return Found(**whole(parts), measures=measures)
 
 
 @dataclass(frozen=True)
@@ -53,8 +81,8 @@ class Localizer:
         table: (S, S, C, F) scaled inputs by place, see `ResponseModel`; what a recalibration moves presses by.
         method: which network and training, of `settings.Method`.
         features: which inputs it takes, of `features.FEATURES`.
-        factors: (K, 3) by number of lost fibres, what makes of the expected error a standard deviation, and the radii
-            of 50 % and of 90 %; found on presses never trained on.
+        factors: (K, 3 + T) by number of lost fibres, what makes of the expected error a standard deviation, the radii
+            of 50 % and of 90 %, and the `r90` of each of T measures learnt; found on presses never trained on.
         rate_hz: readings per second of the recording it learnt from.
         learnt_from: digest of that recording, `test`: its presses that were held back, by index, and `split`: how.
         recalibrated_by: digests of the recordings that it was recalibrated by, all of whose presses it has seen.
@@ -108,18 +136,26 @@ class Localizer:
             raise InputError("fibres are lost: a published localizer knows none, train one of method masked")
         chunks = range(0, len(presses), _CHUNK)
         found = [self._pooled(presses.inputs[i : i + _CHUNK], alive[i : i + _CHUNK]) for i in chunks]
-        places, spread = (
-            (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (np.empty((0, 2)),) * 2
+        learnt = self.normalization.measures
+        nothing = np.empty((0, 2 + len(learnt)))
+        numbers, spreads = (
+            (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (nothing, nothing)
         )
+        places, spread = numbers[:, :2], spreads[:, :2]
         level = np.minimum((~alive).sum(axis=1), len(self.factors) - 1)
-        to_sd, to_r50, to_r90 = self.factors[level].T * self.normalization.span_mm
+        to_sd, to_r50, to_r90 = self.factors[level, :3].T * self.normalization.span_mm
         radius = np.hypot(*spread.T)
         sd, r50, r90 = to_sd[:, None] * spread, to_r50 * radius, to_r90 * radius
         blind = np.logical_not(alive.all(axis=1) if self.method == "published" else alive.any(axis=1))
         anywhere = np.array(UNKNOWN) * self.normalization.span_mm
         places, sd = np.where(blind[:, None], 0.0, places), np.where(blind[:, None], anywhere[0], sd)
         r50, r90 = np.where(blind, anywhere[1], r50), np.where(blind, anywhere[2], r90)
-        return Found(self.normalization.places_mm(places), sd, r50, r90)
+        measures = {}
+        for column, target in enumerate(learnt):
+            half = self.factors[level, 3 + column] * spreads[:, 2 + column]
+            value = np.where(blind, 0.0, numbers[:, 2 + column])
+            measures[target.name] = Measured(target.values(value), target.span * np.where(blind, 1.0, half))
+        return Found(self.normalization.places_mm(places), sd, r50, r90, measures)
 
     def _pooled(self, inputs: Floats, alive: Mask) -> tuple[Floats, Floats]:
         entries = inputs.reshape(len(inputs), -1) if self.method == "published" else masked(inputs, alive)
@@ -158,6 +194,11 @@ class Localizer:
                 "usual_v": self.normalization.usual.tolist(),
                 "middle_mm": self.normalization.middle_mm.tolist(),
                 "span_mm": self.normalization.span_mm,
+                **(
+                    {"measures": [asdict(each) for each in measures]}
+                    if (measures := self.normalization.measures)
+                    else {}
+                ),
             },
             "factors": self.factors.tolist(),
             "weights_sha256": "",  # known when they are written
@@ -188,11 +229,13 @@ class Localizer:
             np.array(document.scaling.usual_v).reshape(document.fibres, -1),
             np.array(document.scaling.middle_mm),
             document.scaling.span_mm,
+            tuple(Target(each.name, each.middle, each.span) for each in document.scaling.measures),
         )
         with files.arrays(document.weights_sha256, "the localizer") as weights:
             table = weights.pop(TABLE)
             normalization.refuse_unsound(table)
-            refuse_unsound(weights, normalization.entries(document.method), document.method)
+            entries = normalization.entries(document.method)
+            refuse_unsound(weights, entries, document.method, len(normalization.measures))
         plain = ("method", "features", "rate_hz", "learnt_from", "split", "provenance")
         return cls(
             weights,
@@ -201,6 +244,6 @@ class Localizer:
             factors=np.array(document.factors),
             test=tuple(document.test),
             recalibrated_by=tuple(document.recalibrated_by),
-            errors=[row.model_dump() for row in document.errors],
+            errors=[row.model_dump(exclude_none=True) for row in document.errors],
             **{name: getattr(document, name) for name in plain},
         )

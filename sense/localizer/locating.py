@@ -1,4 +1,4 @@
-"""Places found, as CSV: one line a press, with how sure it is."""
+"""Places found, as CSV, and depths and forces where they were learnt: one line a press, with how sure it is."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,19 +15,23 @@ from sense.recordings.recording import Recording
 from .localizer import Found, Localizer
 
 COLUMNS = ("press", "x_mm", "y_mm", "sd_x_mm", "sd_y_mm", "r50_mm", "r90_mm")
-"""Press, counted from 0; place from the pad's centre; standard deviations; radii that hold 50 % and 90 % of presses."""
+"""Press, counted from 0; place from the pad's centre; standard deviations; radii that hold 50 % and 90 % of presses.
+Where they were learnt, `MEASURED` follow: depth, force, and how far beside them 90 % of presses are at most."""
+MEASURED = {"depth_mm": ("depth_mm", "depth_r90_mm"), "force_n": ("force_n", "force_r90_n")}
 
 
 def write_places(found: Found, path: str | Path) -> None:
-    """Write what was found for Q presses as CSV with the columns `COLUMNS`, atomically.
+    """Write what was found for Q presses as CSV with the columns `COLUMNS` and `MEASURED`, atomically.
 
     Raises:
         InputError: `path` cannot be written.
     """
-    table = np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm])
+    more = [column for each in found.measures.values() for column in (each.values, each.r90)]
+    table = np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm, *more])
+    names = (*COLUMNS, *(name for measure in found.measures for name in MEASURED[measure]))
     lines = [",".join([str(press), *(f"{value:.4f}" for value in row)]) for press, row in enumerate(table.tolist())]
     with writing(Path(path)):
-        write_text(Path(path), "\n".join([",".join(COLUMNS), *lines]) + "\n")
+        write_text(Path(path), "\n".join([",".join(names), *lines]) + "\n")
 
 
 def locate(

@@ -1,9 +1,9 @@
 """The networks of the localizer, in NumPy: what they compute, apart from how they are trained.
 
 Of the method "masked": masked inputs enter together with the mask, so one network serves every set of lost fibres. A
-first layer leads to residual layers h + gelu(normalised h) W + b, and a normalised last one to two coordinates and the
-logarithms of their expected errors. Members of an ensemble are stacked along the first axis of every array. Of the
-method "published": one layer of tanh neurons leads to two coordinates.
+first layer leads to residual layers h + gelu(normalised h) W + b, and a normalised last one to two coordinates, to what
+else is learnt of a press, and to the logarithms of the expected errors of all these. Members of an ensemble are stacked
+along the first axis of every array. Of the method "published": one layer of tanh neurons leads to two coordinates.
 """
 
 from collections.abc import Mapping
@@ -15,12 +15,13 @@ from design.common.errors import InputError
 from sense.recordings.processing.limits import Floats, Mask
 
 Weights = Mapping[str, Floats]
-"""`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 4) and
-`last.b` (E, 1, 4), for E members, D inputs, H hidden units and L residual layers; of the published network, E = 1,
-no `hidden`, and 2 in place of 4."""
+"""`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
+`last.b` (E, 1, 2 N), for E members, D inputs, H hidden units, L residual layers and N numbers learnt, the first of them
+x and y; of the published network, E = 1, no `hidden`, and 2 in place of 2 N."""
 
 OUTPUTS = 4
-"""x, y, and the logarithms of the mean absolute errors expected of them, all in units of the localizer's span."""
+"""x, y, and the logarithms of the mean absolute errors expected of them, all in units of the localizer's span. What
+else is learnt follows y, in units of its own span, and its logarithms follow theirs."""
 EPSILON = 1e-5
 """Added to the variance that a layer is normalised by."""
 LEAST_LOG, MOST_LOG = -9.0, 2.0
@@ -29,14 +30,18 @@ MAX_WEIGHT = 1e4
 """Greatest weight of a sound network, far above any that training ends with; no sum of a pass overflows below it."""
 
 
-def refuse_unsound(weights: Weights, entries: int, method: str) -> None:
-    """Raise InputError unless `weights` are those of a network that takes `entries` numbers, and all of them sane."""
+def refuse_unsound(weights: Weights, entries: int, method: str, measures: int = 0) -> None:
+    """Raise InputError unless `weights` are those of a network that takes `entries` numbers, and all of them sane.
+
+    Args:
+        measures: how many numbers it gives beside the place, each with an expected error.
+    """
     found = {name: weight.shape for name, weight in weights.items()}
     first, layers = found.get("first.w", ()), found.get("hidden.w", (0,))[:1]
     if len(first) != 3 or len(layers) != 1 or 0 in first:
         raise InputError(f"weights have shapes {found}, expected first.w (E, D, H) and others")
     members, _, hidden = first
-    outputs = OUTPUTS if method == "masked" else 2
+    outputs = OUTPUTS + 2 * measures if method == "masked" else 2
     expected = {
         "first.w": (members, entries, hidden),
         "first.b": (members, 1, hidden),
@@ -70,7 +75,7 @@ def masked(inputs: Floats, alive: Mask) -> Floats:
 
 
 def forward(weights: Weights, x: Floats) -> Floats:
-    """(Q, D) entries to (E, Q, 4): places and logarithms of expected errors, see `OUTPUTS`.
+    """(Q, D) entries to (E, Q, 2 N): what is learnt and logarithms of expected errors, see `OUTPUTS`.
 
     The published network expects the same error of every press, which is called 1.
     """
@@ -84,14 +89,14 @@ def forward(weights: Weights, x: Floats) -> Floats:
 
 
 def pooled(outputs: Floats) -> tuple[Floats, Floats]:
-    """(E, Q, 4) outputs of all members to one place (Q, 2) and its standard deviations (Q, 2), in units of the span.
+    """(E, Q, 2 N) outputs of all members to (Q, N) numbers learnt and their standard deviations, in units of spans.
 
     A member's error is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b; the spread of the
     members adds to it (Lakshminarayanan et al. 2017, Simple and scalable predictive uncertainty).
     """
-    places, logs = outputs[:, :, :2], np.clip(outputs[:, :, 2:], LEAST_LOG, MOST_LOG)
-    variance = (2 * np.exp(2 * logs)).mean(axis=0) + places.var(axis=0)
-    return places.mean(axis=0), np.sqrt(variance)
+    learnt, logs = np.split(outputs, 2, axis=2)
+    variance = (2 * np.exp(2 * np.clip(logs, LEAST_LOG, MOST_LOG))).mean(axis=0) + learnt.var(axis=0)
+    return learnt.mean(axis=0), np.sqrt(variance)
 
 
 def _gelu(x: Floats) -> Floats:

@@ -1,5 +1,10 @@
-"""How the inputs of presses become numbers of about 1, and what the network gives becomes mm."""
+"""How the inputs of presses become numbers of about 1, and what the network gives becomes mm and N.
 
+Where presses of several depths were learnt from, the network gives depths (and forces) as well, and inputs are measured
+from no press at all, so that they are in proportion to the depth.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +38,34 @@ class Scaled:
 
 
 @dataclass(frozen=True)
+class Target:
+    """What the network gives beside the place.
+
+    Attributes:
+        name: one of `Recording.measures`. middle: the value that the network calls 0. span: the difference that it
+            calls 1; both in the unit that the name ends in.
+    """
+
+    name: str
+    middle: float
+    span: float
+
+    @classmethod
+    def of(cls, name: str, values: Array) -> "Target":
+        """The one that puts (Q,) known values within [-1, 1]."""
+        low, high = float(values.min()), float(values.max())
+        return cls(name, (low + high) / 2, (high - low) / 2 or 1.0)
+
+    def scaled(self, values: Array) -> Array:
+        """(Q,) values to what the network gives."""
+        return (values - self.middle) / self.span
+
+    def values(self, scaled: Array) -> Array:
+        """What the network gives to values."""
+        return scaled * self.span + self.middle
+
+
+@dataclass(frozen=True)
 class Normalization:
     """Fitted on the presses of training.
 
@@ -40,6 +73,7 @@ class Normalization:
         centre, spread: (C, F) V; an input enters as (input - centre) / spread.
         memory: (C, J, F) V/V, what of a volt of history shows in the inputs; usual: (C, J) V, the usual history.
         middle_mm: (2,) place that the network calls 0. span_mm: distance that it calls 1.
+        measures: what the network gives beside the place; none, the depth, or depth and force, in this order.
     """
 
     centre: Array
@@ -48,28 +82,36 @@ class Normalization:
     usual: Array
     middle_mm: Array
     span_mm: float
+    measures: Sequence[Target] = ()
 
     @classmethod
-    def fit(cls, inputs: Inputs, places_mm: Array) -> tuple["Normalization", Floats]:
-        """From the inputs and the places (Q, 2) of the presses of training.
+    def fit(
+        cls, inputs: Inputs, places_mm: Array, measures: Mapping[str, Array] | None = None
+    ) -> tuple["Normalization", Floats]:
+        """From the inputs and the places (Q, 2) of the presses of training, and (Q,) of each measure to be learnt.
 
         A window is scaled by the geometric mean of its own spread and its fibre's: the fine windows of a touch keep
         some of their smallness, and so of their noise. What never varied is left as large as it is.
 
         Returns:
-            The scaling, and the scaled inputs by place (S, S, C, F), see `ResponseModel.table`.
+            The scaling, and the scaled inputs by place (S, S, C, F), see `ResponseModel.table`; of several depths, for
+            the one that the network calls 0.
         """
+        targets = tuple(Target.of(name, values) for name, values in (measures or {}).items())
         low, high = places_mm.min(axis=0), places_mm.max(axis=0)
         middle, span = (low + high) / 2, float((high - low).max() / 2) or 1.0
-        response = ResponseModel.fit((places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive)
+        strengths = measures["depth_mm"] / targets[0].middle if measures else None
+        response = ResponseModel.fit(
+            (places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive, strengths
+        )
         windows = settled(inputs.windows, inputs.history, response.memory, response.usual)
         there = np.broadcast_to(inputs.alive[:, :, None], windows.shape)
         centre = _mean(windows, there)
         variance = _mean((windows - centre) ** 2, there)
         spread = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
-        scaling = cls(
-            centre, np.where(spread >= LEAST_SPREAD_V, spread, 1.0), response.memory, response.usual, middle, span
-        )
+        spread = np.where(spread >= LEAST_SPREAD_V, spread, 1.0)
+        centre = np.zeros_like(centre) if targets else centre
+        scaling = cls(centre, spread, response.memory, response.usual, middle, span, targets)
         return scaling, scaling.scaled(response.table)
 
     def refuse_unsound(self, table: Floats) -> None:
@@ -93,12 +135,18 @@ class Normalization:
         """(..., C, F) volts after the usual history to numbers of about 1."""
         return np.clip((windows - self.centre) / self.spread, -MAX_INPUT, MAX_INPUT).astype(np.float32)
 
-    def targets(self, places_mm: Array) -> Floats:
-        """(Q, 2) mm to what the network gives."""
-        return ((places_mm - self.middle_mm) / self.span_mm).astype(np.float32)
+    @property
+    def stretch(self) -> float:
+        """By how much a press grows stronger, as a share of one of the middle depth, for a depth that is 1 greater."""
+        return self.measures[0].span / self.measures[0].middle if self.measures else 0.0
+
+    def targets(self, places_mm: Array, measures: Mapping[str, Array] | None = None) -> Floats:
+        """(Q, 2) mm, and (Q,) of each measure that is learnt, to what the network gives, (Q, 2 + T)."""
+        more = [each.scaled((measures or {})[each.name]) for each in self.measures]
+        return np.column_stack([(places_mm - self.middle_mm) / self.span_mm, *more]).astype(np.float32)
 
     def places_mm(self, targets: Floats) -> Array:
-        """What the network gives to mm."""
+        """What the network gives of places, (Q, 2), to mm."""
         return targets * self.span_mm + self.middle_mm
 
 

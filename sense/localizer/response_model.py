@@ -2,8 +2,9 @@
 
 A fibre's windows are modelled as a smooth function of the place, a sum of Gaussian bumps on a grid over the pad, plus
 a linear function of the fibre's own history: silicone creeps, so the rest is still on its way when the next press
-comes. Both are found together by ridge regression. The second is taken off the windows before they are looked at; the
-first lets a press be moved by a few millimetres, which turns thousands of presses into as many as training asks for.
+comes. Of presses of several depths, the first is in proportion to the depth. Both are found together by ridge
+regression. The second is taken off the windows before they are looked at; the first lets a press be moved by a few
+millimetres, which turns thousands of presses into as many as training asks for.
 """
 
 from dataclasses import dataclass
@@ -38,10 +39,15 @@ class ResponseModel:
     usual: Array
 
     @classmethod
-    def fit(cls, places: Array, windows: Array, history: Array, alive: Mask) -> "ResponseModel":
+    def fit(
+        cls, places: Array, windows: Array, history: Array, alive: Mask, strengths: Array | None = None
+    ) -> "ResponseModel":
         """From places (Q, 2) within [-1, 1], windows (Q, C, F) V, history (Q, C, J) V of presses of training.
 
         A fibre learns from the presses in which it is alive, (Q, C).
+
+        Args:
+            strengths: (Q,) how deep each press was, relative to that of the table; all alike if None.
         """
         fibres, pasts = history.shape[1:]
         grid = np.linspace(-1, 1, STEPS + 1)
@@ -56,7 +62,7 @@ class ResponseModel:
             usual[fibre] = past.mean(axis=0)
             spread = past.std(axis=0)
             past = np.divide(past - usual[fibre], spread, out=np.zeros_like(past), where=spread > LEAST_SPREAD_V)
-            own, both = _moments(places[there], past, answer)
+            own, both = _moments(places[there], past, answer, None if strengths is None else strengths[there])
             weights = np.linalg.solve(own + penalty, both)
             memory[fibre] = np.divide(
                 weights[-pasts:].T if pasts else np.empty((windows.shape[2], 0)),
@@ -68,12 +74,13 @@ class ResponseModel:
         return cls(table.reshape(STEPS + 1, STEPS + 1, fibres, -1), memory, usual)
 
 
-def _moments(places: Array, past: Array, answer: Array) -> tuple[Array, Array]:
+def _moments(places: Array, past: Array, answer: Array, strengths: Array | None) -> tuple[Array, Array]:
     """K' K and K' answer of the bumps and history K of presses, a part at a time: they take kilobytes a press."""
     own = both = np.zeros(())
     for first in range(0, len(places), _PART):
         part = slice(first, first + _PART)
-        known = np.hstack([bumps(places[part]), past[part]])
+        shown = bumps(places[part]) if strengths is None else strengths[part, None] * bumps(places[part])
+        known = np.hstack([shown, past[part]])
         own, both = own + known.T @ known, both + known.T @ answer[part]
     return own, both
 

@@ -24,6 +24,14 @@ Distance = Annotated[float, Field(ge=0)]
 Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
 
 
+class MeasureTable(Settings):
+    """An entry of `measures` of `scaling`, see `normalization.Target`."""
+
+    name: Literal["depth_mm", "force_n"]
+    middle: float = Field(ge=0, le=MAX_MM)
+    span: float = Field(gt=0, le=MAX_MM)
+
+
 class ScalingTable(Settings):
     """`scaling` of `localizer.json`, see `normalization.Normalization`."""
 
@@ -33,6 +41,7 @@ class ScalingTable(Settings):
     usual_v: list[list[Volts]]
     middle_mm: Annotated[list[Place], Field(min_length=2, max_length=2)]
     span_mm: float = Field(gt=0, le=MAX_MM)
+    measures: Annotated[list[MeasureTable], Field(max_length=2)] = Field(default_factory=list)
 
 
 class ErrorRow(Settings):
@@ -47,6 +56,12 @@ class ErrorRow(Settings):
     p95_mm: Distance
     within_r50: Share
     within_r90: Share
+    depth_mean_mm: Distance | None = None
+    depth_p95_mm: Distance | None = None
+    depth_within_r90: Share | None = None
+    force_mean_n: Distance | None = None
+    force_p95_n: Distance | None = None
+    force_within_r90: Share | None = None
 
 
 class LocalizerDocument(Settings):
@@ -58,7 +73,7 @@ class LocalizerDocument(Settings):
     fibres: int = Field(ge=1, le=MAX_FIBRES)
     rate_hz: float = Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
     scaling: ScalingTable
-    factors: Annotated[list[Annotated[list[Factor], Field(min_length=3, max_length=3)]], Field(min_length=1)]
+    factors: Annotated[list[Annotated[list[Factor], Field(min_length=3, max_length=5)]], Field(min_length=1)]
     weights_sha256: Digest
     split: Split
     test_presses: int
@@ -89,6 +104,17 @@ def read_document(document: Mapping[str, Any], where: str) -> LocalizerDocument:
         "memory": (_sizes([row for fibre in table.memory for row in fibre]), (found.fibres * past, size)),
         "memory of fibres": (_sizes(table.memory), (found.fibres, past)),
     }
+    names = [each.name for each in table.measures]
+    if names != ["depth_mm", "force_n"][: len(names)] or (names and found.method == "published"):
+        raise InputError(
+            f"{where}: scaling.measures are {', '.join(names)} of method {found.method}, expected none, depth_mm, or "
+            "depth_mm and force_n, and of method masked"
+        )
+    if _sizes(found.factors) != [3 + len(names)] * len(found.factors):
+        raise InputError(
+            f"{where}: factors have {shortened(sorted(set(_sizes(found.factors))))} values a row, "
+            f"expected {3 + len(names)} for {len(names)} measures"
+        )
     for name, (sizes, (rows, values)) in shapes.items():
         if sizes != [values] * rows:
             raise InputError(

@@ -6,10 +6,12 @@ import shutil
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import isnan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from design.common.errors import InputError, shown
 from design.common.files import read_json, writing
@@ -17,12 +19,17 @@ from sense.recordings.processing import limits
 from sense.recordings.processing.limits import Array, Indices, Mask
 
 from .block_file import read_blocks
-from .press_journal import read_journal
+from .press_journal import Press, read_journal
 from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64) | dict.fromkeys(
     ("begun", "lifted"), np.int64
 )
+_MEASURED = {
+    "depths_mm": (limits.MAX_MM, "mm"),
+    "reached_mm": (limits.MAX_MM, "mm"),
+    "forces_n": (limits.MAX_N, "N"),
+}
 
 
 @dataclass(frozen=True)
@@ -37,11 +44,14 @@ class Recording:
         lifted: (Q,) index of the first reading after it was sent up; R if none was taken.
         source: where the recording came from; free JSON.
         torn_presses: presses that were left out because the end of the stream was torn off.
+        depths_mm: (Q,) how deep the probe was to go below the surface, mm, > 0; NaN where that is not known.
+        reached_mm: (Q,) how deep an arm found itself while it held the press, mm; NaN where none told.
+        forces_n: (Q,) force on the probe meanwhile, N, >= 0; NaN where no sensor told.
 
     Raises:
         InputError: no numbers, shapes that do not fit together, infinite values or such beyond the limits of
             `limits`, no reading at all, half a place, times that do not ascend, presses that overlap, one without a
-            reading before it, or a source that JSON cannot hold.
+            reading before it, depths or forces below 0, or a source that JSON cannot hold.
     """
 
     readings: Array
@@ -51,18 +61,29 @@ class Recording:
     lifted: Indices
     source: Mapping[str, Any] = field(default_factory=dict, compare=False)
     torn_presses: int = field(default=0, compare=False)
+    depths_mm: Array = field(default_factory=lambda: np.empty(0))
+    reached_mm: Array = field(default_factory=lambda: np.empty(0))
+    forces_n: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         for name, kind in _ARRAYS.items():
-            array = limits.as_numbers(getattr(self, name), kind, name)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            self._keep(name, limits.as_numbers(getattr(self, name), kind, name))
         _validate(self)
+        for name, (limit, unit) in _MEASURED.items():
+            values = limits.as_numbers(getattr(self, name), np.float64, name)
+            unknown = np.isnan(values).all()  # of however many: `replace` may have left some presses out
+            self._keep(name, np.full(len(self.presses_mm), np.nan) if unknown else values)
+            _validate_measured(self, name, limit, unit)
+
+    def _keep(self, name: str, array: NDArray[Any]) -> None:
+        array.setflags(write=False)
+        object.__setattr__(self, name, array)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Recording):
             return NotImplemented
-        return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in _ARRAYS)
+        names = (*_ARRAYS, *_MEASURED)
+        return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in names)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -77,13 +98,23 @@ class Recording:
         return ~(np.isnan(self.presses_mm[:, 0]) | np.isnan(self.presses_mm[:, 1]))
 
     @property
+    def deep_mm(self) -> Array:
+        """(Q,) how deep each press was, mm: as reached, or else as commanded; NaN where neither is known."""
+        return np.where(np.isnan(self.reached_mm), self.depths_mm, self.reached_mm)
+
+    @property
+    def measures(self) -> dict[str, Array]:
+        """What else than its place is known of each press, by its name: (Q,) how deep and with which force it was."""
+        return {"depth_mm": self.deep_mm, "force_n": self.forces_n}
+
+    @property
     def rate_hz(self) -> float:
         """Readings per second, by the median interval."""
         return rate_of(self.times_s)
 
     @property
     def digest(self) -> str:
-        """Hex SHA-256 of all readings and presses, wherever they are kept."""
+        """Hex SHA-256 of all readings and presses, wherever they are kept, and whether or not depth and force are."""
         digest = hashlib.sha256()
         for array in (getattr(self, name) for name in _ARRAYS):
             plain = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # one NaN of many
@@ -104,8 +135,8 @@ class Recording:
         start = read_json(path / START, FORMAT)
         rows, _ = read_blocks(path / READINGS, fibres)
         done = read_journal(path / JOURNAL)
-        presses = [press for press in done.values() if press[3] <= len(rows)]
-        table = np.array(presses, dtype=np.float64).reshape(-1, 4)
+        presses = [press for press in done.values() if press.lifted <= len(rows)]
+        table = np.array(presses, dtype=np.float64).reshape(-1, len(Press._fields))
         try:
             return cls(
                 readings=rows[:, 1:],
@@ -115,6 +146,9 @@ class Recording:
                 lifted=table[:, 3].astype(np.int64),
                 source=start.get("source", {}),
                 torn_presses=len(done) - len(presses),
+                depths_mm=table[:, 4],
+                reached_mm=table[:, 5],
+                forces_n=table[:, 6],
             )
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
@@ -132,9 +166,12 @@ class Recording:
         try:
             with writing(path), Recorder(unfinished, self.fibres, self.source, provenance) as recorder:
                 recorder.append(self.times_s, self.readings)
-                for place, begun, lifted in zip(self.presses_mm, self.begun, self.lifted, strict=True):
-                    recorder.begin(place, int(begun))
-                    recorder.finish(int(lifted))
+                measured = np.column_stack([getattr(self, name) for name in _MEASURED]).tolist()
+                edges = zip(self.presses_mm, self.begun, self.lifted, measured, strict=True)
+                for place, begun, lifted, (depth, reached, force) in edges:
+                    recorder.begin(place, int(begun), **({} if isnan(depth) else {"depth_mm": depth}))
+                    told = {} if isnan(reached) else {"at_mm": [None, None, reached]}
+                    recorder.finish(int(lifted), **told, **({} if isnan(force) else {"force_n": force}))
             _put(unfinished, path)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -190,6 +227,19 @@ def _validate(recording: Recording) -> None:
             f"press {press} goes from reading {recording.begun[press]} to {recording.lifted[press]}, "
             f"expected presses that do not overlap, each after at least one reading and within {len(readings)}"
         )
+
+
+def _validate_measured(recording: Recording, name: str, limit: float, unit: str) -> None:
+    """Refuse measures of presses that do not go with them; only an arm may tell of one that it is above the pad."""
+    values = getattr(recording, name)
+    if values.shape != (len(recording.presses_mm),):
+        raise InputError(f"{name} have shape {values.shape}, expected ({len(recording.presses_mm)},)")
+    limits.refuse_beyond(name, values[:, None], limit, unit, missing=True)
+    wrong = {"depths_mm": values <= 0, "forces_n": values < 0}.get(name, np.zeros(len(values), bool))
+    if wrong.any():
+        press = int(np.argmax(wrong))
+        least = "more than 0" if name == "depths_mm" else "0 or more"
+        raise InputError(f"{name} of press {press} is {values[press]:g} {unit}, allowed is {least}")
 
 
 def rate_of(times_s: Array) -> float:

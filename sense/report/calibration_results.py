@@ -1,6 +1,6 @@
 """All that a calibration leaves in a folder: the localizer, what health is told by, the document and its figures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ from design.common.files import refuse_unwritable, staged, write_json
 from design.common.profiling import stage
 from sense.health.learning import learn_health
 from sense.health.model_folder import forget_health
-from sense.localizer.calibration.calibration import calibrate
+from sense.localizer.calibration.calibration import calibrate, left_out
 from sense.recordings.recording import Recording
 from sense.settings import LocalizerSettings
 
@@ -28,13 +28,15 @@ def calibrate_into(
 
     Args:
         progress: called with (steps of training done, in all), and (0, 0) when the health of the fibres is learnt.
-        warn: told in a line that health is not learnt where the recording does not suffice.
+        warn: told in a line what is not learnt, of depth, force or health, as the recording does not suffice.
 
     Raises:
         InputError: as `calibrate`, or `out` cannot be written.
     """
     refuse_unwritable(out)
     localizer, document = calibrate(recording, options, progress=progress)
+    for line in left_out(recording, localizer):
+        warn(line)
     progress(0, 0)
     with stage("health"):
         try:
@@ -58,7 +60,7 @@ def calibrate_into(
 
 
 def calibration_lines(document: Mapping[str, Any]) -> list[str]:
-    """The errors of a calibration document as a table for people."""
+    """The errors of a calibration document as tables for people: of places, and of depth and force if learnt."""
     names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
     return [
         f"error in mm on {document['test_presses']} presses (split: {document['split']})",
@@ -68,4 +70,20 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
             f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
             for row in document["errors"]
         ),
+        *measure_lines(document["errors"]),
     ]
+
+
+def measure_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Errors of depth and force as tables for people, by rows of "errors"; none where they were not learnt."""
+    out = []
+    for kind, unit in (("depth", "mm"), ("force", "N")):
+        names = (f"{kind}_mean_{unit.lower()}", f"{kind}_p95_{unit.lower()}")
+        if names[0] in rows[0]:
+            out += [f"error of {kind} in {unit}", "lost  sets   mean    p95  in r90"]
+            out += [
+                f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+                f"{row[f'{kind}_within_r90']:7.1%}"
+                for row in rows
+            ]
+    return out

@@ -2,13 +2,17 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from math import isnan
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
 from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
+from sense.recordings.press_journal import read_journal
 from sense.recordings.processing.limits import MAX_FIBRES
+from sense.recordings.recorder import JOURNAL
 
 from .loss_chart import Errors, loss_chart
 
@@ -27,11 +31,32 @@ def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSe
     """
     source = document["source"]
     kind = source.get("kind")
-    origin = {"simulated": "the simulated rig", "rig": "a rig"}.get(kind) or source.get("file", kind)
+    origin = {"simulated": "the simulated rig", "rig": "a rig", "hand": "presses by hand"}.get(kind) or source.get(
+        "file", kind
+    )
     origin = f"{origin}, by the twin of a printed pad" if "twin" in source else origin
     rig = source.get("rig", {})
-    how = f", {rig['rate_hz']:g} a second; presses {rig['depth_mm']:g} mm deep" if rig else ""
-    return [PageSection("Recording", [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")])]
+    how = f", {rig['rate_hz']:g} a second" if rig else ""
+    if rig and kind != "hand":
+        depths = rig.get("depths_mm") or [rig["depth_mm"]]
+        deep = f"{min(depths):g} to {max(depths):g}" if len(depths) > 1 else f"{depths[0]:g}"
+        how += f"; presses {deep} mm deep"
+    body = [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")]
+    return [PageSection("Recording", [*body, *_measures(folder)])]
+
+
+def _measures(folder: Path) -> list[str]:
+    """What the journal of the recording in `folder` knows of depth and force, as a table; none where it is silent."""
+    journal = folder / "recording" / JOURNAL
+    presses = list(read_journal(journal).values()) if journal.is_file() else []
+    names = {"depth_mm": "depth commanded (mm)", "reached_mm": "depth reached (mm)", "force_n": "force (N)"}
+    known = {text: [x for press in presses if not isnan(x := getattr(press, key))] for key, text in names.items()}
+    rows = [
+        [text, len(values), f"{min(values):.2f}", f"{median(values):.2f}", f"{max(values):.2f}"]
+        for text, values in known.items()
+        if values
+    ]
+    return [table(["", "presses", "least", "median", "most"], rows)] if rows else []
 
 
 def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -62,6 +87,7 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
                     for row in rows
                 ],
             ),
+            *_measure_errors(rows),
             paragraph(
                 "Mean, spread and worst are over the sets of lost fibres; median and 95th percentile over all their"
                 " presses."
@@ -82,6 +108,18 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         ],
     )
     return [section, *([] if (folder / "fibre_loss.json").exists() else fibre_loss_sections(folder, document))]
+
+
+def _measure_errors(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Errors of depth and force, by lost fibres, where these were learnt."""
+    out = []
+    for kind, unit in (("depth", "mm"), ("force", "N")):
+        names = [f"{kind}_{what}_{unit.lower()}" for what in ("mean", "p95")]
+        if names[0] in rows[0]:
+            numbers = [[row["lost"], *(f"{row[name]:.2f}" for name in names)] for row in rows]
+            within = [[*line, f"{row[f'{kind}_within_r90']:.1%}"] for line, row in zip(numbers, rows, strict=True)]
+            out.append(table(["lost", f"{kind}, mean ({unit})", "95 %", "in r90"], within))
+    return out
 
 
 def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:

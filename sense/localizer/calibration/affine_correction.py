@@ -5,7 +5,9 @@ fold into what a localizer has anyway, the scales of its inputs and its last lay
 any other.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,27 +17,38 @@ from sense.recordings.processing.limits import Array, Floats
 
 GAIN, TURN, SHIFT = 0.2, 0.05, 0.1
 """Spreads expected: of the logarithm of a gain, of the angle (radians) and the stretch, of the shift (spans)."""
+IN_R90 = 1.645
+"""Standard deviations in the half-width that holds 90 % of what is normally distributed."""
 STEP = 0.02
 """Way over which slopes are taken, in these spreads: shorter ones drown in the rounding of the network."""
 
 
-def fit_correction(localizer: Localizer, raw: Inputs, places_mm: Array) -> Localizer:
+def fit_correction(
+    localizer: Localizer, raw: Inputs, places_mm: Array, measures: Mapping[str, Array] = MappingProxyType({})
+) -> Localizer:
     """The corrected localizer that finds presses nearest to where they were, in robust least squares.
 
     A correction costs the square of its size in the spreads expected, so of three presses little is made.
 
     Args:
         raw: inputs of Q presses in volts. places_mm: (Q, 2).
+        measures: (Q,) of those that the localizer has learnt, as far as they are known; NaN tells nothing.
     """
     from scipy.optimize import least_squares  # slow to import, and needed here only
 
-    expected_mm = localizer.locate(localizer.normalization.inputs(raw)).sd_mm
+    expected = localizer.locate(localizer.normalization.inputs(raw))
 
     def off(numbers: Array) -> Array:
         # Numbers are counted from 1, since the solver takes its steps relative to them.
         found = _corrected(localizer, numbers - 1)
-        misses = (found.locate(found.normalization.inputs(raw)).places_mm - places_mm) / expected_mm
-        return np.concatenate([misses.ravel(), numbers - 1])
+        presses = found.locate(found.normalization.inputs(raw))
+        misses = (presses.places_mm - places_mm) / expected.sd_mm
+        more = [
+            (each.values - measures[name]) / (expected.measures[name].r90 / IN_R90)
+            for name, each in presses.measures.items()
+            if name in measures
+        ]
+        return np.nan_to_num(np.concatenate([misses.ravel(), *more, numbers - 1]))
 
     solved = least_squares(off, np.ones(localizer.fibres + 4), loss="soft_l1", diff_step=STEP, xtol=1e-2, ftol=1e-3)
     numbers = solved.x - 1

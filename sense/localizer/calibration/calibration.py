@@ -1,6 +1,9 @@
-"""Calibration: learn places from a recording, and say how far off they are on presses never learnt from."""
+"""Calibration: learn places from a recording, and say how far off they are on presses never learnt from.
 
-from collections.abc import Callable
+Of presses of several depths, depth is learnt as well, and force where it is known of all.
+"""
+
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +27,8 @@ LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
 CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that end it and find the radii; of the published method, 15 % of all."""
+LEAST_SPREAD_MM = 0.2
+"""Depths of which nine tenths lie within so much are one."""
 SUBSETS = 32
 """Sets of lost fibres of a size that the radii are found on, at most."""
 
@@ -93,31 +98,34 @@ def learn(
     taught, checked = (
         training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
     )
+    masked = options.method == "masked"
     edges = recording.begun, recording.lifted
     raw = press_inputs(recording.readings, *edges, options.features)
-    shown_raw, shown_mm, held_mm = raw[taught], recording.presses_mm[taught], recording.presses_mm[checked]
-    if options.method == "masked":
+    measures = learnable(recording, training) if masked else {}
+    shown_raw, rows, held_mm = raw[taught], taught, recording.presses_mm[checked]
+    if masked:
         from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
         again = as_detected(recording.readings, recording.times_s, *edges)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
-        shown_mm = np.concatenate([shown_mm, shown_mm])
-    scaling, table = Normalization.fit(shown_raw, shown_mm)
-    held_presses = scaling.inputs(raw[checked])
+        rows = np.concatenate([taught, taught])
+    shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
+    scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more)
+    held_presses, held_more = scaling.inputs(raw[checked]), _of(measures, checked)
     from .training import TrainingPresses, train_members  # torch, seconds to import, is needed here only
 
-    shown, held = (
-        TrainingPresses(presses.inputs, presses.alive, scaling.targets(places))
-        for presses, places in ((scaling.inputs(shown_raw), shown_mm), (held_presses, held_mm))
-    )
-    if options.method == "masked":
+    def samples(presses: Scaled, places_mm: Array, more: Mapping[str, Array]) -> TrainingPresses:
+        return TrainingPresses(presses.inputs, presses.alive, scaling.targets(places_mm, more), scaling.stretch)
+
+    shown, held = samples(scaling.inputs(shown_raw), shown_mm, shown_more), samples(held_presses, held_mm, held_more)
+    if masked:
         weights = train_members(shown, held, table, options, rng, progress)
     else:
         from .published_training import train_published
 
         weights = train_published(shown, held, rng)
     try:
-        refuse_unsound(weights, scaling.entries(options.method), options.method)
+        refuse_unsound(weights, scaling.entries(options.method), options.method, len(measures))
     except InputError as error:
         raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
     localizer = Localizer(
@@ -126,20 +134,57 @@ def learn(
         table=table,
         method=options.method,
         features=options.features,
-        factors=np.ones((1, 3)),
+        factors=np.ones((1, 3 + len(measures))),
         rate_hz=recording.rate_hz,
         learnt_from=recording.digest,
     )
-    levels = min(options.lost, recording.fibres - 1) + 1 if options.method == "masked" else 1
-    return replace(localizer, factors=radii(localizer, held_presses, held_mm, levels))
+    levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
+    return replace(localizer, factors=radii(localizer, held_presses, held_mm, levels, held_more))
 
 
-def radii(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Array:
-    """(levels, 3) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
-    plain = replace(localizer, factors=np.ones((1, 3)))
+def _of(measures: Mapping[str, Array], presses: Indices) -> dict[str, Array]:
+    return {name: values[presses] for name, values in measures.items()}
+
+
+def learnable(recording: Recording, presses: Indices) -> dict[str, Array]:
+    """What is learnt of the presses beside their places, (Q,) of all there are, by the names of `Recording.measures`.
+
+    Depth, where it is known of all `presses` and not the same; then force too, where it is known of all.
+    """
+    measures = recording.measures
+    deep, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
+    if np.isnan(deep).any() or deep.min() <= 0 or np.ptp(np.percentile(deep, [5, 95])) <= LEAST_SPREAD_MM:
+        return {}
+    return measures if not np.isnan(force).any() else {"depth_mm": measures["depth_mm"]}
+
+
+def left_out(recording: Recording, localizer: Localizer) -> list[str]:
+    """Why `localizer` has not learnt a depth or force that is known of some presses of `recording`, a line each."""
+    if localizer.method != "masked":
+        return []
+    learnt = {target.name for target in localizer.normalization.measures}
+    measures = {name: values[recording.known] for name, values in recording.measures.items()}
+    deep, force = measures["depth_mm"], measures["force_n"]
+    out = []
+    if "depth_mm" not in learnt:
+        above = int((deep <= 0).sum())
+        if above:
+            out.append(f"depth is not learnt: {above} of {len(deep)} presses reached 0 mm or less")
+        elif 0 < (known := int((~np.isnan(deep)).sum())) < len(deep):
+            out.append(f"depth is not learnt: it is known of {known} of {len(deep)} presses, needed is of all")
+    elif "force_n" not in learnt and (known := int((~np.isnan(force)).sum())):
+        out.append(f"force is not learnt: it is known of {known} of {len(force)} presses, needed is of all")
+    return out
+
+
+def radii(
+    localizer: Localizer, presses: Scaled, places_mm: Array, levels: int, measures: Mapping[str, Array] | None = None
+) -> Array:
+    """(levels, 3 + T) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
+    plain = replace(localizer, factors=np.ones((1, localizer.factors.shape[1])))
     by_level = (lost_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
     found = ([plain.locate(presses, subset) for subset in subsets] for subsets in by_level)
-    return np.clip([conformal(each, places_mm) for each in found], 1e-6, 1e6)
+    return np.clip([conformal(each, places_mm, measures) for each in found], 1e-6, 1e6)
 
 
 def split_presses(

@@ -142,7 +142,7 @@ def _retrained(
         for lost, result in run_tasks(trainings):
             found[lost] = result
             if kept:
-                kept.save(_number(lost), dict(vars(result)))
+                kept.save(_number(lost), {key: value for key, value in vars(result).items() if key != "measures"})
             progress(len(found), len(subsets))
     if kept:
         kept.clear()
@@ -172,7 +172,7 @@ def _found_of(state: State, presses: int) -> Found:
         raise InputError(f"unfinished networks hold {shown(arrays)}, expected {shapes}; remove them to start anew")
     if not all(np.isfinite(array).all() for array in state.values()):
         raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
-    return Found(**state)
+    return Found(state["places_mm"], state["sd_mm"], state["r50_mm"], state["r90_mm"])
 
 
 def fibre_loss_lines(document: dict[str, Any]) -> list[str]:

@@ -17,7 +17,7 @@ from sense.health.trained_model import one_cycle
 from sense.localizer.network import Weights
 from sense.recordings.processing.limits import Floats
 
-from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, looked_up, masked
+from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, inputs_at, masked, misses
 
 STEPS, BATCH, RATE = 200, 128, 1e-4
 """Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""
@@ -41,7 +41,7 @@ def adapt(
 
     Args:
         weights: as `network.forward` takes them.
-        samples: presses of known place.
+        samples: presses of known place, depth and force, where these were learnt.
         table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
         lost: fibres that are lost at once, at most, while adapting.
         rng: source of the seed of torch's generator, which draws all that is random here.
@@ -61,9 +61,9 @@ def adapt(
         for number in range(1, STEPS + 1):
             optimizer.param_groups[0]["lr"] = RATE * one_cycle(number / STEPS)
             optimizer.zero_grad()
-            entries, places = presses.nearby()
-            off = forward(now, entries.expand(members, -1, -1))[..., :2] - places
-            loss = trust * _length(off).mean(dim=1).sum()
+            entries, targets = presses.nearby()
+            off = forward(now, entries.expand(members, -1, -1))[..., : targets.shape[1]] - targets
+            loss = trust * misses(off).mean(dim=1).sum()
             entries = presses.anywhere().expand(members, -1, -1)
             with torch.no_grad():
                 found = forward(before, entries)
@@ -78,27 +78,32 @@ class _Presses:
     """Draws presses that resemble the known ones."""
 
     def __init__(self, samples: TrainingPresses, table: Floats, lost: int, generator: torch.Generator) -> None:
-        self._x, self._alive, self._y = (torch.from_numpy(a) for a in (samples.inputs, samples.alive, samples.places))
-        self._table = torch.from_numpy(table).flatten(2)
-        self._at_home = looked_up(self._table, self._y)
+        self._x, self._alive, self._y = (torch.from_numpy(a) for a in (samples.inputs, samples.alive, samples.targets))
+        self._table, self._stretch = torch.from_numpy(table).flatten(2), samples.stretch
+        self._at_home = inputs_at(self._table, self._y, self._stretch)
         self._lost, self._generator = lost, generator
 
     def nearby(self) -> tuple[Tensor, Tensor]:
-        """Entries (1, B, D) of the network and places (B, 2) of presses moved by a few millimetres."""
+        """Entries (1, B, D) of the network and targets (B, 2 + T) of presses moved by a few millimetres."""
         rows = self._rows()
-        places = (self._y[rows] + MOVED * self._normal(BATCH, 2)).clamp(-1, 1)
-        return self._entries(rows, places, INPUT_NOISE), places
+        targets = self._at(rows, (self._y[rows, :2] + MOVED * self._normal(BATCH, 2)).clamp(-1, 1))
+        return self._entries(rows, targets, INPUT_NOISE), targets
 
     def anywhere(self) -> Tensor:
         """Entries (1, B, D) of presses moved to any place of the pad."""
         rows = self._rows()
-        return self._entries(rows, 2 * torch.rand(BATCH, 2, generator=self._generator) - 1, FAR_NOISE)
+        anywhere = 2 * torch.rand(BATCH, 2, generator=self._generator) - 1
+        return self._entries(rows, self._at(rows, anywhere), FAR_NOISE)
 
     def _rows(self) -> Tensor:
         return torch.randint(len(self._x), (BATCH,), generator=self._generator)
 
-    def _entries(self, rows: Tensor, places: Tensor, noise: float) -> Tensor:
-        moved = (looked_up(self._table, places) - self._at_home[rows]).view_as(self._x[rows])
+    def _at(self, rows: Tensor, places: Tensor) -> Tensor:
+        """(B, 2 + T) targets of presses at other places, as deep and forceful as they were."""
+        return torch.cat([places, self._y[rows, 2:]], dim=1)
+
+    def _entries(self, rows: Tensor, targets: Tensor, noise: float) -> Tensor:
+        moved = (inputs_at(self._table, targets, self._stretch) - self._at_home[rows]).view_as(self._x[rows])
         inputs = self._x[rows] + moved
         inputs = inputs + noise * self._normal(*inputs.shape)
         alive = self._alive[rows] & draw_alive(BATCH, self._x.shape[1], self._lost, self._generator)
@@ -109,10 +114,6 @@ class _Presses:
 
 
 def _change(found: Tensor, before: Tensor) -> Tensor:
-    """How far places and expected errors (E, B, 4) moved, summed over members."""
-    change = found - before
-    return (_length(change[..., :2]) + SPREAD_KEPT * change[..., 2:].abs().mean(dim=2)).mean(dim=1).sum()
-
-
-def _length(off: Tensor) -> Tensor:
-    return off.square().sum(dim=-1).add(1e-8).sqrt()
+    """How far what is found and expected errors (E, B, 2 N) moved, summed over members."""
+    change, logs = (found - before).chunk(2, dim=2)
+    return (misses(change) + SPREAD_KEPT * logs.abs().mean(dim=2)).mean(dim=1).sum()

@@ -9,6 +9,7 @@ all.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from design.common.files import provenance
 from design.criteria.fibre_loss import lost_subsets
 from sense.localizer.evaluation import conformal, distances, error_row
 from sense.localizer.features import Inputs
-from sense.localizer.localizer import Found, Localizer
+from sense.localizer.localizer import Found, Localizer, joined
 from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
@@ -35,8 +36,9 @@ gains almost always, but less than a hundred presses can show, so it is kept unl
 SUBSETS = 16
 """Sets of lost fibres of a size that are looked at, at most."""
 
+Measures = Mapping[str, Array]
 FoundByLoss = Mapping[tuple[int, ...], Found]
-Change = Callable[[Localizer, Inputs, Array], Localizer]
+Change = Callable[[Localizer, Inputs, Array, Measures], Localizer]
 
 
 def recalibrate(
@@ -71,10 +73,10 @@ def recalibrate(
         raise InputError(f"recording has {len(known)} presses of known place, expected at least {LEAST_PRESSES}")
     rows = np.random.default_rng(seed).permutation(known)
     raw, places_mm = localizer.raw_inputs(recording)[rows], recording.presses_mm[rows]
-    subsets = [
-        subset for level in range(len(localizer.factors)) for subset in lost_subsets(localizer.fibres, level, SUBSETS)
-    ]
-    validation = _CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets)
+    measures = {each.name: recording.measures[each.name][rows] for each in localizer.normalization.measures}
+    levels = range(len(localizer.factors))
+    subsets = [subset for level in levels for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
+    validation = _CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
     before = validation.found([localizer] * FOLDS)
     now, after, changes = _changed(localizer, validation, before, seed, progress)
     gain, error = validation.gain(before, after)
@@ -125,8 +127,8 @@ def _changed(
     step()
     if localizer.method == "masked":
 
-        def adapt(old: Localizer, inputs: Inputs, places_mm: Array) -> Localizer:
-            changed = _adapted(old, inputs, places_mm, np.random.default_rng([seed, len(inputs)]))
+        def adapt(old: Localizer, inputs: Inputs, places_mm: Array, measures: Measures) -> Localizer:
+            changed = _adapted(old, inputs, places_mm, measures, np.random.default_rng([seed, len(inputs)]))
             step()
             return changed
 
@@ -140,12 +142,16 @@ def _changed(
     return now, after, changes
 
 
-def _adapted(localizer: Localizer, raw: Inputs, places_mm: Array, rng: np.random.Generator) -> Localizer:
+def _adapted(
+    localizer: Localizer, raw: Inputs, places_mm: Array, measures: Measures, rng: np.random.Generator
+) -> Localizer:
     from .fine_tuning import adapt  # torch, seconds to import, is needed here only
     from .training import TrainingPresses
 
-    scaled, targets = localizer.normalization.inputs(raw), localizer.normalization.targets(places_mm)
-    samples = TrainingPresses(scaled.inputs, scaled.alive, targets)
+    scaling, scaled = localizer.normalization, localizer.normalization.inputs(raw)
+    found = localizer.locate(scaled).measures  # where it is not known how deep a press was, it goes on being found so
+    known = {name: np.where(np.isnan(values), found[name].values, values) for name, values in measures.items()}
+    samples = TrainingPresses(scaled.inputs, scaled.alive, scaling.targets(places_mm, known), scaling.stretch)
     return replace(
         localizer, weights=adapt(localizer.weights, samples, localizer.table, len(localizer.factors) - 1, rng)
     )
@@ -157,24 +163,32 @@ class _CrossValidation:
     Args:
         raw, places_mm: inputs and places (Q, 2) of the presses. folds: indices that are left out in turn, in order.
         subsets: the sets of lost fibres to look at, by number of lost fibres.
+        measures: (Q,) of each that the localizers have learnt, NaN where it is not known.
     """
 
     def __init__(
-        self, raw: Inputs, places_mm: Array, folds: Sequence[Indices], subsets: Sequence[tuple[int, ...]]
+        self,
+        raw: Inputs,
+        places_mm: Array,
+        folds: Sequence[Indices],
+        subsets: Sequence[tuple[int, ...]],
+        measures: Measures = MappingProxyType({}),
     ) -> None:
-        self._raw, self._places_mm, self._folds, self._subsets = raw, places_mm, folds, subsets
+        self._raw, self._places_mm, self._measures = raw, places_mm, measures
+        self._folds, self._subsets = folds, subsets
 
     @property
-    def presses(self) -> tuple[Inputs, Array]:
-        """Inputs and places of them all."""
-        return self._raw, self._places_mm
+    def presses(self) -> tuple[Inputs, Array, Measures]:
+        """Inputs, places and measures of them all."""
+        return self._raw, self._places_mm, self._measures
 
     def changed(self, localizers: Sequence[Localizer], change: Change) -> list[Localizer]:
         """The localizers, one a fold, each changed by the presses that its fold does not hold."""
         out = []
         for localizer, fold in zip(localizers, self._folds, strict=True):
             rest = np.setdiff1d(np.arange(len(self._places_mm)), fold)
-            out.append(change(localizer, self._raw[rest], self._places_mm[rest]))
+            measures = {name: values[rest] for name, values in self._measures.items()}
+            out.append(change(localizer, self._raw[rest], self._places_mm[rest], measures))
         return out
 
     def found(self, localizers: Sequence[Localizer]) -> FoundByLoss:
@@ -185,8 +199,7 @@ class _CrossValidation:
         out = {}
         for lost in self._subsets:
             parts = [each.locate(part, lost) for each, part in zip(localizers, scaled, strict=True)]
-            names = ("places_mm", "sd_mm", "r50_mm", "r90_mm")
-            out[lost] = Found(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+            out[lost] = joined(parts)
         return out
 
     def gain(self, before: FoundByLoss, after: FoundByLoss) -> tuple[float, float]:
@@ -200,11 +213,15 @@ class _CrossValidation:
 
     def summary(self, found: FoundByLoss) -> list[dict[str, Any]]:
         """Rows as "errors" of `evaluate`."""
-        return [error_row(len(level[0]), [found[lost] for lost in level], self._places_mm) for level in self._levels()]
+        return [
+            error_row(len(level[0]), [found[lost] for lost in level], self._places_mm, self._measures)
+            for level in self._levels()
+        ]
 
     def widened(self, found: FoundByLoss) -> Array:
         """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do."""
-        return np.maximum([conformal([found[lost] for lost in sets], self._places_mm) for sets in self._levels()], 1.0)
+        by_level = ([found[lost] for lost in sets] for sets in self._levels())
+        return np.maximum([conformal(each, self._places_mm, self._measures) for each in by_level], 1.0)
 
     def _levels(self) -> list[list[tuple[int, ...]]]:
         sizes = dict.fromkeys(len(lost) for lost in self._subsets)

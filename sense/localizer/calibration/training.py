@@ -2,9 +2,10 @@
 
 The loss is the distance itself, not its square; beside it the network learns how far off it expects to be. Every step
 loses a random few fibres of every press and moves the press by a few millimetres, its readings following as the fitted
-`response_model` of the pad says. The rate follows one cycle; what is kept is a running average of the weights, the one
-that did best on presses held back for that, which also end the training where they have long gained nothing. Members
-are independent, each on a thread of its own.
+`response_model` of the pad says. Of several depths, these are learnt too, with forces where they are known, and presses
+are moved in depth as well: the lighter, and so the more blurred, the farther. The rate follows one cycle; what is kept
+is that running average of the weights which did best on presses held back for that, which also end the training where
+they have long gained nothing. Members are independent, each on a thread of its own.
 """
 
 import math
@@ -25,8 +26,8 @@ from sense.health.trained_model import average_in, one_cycle
 from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Weights
 from sense.recordings.processing.limits import Floats, Mask
 
-MOST_STEPS = 11_000
-"""Steps of training at most: with moved presses, the length of the recording does not matter beyond."""
+MOST_STEPS, LONGER = 11_000, 2
+"""Steps of training at most, as presses are moved; of several depths, which are harder to learn, so many times more."""
 WEIGHT_DECAY = 1e-2
 INPUT_NOISE = 0.02
 """Noise on the scaled inputs while training, their spread being about 1."""
@@ -34,6 +35,11 @@ WHOLE = 0.25
 """Share of training presses that keep all fibres; the others lose 1 .. `lost`, each as often."""
 MOVED = 0.13
 """Standard deviation of the way a press is moved, in units of the span: 3 mm on a pad of 45 mm."""
+BLURRED, DEEPENED = 0.26, 0.3
+"""Of several depths, the same and what is added to the depth, in its spans, for one of the middle depth. Lighter ones
+are moved by as much more as noise blurs them more, or they would be known again by their noise."""
+MEASURING = 0.5
+"""Weight of the error of a depth or force in units of its span, beside the distance."""
 EXPECTING = 0.1
 """Weight of learning the expected error, beside the distance."""
 LOOKS = 40
@@ -47,12 +53,14 @@ class TrainingPresses:
     """Presses to learn from or to check on.
 
     Attributes:
-        inputs: (Q, C, F) scaled. alive: (Q, C). places: (Q, 2) in units of the span.
+        inputs: (Q, C, F) scaled. alive: (Q, C).
+        targets: (Q, 2 + T) what the network is to give. stretch: see `Normalization`.
     """
 
     inputs: Floats
     alive: Mask
-    places: Floats
+    targets: Floats
+    stretch: float = 0.0
 
 
 class StoppedError(Exception):
@@ -98,15 +106,14 @@ def train_members(
     Args:
         learn, check: presses to learn from, and to tell by when to stop.
         table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
-        options: size of the network and length of the training.
-        rng: source of the seeds of torch's own generators, which draw all that is random here.
+        options: size of the network and length of the training. rng: of the seeds of torch's own generators.
         progress: called with (steps done, steps in all), of all members together.
 
     Returns:
         Weights as `network.forward` takes them.
     """
     seeds = [int(seed) for seed in rng.integers(2**63, size=options.members)]
-    steps = training_steps(len(learn.inputs), options)
+    steps = training_steps(len(learn.inputs), options) * (LONGER if learn.stretch else 1)
     joint = JointProgress([steps] * len(seeds), progress)
 
     def train(number: int) -> Weights:
@@ -144,12 +151,19 @@ class _Member:
         self._fibres, size = self._x.shape[1:]
         self._lost = min(options.lost, self._fibres - 1)
         self._table = torch.from_numpy(table).to(self._device).flatten(2)
-        self._bounds = self._y.amin(dim=0), self._y.amax(dim=0)
-        self._at_home = looked_up(self._table, self._y)
-        self._weights = initial(self._fibres * size + self._fibres, options, self._generator)
+        self._bounds = self._y[:, :3].amin(dim=0), self._y[:, :3].amax(dim=0)
+        self._steps = torch.tensor(
+            [BLURRED, BLURRED, DEEPENED] if learn.stretch else [MOVED, MOVED], device=self._device
+        )
+        off = (self._y - self._y.mean(dim=0))[:, 2:]
+        self._harder = (off[:, :1] * off[:, 1:]).sum() / off[:, :1].square().sum()  # force by depth, in line
+        self._stretch = learn.stretch
+        self._at_home = inputs_at(self._table, self._y, self._stretch)
+        entries, outputs = self._fibres * (size + 1), OUTPUTS + 2 * (self._y.shape[1] - 2)
+        self._weights = initial(entries, options, self._generator, outputs)
 
     def _on_device(self, samples: TrainingPresses) -> tuple[Tensor, Tensor, Tensor]:
-        arrays = (samples.inputs, samples.alive, samples.places)
+        arrays = (samples.inputs, samples.alive, samples.targets)
         x, alive, y = (torch.from_numpy(array).to(self._device) for array in arrays)
         return x, alive, y
 
@@ -184,29 +198,45 @@ class _Member:
     def _loss(self) -> Tensor:
         batch = min(self._options.batch, len(self._x))
         rows = torch.randint(len(self._x), (batch,), generator=self._generator, device=self._device)
-        places = self._y[rows] + MOVED * self._normal(batch, 2)
-        low, high = self._bounds
-        places = torch.where(places < low, 2 * low - places, places)  # a press that would leave the pad is sent back
-        places = torch.where(places > high, 2 * high - places, places).clamp(-1, 1)
-        moved = (looked_up(self._table, places) - self._at_home[rows]).view(batch, self._fibres, -1)
-        inputs = self._x[rows] + moved
-        inputs = inputs + INPUT_NOISE * self._normal(*inputs.shape)
+        targets = self._moved(self._y[rows])
+        moved = (inputs_at(self._table, targets, self._stretch) - self._at_home[rows]).view(batch, self._fibres, -1)
+        inputs = self._x[rows] + moved + INPUT_NOISE * self._normal(*moved.shape)
         alive = self._alive[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
-        found = forward(self._weights, masked(inputs, alive)[None])[0]
-        off = found[:, :2] - places
-        logs = found[:, 2:].clamp(LEAST_LOG, MOST_LOG)
-        expected = (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)
-        return (off.square().sum(dim=1).add(1e-8).sqrt() + EXPECTING * expected).mean()
+        learnt, logs = forward(self._weights, masked(inputs, alive)[None])[0].chunk(2, dim=1)
+        off, logs = learnt - targets, logs.clamp(LEAST_LOG, MOST_LOG)
+        return (misses(off) + EXPECTING * (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)).mean()
+
+    def _moved(self, targets: Tensor) -> Tensor:
+        """(B, 2 + T) targets of presses moved by a few millimetres, and in depth, with the force that goes with it."""
+        low, high = self._bounds
+        steps = self._steps / (1 + self._stretch * targets[:, 2:3]) if self._stretch else self._steps
+        moved = targets[:, :3] + steps * self._normal(len(targets), len(self._steps))
+        moved = torch.where(moved < low, 2 * low - moved, moved)  # a press that would leave the pad is sent back
+        moved = torch.where(moved > high, 2 * high - moved, moved).clamp(-1, 1)
+        forces = targets[:, 3:] + self._harder * (moved - targets[:, :3])[:, 2:]
+        return torch.cat([moved, forces], dim=1)
 
     def _normal(self, *shape: int) -> Tensor:
         return torch.randn(*shape, generator=self._generator, device=self._device)
 
     def _error(self, weights: dict[str, Tensor], masks: Tensor) -> float:
-        """Mean distance on the presses held back, with the fibres in `masks`."""
+        """Mean distance of places on the presses held back, with the fibres in `masks`."""
         x, _, y = self._check
         with torch.no_grad():
             found = forward(weights, masked(x, masks)[None])[0, :, :2]
-            return float((found - y).square().sum(dim=1).sqrt().mean())
+            return float((found - y[:, :2]).square().sum(dim=1).sqrt().mean())
+
+
+def misses(off: Tensor) -> Tensor:
+    """(..., 2 + T) differences of what is learnt to (...) what they count: the distance, and a share of the others."""
+    distance = off[..., :2].square().sum(dim=-1).add(1e-8).sqrt()
+    return distance if off.shape[-1] == 2 else distance + MEASURING * off[..., 2:].abs().sum(dim=-1)
+
+
+def inputs_at(table: Tensor, targets: Tensor, stretch: float) -> Tensor:
+    """(B, D) scaled inputs of presses with (B, 2 + T) targets, by `looked_up`; in proportion to their depth."""
+    found = looked_up(table, targets[:, :2])
+    return found if targets.shape[1] == 2 else (1 + stretch * targets[:, 2:3]) * found
 
 
 def looked_up(table: Tensor, places: Tensor) -> Tensor:
@@ -220,7 +250,9 @@ def looked_up(table: Tensor, places: Tensor) -> Tensor:
     return torch.lerp(low, torch.lerp(table[i + 1, j], table[i + 1, j + 1], y), x)
 
 
-def initial(entries: int, options: settings.LocalizerSettings, generator: torch.Generator) -> dict[str, Tensor]:
+def initial(
+    entries: int, options: settings.LocalizerSettings, generator: torch.Generator, outputs: int = OUTPUTS
+) -> dict[str, Tensor]:
     """Random first weights of one member, named and shaped as in `network.Weights`, for `entries` numbers entering."""
     hidden, layers = options.hidden, options.layers
 
@@ -235,8 +267,8 @@ def initial(entries: int, options: settings.LocalizerSettings, generator: torch.
         "first.b": zeros(1, 1, hidden),
         "hidden.w": normal(layers, 1, hidden, hidden, gain=0.5),
         "hidden.b": zeros(layers, 1, 1, hidden),
-        "last.w": normal(1, hidden, OUTPUTS, gain=0.3),
-        "last.b": zeros(1, 1, OUTPUTS),
+        "last.w": normal(1, hidden, outputs, gain=0.3),
+        "last.b": zeros(1, 1, outputs),
     }
     return {name: w.requires_grad_() for name, w in weights.items()}
 
@@ -257,7 +289,7 @@ def masked(inputs: Tensor, alive: Tensor) -> Tensor:
 
 
 def forward(weights: dict[str, Tensor], x: Tensor) -> Tensor:
-    """(E, B, D) entries to (E, B, 4), as `network.forward`."""
+    """(E, B, D) entries to (E, B, 2 N), as `network.forward`."""
     h = torch.baddbmm(weights["first.b"], x, weights["first.w"])
     for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
         h = h + torch.baddbmm(b, _ready(h), w)

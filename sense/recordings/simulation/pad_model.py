@@ -147,12 +147,19 @@ def digitised(volts: Array) -> Array:
 
 
 def read_pad(
-    answers: Array, cycle: Cycle, rig: RigSettings, rng: np.random.Generator, noise_v: Array | None = None
+    answers: Array,
+    depths_mm: Array,
+    cycle: Cycle,
+    rig: RigSettings,
+    rng: np.random.Generator,
+    noise_v: Array | None = None,
 ) -> Array:
-    """What the ADC gives of a plan of presses at full depth.
+    """What the ADC gives of a plan of presses; as in `LivePad`, a press of half the depth gives half the strain.
 
     Args:
-        answers: (Q, C) signals in grid units; or V, as measured, which is how a held press differs from the rest.
+        answers: (Q, C) signals at full depth in grid units; or V, as measured, which is how a held press differs from
+            the rest.
+        depths_mm: (Q,) how deep the presses are.
         noise_v: (C,) by how much answers in V scatter in all, standard deviation; None for signals.
 
     Returns:
@@ -164,7 +171,7 @@ def read_pad(
         own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
         answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)
     indented = indentation(cycle, rng.uniform(*DELAY_S, (presses, 2)))
-    return model(rig.depth_mm / FULL_DEPTH_MM * strain(answers, indented))
+    return model(strain(depths_mm[:, None] / FULL_DEPTH_MM * answers, indented))
 
 
 def held_share(cycle: Cycle, rig: RigSettings) -> float:

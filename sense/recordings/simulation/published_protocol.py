@@ -6,6 +6,7 @@ from design import Contact, Morphology, Twin
 from design.common.errors import MOST_VALUES, InputError, instance, whole
 from design.common.settings import or_default
 from design.settings import Sensed, sensed_rectangle
+from sense.recordings.press_plan import planned_in
 from sense.recordings.processing.limits import MAX_FIBRES, Array
 from sense.recordings.recording import Recording
 from sense.settings import RigSettings
@@ -24,13 +25,14 @@ def simulate(
     sensed_mm: Sensed = "beyond",
     like: Twin | None = None,
 ) -> Recording:
-    """Record presses at random places on a simulated pad.
+    """Record presses on a simulated pad, where and as deep as `[rig]` plans them.
 
     A press takes a cycle of readings: the probe goes down in its middle and up at its end.
 
     Args:
         pad: course of the fibres; or a twin, which answers, and is pressed, as the pad it was measured on.
-        rig: length, rate, seed and strengths. contact: what a press deforms. What a twin has measured goes before both.
+        rig: plan, depths, rate, seed and strengths. contact: what a press deforms. What a twin has measured goes
+            before both.
         sensed_mm: where it is pressed (`PadSettings`).
         like: a twin of another pad, which `pad` is to answer like.
 
@@ -38,33 +40,38 @@ def simulate(
         The recording, the same for the same arguments.
 
     Raises:
-        InputError: more fibres or readings than a recording may hold, presses beyond the pad, or a twin of which no
-            channel reads a fibre.
+        InputError: more fibres or readings than a recording may hold, presses beyond the pad, a plan that is adaptive
+            or no file of places, or a twin of which no channel reads a fibre.
     """
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
     channels = len(pad.channels) if isinstance(pad, Twin) else len(instance("pad", pad, Morphology).knots)
     whole("fibres of the pad", channels, 1, MAX_FIBRES)
-    values = rig.presses * rig.readings_per_press * channels
-    if values > MOST_VALUES:
+    if rig.plan == "adaptive":
         raise InputError(
-            f"[rig] presses is {rig.presses}: with {rig.readings_per_press} readings each of {channels} fibres "
-            f"{values} values, allowed are {MOST_VALUES}"
+            "[rig] plan is adaptive, which only a recording in real time is steered by; allowed where presses are "
+            "simulated at once are uniform, grid, boustrophedon or a .csv file"
         )
     model = _modelled(pad, contact, sensed_mm, like)
     rig = rig.model_copy(update=model.strengths)
     rng = np.random.default_rng(rig.seed)
+    plan = planned_in(model.pressed_mm, rig, rng)
+    values = len(plan) * rig.readings_per_press * channels
+    if values > MOST_VALUES:
+        raise InputError(
+            f"[rig] presses is {len(plan)}: with {rig.readings_per_press} readings each of {channels} fibres "
+            f"{values} values, allowed are {MOST_VALUES}"
+        )
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
-    low_mm, high_mm = model.pressed_mm
-    places_mm = rng.uniform(low_mm, high_mm, (rig.presses, 2))
-    readings = read_pad(model.answers(places_mm), cycle, rig, rng, model.noise_v)
+    readings = read_pad(model.answers(plan.places_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
-    first = cycle.readings * np.arange(rig.presses)
+    first = cycle.readings * np.arange(len(plan))
     return Recording(
         readings,
         np.cumsum(intervals_s),
-        places_mm,
+        plan.places_mm,
         begun=first + cycle.down_at,
         lifted=first + cycle.readings,
+        depths_mm=plan.depths_mm,
         source={"kind": "simulated", "rig": rig.model_dump(mode="json"), **model.source},
     )
 

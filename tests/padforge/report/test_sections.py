@@ -184,3 +184,30 @@ def test_errors_stand_by_the_contact_believed(page: Path) -> None:
     rows = [re.findall(r"<td.*?>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section, re.S)]
     assert ["published disc, K = 0.6", "designed", "4.00", "6.00"] in rows
     assert len([row for row in rows if row]) == 4
+
+
+def test_the_report_tells_how_deep_and_hard_presses_were(pad: Path) -> None:
+    start = json.loads((pad / "recording" / "start.json").read_text())
+    start["source"]["rig"]["depths_mm"] = [0.5, 5.0]
+    (pad / "recording" / "start.json").write_text(json.dumps(start))
+    lines = [
+        {"event": "begun", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
+        {"event": "done", "press": 0, "reading": 2, "at_mm": [0, 0, 0.45], "force_n": 1.25},
+        {"event": "begun", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
+        {"event": "done", "press": 1, "reading": 4, "at_mm": [0, 0, 4.95]},
+    ]
+    journal = "".join(json.dumps(line) + "\n" for line in lines)
+    (pad / "recording" / "journal.ndjson").write_text(journal)
+    document = json.loads((pad / "calibration.json").read_text())
+    for row in document["errors"]:
+        row |= {"depth_mean_mm": 0.123, "depth_p95_mm": 0.3, "depth_within_r90": 0.912}
+    (pad / "calibration.json").write_text(json.dumps(document))
+    page = write_report(pad).read_text()
+    words = " ".join(re.sub("<[^>]*>", " ", page).split())
+    assert "presses 0.5 to 5 mm deep" in words
+    for row in (("depth commanded (mm)", 2, "0.50", "2.75", "5.00"), ("force (N)", 1, "1.25", "1.25", "1.25")):
+        assert " ".join(map(str, row)) in words
+    assert "depth, mean (mm) 95 % in r90 0 0.12 0.30 91.2%" in words
+    (pad / "recording" / "journal.ndjson").write_text("{}\n")
+    with pytest.raises(InputError, match=r"journal\.ndjson: line 1"):
+        write_report(pad)

@@ -1,12 +1,14 @@
 """How far off a localizer is: what is told of errors that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from design.common.errors import InputError
 from sense import Recording
 from sense.localizer.evaluation import by_place, conformal, distances, error_row, errors_by_loss, idle_share
-from sense.localizer.localizer import Found
+from sense.localizer.localizer import Found, Measured
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
 
@@ -76,3 +78,15 @@ def test_a_fibre_is_idle_that_changes_by_less_than_two_percent_of_its_range() ->
         readings[down:up] = step
     recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), begun, lifted)
     np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])
+
+
+def test_errors_of_measures_are_told_of_presses_of_which_they_are_known() -> None:
+    found = replace(off_by(0, 0, 0, 0), measures={"depth_mm": Measured(np.array([1.0, 2, 3, 4]), np.full(4, 0.15))})
+    depths = np.array([1.1, 2.0, 3.3, np.nan])
+    row = error_row(0, [found], PLACES, {"depth_mm": depths, "force_n": depths})
+    assert row["depth_mean_mm"] == pytest.approx(0.4 / 3)
+    assert row["depth_within_r90"] == pytest.approx(2 / 3)
+    assert not [key for key in row if key.startswith("force")]
+    assert not [key for key in error_row(0, [found], PLACES) if key.startswith("depth")]
+    assert conformal([found], PLACES, {"depth_mm": depths})[3] == pytest.approx(0.3 / 0.15)
+    assert conformal([found], PLACES)[3] == 1

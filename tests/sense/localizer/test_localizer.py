@@ -8,6 +8,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense import Localizer, Recording
+from sense.localizer.localizer import joined
 from sense.localizer.normalization import Scaled
 
 
@@ -185,3 +186,44 @@ def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localiz
     places = found.locate(found.inputs(replace(recording, readings=readings)))
     assert np.isfinite(places.places_mm).all()
     assert np.isfinite(places.r90_mm).all()
+
+
+def test_depth_and_force_come_with_widths_that_grow_as_fibres_are_lost(
+    deep_localizer: Localizer, deep_recording: Recording
+) -> None:
+    presses = deep_localizer.inputs(deep_recording)
+    whole, fewer = (deep_localizer.locate(presses, lost).measures for lost in ((), (1, 2)))
+    assert list(whole) == ["depth_mm", "force_n"]
+    assert np.corrcoef(whole["depth_mm"].values, deep_recording.depths_mm)[0, 1] > 0.95
+    np.testing.assert_allclose(whole["force_n"].values, 3 * whole["depth_mm"].values, atol=2)
+    assert (whole["depth_mm"].r90 > 0).all()
+    assert fewer["depth_mm"].r90.mean() > whole["depth_mm"].r90.mean()
+
+
+def test_a_press_without_any_fibre_may_be_of_any_depth(deep_localizer: Localizer, deep_recording: Recording) -> None:
+    presses = deep_localizer.inputs(deep_recording)
+    depth = deep_localizer.locate(Scaled(presses.inputs, np.zeros_like(presses.alive))).measures["depth_mm"]
+    assert depth.values == pytest.approx(2.75, abs=0.05)
+    assert depth.r90 == pytest.approx(2.25, abs=0.05)
+
+
+def test_what_was_learnt_beside_the_place_survives_its_files(
+    deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path
+) -> None:
+    deep_localizer.save(tmp_path)
+    again = Localizer.load(tmp_path)
+    assert again.normalization.measures == deep_localizer.normalization.measures
+    assert again.errors == deep_localizer.errors
+    presses = deep_localizer.inputs(deep_recording)
+    found = again.locate(presses).measures
+    for name, before in deep_localizer.locate(presses).measures.items():
+        assert np.array_equal(before.values, found[name].values)
+        assert np.array_equal(before.r90, found[name].r90)
+
+
+def test_parts_are_joined_press_by_press(deep_localizer: Localizer, deep_recording: Recording) -> None:
+    presses = deep_localizer.inputs(deep_recording)
+    found = joined([deep_localizer.locate(presses[:5]), deep_localizer.locate(presses[5:9])])
+    expected = deep_localizer.locate(presses[:9])
+    np.testing.assert_allclose(found.places_mm, expected.places_mm, atol=1e-3)
+    np.testing.assert_allclose(found.measures["force_n"].r90, expected.measures["force_n"].r90, rtol=1e-3)

@@ -78,3 +78,13 @@ def test_bumps_add_up_to_something_flat_within_the_pad() -> None:
     places = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 2))
     total = bumps(places).sum(axis=1)
     assert np.ptp(total) < 1e-2 * total.mean()
+
+
+def test_answers_in_proportion_to_the_depth_are_one_table() -> None:
+    """A fibre that answers 0.1 V per mm at any place, from presses of 1 to 4 mm, none of which is of 2 mm."""
+    rng = np.random.default_rng(0)
+    places, depths = rng.uniform(-1, 1, (600, 2)), rng.choice([1.0, 3.0, 4.0], 600)
+    windows = (0.1 * depths)[:, None, None]
+    model = ResponseModel.fit(places, windows, np.zeros((600, 1, 1)), np.ones((600, 1), bool), depths / 2)
+    np.testing.assert_allclose(model.table[10:-10, 10:-10], 0.2, rtol=0.06)
+    assert model.table.mean() == pytest.approx(0.2, rel=0.02)

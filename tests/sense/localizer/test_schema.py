@@ -78,3 +78,31 @@ def test_a_document_with_a_value_out_of_bounds_is_refused(
         Localizer.load(tmp_path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        ("scaling.measures", [{"name": "force_n", "middle": 1.0, "span": 1.0}], "force_n of method masked"),
+        ("scaling.measures.0.name", "width_mm", "measures"),
+        ("scaling.measures.0.span", 0.0, "span"),
+        ("scaling.measures.0.middle", np.nan, "middle"),
+        ("scaling.measures", [], "factors have .5. values a row, expected 3"),
+        ("factors.0", [1.0, 1.0, 1.0], "factors have .3, 5. values"),
+    ],
+)
+def test_measures_that_cannot_be_are_refused(
+    deep_localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
+) -> None:
+    deep_localizer.save(tmp_path)
+    document = json.loads((tmp_path / "localizer.json").read_text())
+    (tmp_path / "localizer.json").write_text(json.dumps(edited(document, path, value)))
+    with pytest.raises(InputError, match=named):
+        Localizer.load(tmp_path)
+
+
+def test_a_localizer_of_one_depth_says_nothing_of_measures(localizer: Localizer, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    document = json.loads((tmp_path / "localizer.json").read_text())
+    assert "measures" not in document["scaling"]
+    assert not [key for row in document["errors"] for key in row if key.startswith(("depth", "force"))]

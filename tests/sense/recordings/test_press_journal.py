@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from design.common.errors import InputError
@@ -44,3 +45,22 @@ def test_a_journal_entry_of_other_values_is_refused(folder: Path, old: str, new:
     with pytest.raises(InputError, match=r"journal\.ndjson: line 1 is no journal entry") as caught:
         Recording.open(folder)
     assert len(str(caught.value)) < 400
+
+
+def test_depth_and_force_are_read_from_what_a_rig_noted(recording: Recording, folder: Path) -> None:
+    journal = folder / "journal.ndjson"
+    first, *others = journal.read_text().replace('"depth_mm": 5.0', '"depth_mm": null').splitlines(keepends=True)
+    done = others[0].replace("}", ', "at_mm": [0.1, 0.2, 3.9], "force_n": 12.5}')
+    journal.write_text("".join([first.replace("null", "4"), done, *others[1:]]))
+    found = Recording.open(folder)
+    assert (found.depths_mm[0], found.reached_mm[0], found.forces_n[0]) == (4.0, 3.9, 12.5)
+    assert np.isnan([found.depths_mm[1:], found.reached_mm[1:], found.forces_n[1:]]).all()
+    assert found.digest == recording.digest
+
+
+@pytest.mark.parametrize("more", ['"at_mm": 3', '"at_mm": [1, 2]', '"at_mm": [1, 2, "3"]', '"force_n": true'])
+def test_a_depth_or_force_of_another_kind_is_refused(folder: Path, more: str) -> None:
+    journal = folder / "journal.ndjson"
+    journal.write_text(journal.read_text().replace('"event": "done",', f'"event": "done", {more},', 1))
+    with pytest.raises(InputError, match="line 2 is no journal entry"):
+        Recording.open(folder)

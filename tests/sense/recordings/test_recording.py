@@ -257,3 +257,35 @@ def test_a_place_that_cannot_be_written_is_one_clear_line(recording: Recording, 
         recording.save(tmp_path / ("n" * 300), {})
     assert (tmp_path / "file").read_text() == "kept"
     assert [found.name for found in tmp_path.iterdir()] == ["file"]
+
+
+def test_depth_and_force_belong_to_a_press_but_not_to_the_digest(recording: Recording, tmp_path: Path) -> None:
+    count = len(recording.begun)
+    unknown = replace(recording, depths_mm=np.empty(0))
+    assert np.isnan([unknown.depths_mm, unknown.reached_mm, unknown.forces_n]).all()
+    reached = np.where(np.arange(count) % 2 == 0, np.nan, 4.9)
+    known = replace(recording, reached_mm=reached, forces_n=np.linspace(0, 9, count))
+    assert known != recording
+    assert known.digest == recording.digest == unknown.digest
+    assert known.deep_mm[:4].tolist() == [5, 4.9, 5, 4.9]
+    for number, each in enumerate((unknown, known)):
+        each.save(tmp_path / str(number), {})
+        assert Recording.open(tmp_path / str(number)) == each
+    with pytest.raises(ValueError, match="read-only"):
+        known.forces_n[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depths_mm": [1.0, 2.0]}, r"depths_mm have shape \(2,\), expected \(300,\)"),
+        ({"depths_mm": np.full(300, 0.0)}, "depths_mm of press 0 is 0 mm, allowed is more than 0"),
+        ({"forces_n": np.full(300, -1.0)}, "forces_n of press 0 is -1 N, allowed is 0 or more"),
+        ({"reached_mm": np.full(300, np.inf)}, "reached_mm hold infinity"),
+        ({"reached_mm": np.full(300, 1e6)}, "reached_mm hold 1e.06 mm"),
+        ({"forces_n": ["much"] * 300}, "forces_n are"),
+    ],
+)
+def test_depths_and_forces_that_none_has_are_refused(recording: Recording, change: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(recording, **change)

@@ -14,7 +14,7 @@ from design.common.settings import validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import Localizer, Recording, RigSettings, calibrate, evaluate, import_mat, locate
 from sense.health.monitor import FibreFault
-from sense.localizer.calibration.calibration import split_presses
+from sense.localizer.calibration.calibration import learnable, left_out, split_presses
 from sense.settings import LocalizerSettings as Options
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
@@ -226,3 +226,63 @@ def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Loc
 def test_a_rate_no_rig_has_is_refused(rate_hz: float) -> None:
     with pytest.raises(InputError, match=r"\[rig\] rate_hz: got"):
         validated(RigSettings, {"rate_hz": rate_hz}, "[rig]")
+
+
+def test_presses_of_several_depths_teach_depth_and_force(deep_recording: Recording, deeply_calibrated: tuple) -> None:
+    localizer, document = deeply_calibrated
+    row = document["errors"][0]
+    assert row["depth_mean_mm"] < 0.3
+    assert row["force_mean_n"] < 0.9
+    assert 0.75 <= row["depth_within_r90"] <= 1
+    assert 0.75 <= row["force_within_r90"] <= 1
+    assert localizer.factors.shape[1] == 5
+    test, found = np.array(document["test"]["press"]), document["test"]["depth_mm"]
+    off = np.abs(np.array(found["found"]) - deep_recording.depths_mm[test])
+    assert off.mean() == pytest.approx(row["depth_mean_mm"])
+    assert found["pressed"] == deep_recording.depths_mm[test].tolist()
+
+
+def test_light_presses_are_found_as_well_as_by_a_localizer_of_their_own(deeply_calibrated: tuple) -> None:
+    """Errors of places grow as the answers shrink, not more: so do the radii."""
+    test = deeply_calibrated[1]["test"]
+    errors = np.hypot(*(np.array(test["found_mm"]) - test["pressed_mm"]).T)
+    depths, radii = np.array(test["depth_mm"]["pressed"]), np.array(test["r90_mm"])
+    light, deep = depths < 2, depths > 3.5
+    assert errors[deep].mean() < errors[light].mean() < 6 * errors[deep].mean()
+    assert radii[deep].mean() < radii[light].mean()
+
+
+@pytest.mark.parametrize(
+    ("change", "learnt"),
+    [
+        ({"forces_n": np.empty(0)}, ["depth_mm"]),
+        ({"depths_mm": np.empty(0)}, []),
+        ({"depths_mm": np.full(400, 5.0)}, []),
+        ({"reached_mm": np.full(400, 5.0)}, []),
+        ({}, ["depth_mm", "force_n"]),
+    ],
+)
+def test_depth_is_learnt_where_it_is_known_and_varies(deep_recording: Recording, change: dict, learnt: list) -> None:
+    assert list(learnable(replace(deep_recording, **change), np.arange(400))) == learnt
+    unknown = np.where(np.arange(400) == 7, np.nan, deep_recording.depths_mm)
+    assert learnable(replace(deep_recording, depths_mm=unknown), np.arange(400)) == {}
+    assert list(learnable(replace(deep_recording, depths_mm=unknown), np.arange(8, 400))) == ["depth_mm", "force_n"]
+
+
+def test_it_is_told_why_depth_known_of_some_presses_is_not_learnt(deep_recording: Recording, short: Localizer) -> None:
+    one = np.arange(400) == 7
+    unknown, above = (np.where(one, value, deep_recording.depths_mm) for value in (np.nan, -0.1))
+    said = left_out(replace(deep_recording, depths_mm=unknown), short)
+    assert said == ["depth is not learnt: it is known of 399 of 400 presses, needed is of all"]
+    said = left_out(replace(deep_recording, reached_mm=above), short)
+    assert said == ["depth is not learnt: 1 of 400 presses reached 0 mm or less"]
+    for depths in (np.empty(0), np.full(400, 5.0)):
+        assert left_out(replace(deep_recording, depths_mm=depths), short) == []
+
+
+def test_what_is_known_of_one_depth_changes_nothing_that_is_learnt(recording: Recording, short: Localizer) -> None:
+    unknown = replace(recording, depths_mm=np.empty(0))
+    assert unknown.digest == recording.digest
+    again, _ = calibrate(unknown, SHORT)
+    assert all(np.array_equal(again.weights[name], weight) for name, weight in short.weights.items())
+    assert short.normalization.measures == ()

@@ -82,8 +82,9 @@ def test_a_fold_is_changed_by_the_other_presses_only() -> None:
     trial = trial_of([[1, 3], [0, 2]], np.arange(4))
     seen: list[list[int]] = []
 
-    def change(localizer: int, raw: np.ndarray, places_mm: np.ndarray) -> int:
+    def change(localizer: int, raw: np.ndarray, places_mm: np.ndarray, measures: dict[str, np.ndarray]) -> int:
         assert places_mm.shape == (2, 2)
+        assert measures == {}
         seen.append(raw.tolist())
         return localizer + 1
 
@@ -275,3 +276,20 @@ def test_the_command_writes_a_whole_model(
     assert (document["format"], document["presses"]) == ("padforge-recalibration/1", 20)
     assert Localizer.load("now").fibres == 4
     assert Path("now/health.json").exists()
+
+
+def test_a_localizer_of_several_depths_follows_presses_of_known_and_of_unknown_depth(
+    deep_localizer: Localizer, deep_recording: Recording
+) -> None:
+    few = {
+        name: getattr(deep_recording, name)[:40] for name in ("presses_mm", "begun", "lifted", "depths_mm", "forces_n")
+    }
+    later = replace(deep_recording, **few, reached_mm=np.empty(0))
+    now, document = recalibrate(deep_localizer, later)
+    assert now.factors.shape == deep_localizer.factors.shape
+    assert (now.factors >= deep_localizer.factors).all()
+    assert document["after"][0]["depth_mean_mm"] < 0.5
+    unknown, document = recalibrate(deep_localizer, replace(later, depths_mm=np.empty(0), forces_n=np.empty(0)))
+    assert "depth_mean_mm" not in document["after"][0]
+    depths = unknown.locate(unknown.inputs(deep_recording)).measures["depth_mm"].values
+    assert np.abs(depths - deep_recording.depths_mm).mean() < 0.5

@@ -1,5 +1,7 @@
 """The simulated pad behaves like one: touched fibres answer, creep, overshoot, drift; the ADC counts."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -158,3 +160,29 @@ def test_the_live_pad_answers_where_and_as_deep_as_the_tip_presses() -> None:
     assert touched.any()
     assert ((full < half) & (half < rest))[touched].all()
     assert np.array_equal(full[~touched], rest[~touched])
+
+
+def test_it_presses_as_deep_as_planned_and_answers_in_proportion() -> None:
+    still = RigSettings(presses=40, noise_mv=0.0, drift_mv=0.0, creep=0.0, hysteresis=0.0)
+    light, deep, mixed = (
+        simulate(PAD, still.model_copy(update={"depths_mm": depths})) for depths in ((1.0,), (4.0,), (1.0, 4.0))
+    )
+    assert mixed.depths_mm.tolist() == [1.0, 4.0] * 20
+    assert np.array_equal(mixed.presses_mm, deep.presses_mm)
+    cycles = [each.readings.reshape(40, 40, 8) for each in (light, deep, mixed)]
+    assert np.array_equal(cycles[2][0::2, 20:], cycles[0][0::2, 20:])
+    assert np.array_equal(cycles[2][1::2, 20:], cycles[1][1::2, 20:])
+    swing = [np.abs(each[:, 39] - each[:, 15]).sum() for each in cycles[:2]]
+    assert swing[1] / swing[0] == pytest.approx(4, rel=0.05)
+
+
+def test_it_presses_where_planned(tmp_path: Path) -> None:
+    grid = simulate(PAD, RigSettings(presses=9, plan="grid"))
+    assert grid.presses_mm[:3].tolist() == [[-22.5, -22.5], [0, -22.5], [22.5, -22.5]]
+    (tmp_path / "plan.csv").write_text("x_mm,y_mm,depth_mm\n1,2,3\n-4,5,0.5\n")
+    listed = simulate(PAD, RigSettings(plan=str(tmp_path / "plan.csv")))
+    assert listed.presses_mm.tolist() == [[1, 2], [-4, 5]]
+    assert listed.depths_mm.tolist() == [3, 0.5]
+    assert len(listed.readings) == 80
+    with pytest.raises(InputError, match="plan is adaptive"):
+        simulate(PAD, RigSettings(plan="adaptive"))

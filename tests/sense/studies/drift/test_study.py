@@ -53,6 +53,7 @@ def begin(recording: Recording, presses: int) -> Recording:
         presses_mm=recording.presses_mm[:presses],
         begun=recording.begun[:presses],
         lifted=recording.lifted[:presses],
+        depths_mm=recording.depths_mm[:presses],
     )
 
 
@@ -214,9 +215,8 @@ def test_what_cannot_be_studied_is_refused(recorded: Recording) -> None:
         drift_study({}, {})
     with pytest.raises(InputError, match="a: both a morphology and a recording are called so"):
         drift_study({"a": PAD}, {"a": recorded})
-    few = replace(recorded, presses_mm=recorded.presses_mm[:3], begun=recorded.begun[:3], lifted=recorded.lifted[:3])
     with pytest.raises(InputError, match="few: recording has 3 presses of known place"):
-        drift_study({}, {"few": few})
+        drift_study({}, {"few": begin(recorded, 3)})
 
 
 def test_the_published_pad_and_recording(published: Path, tmp_path: Path) -> None:
