@@ -16,7 +16,7 @@ from sense.recordings.simulation.strengths import strengths
 from .fitting import Fit, Freedom, fit
 from .identified_pad import Identification
 from .laid_pad import LaidPad, Plan
-from .responses import Responses, information, responses
+from .responses import Responses, information, of_one_depth, responses
 from .smooth import smooth_function
 from .wiring import Wiring, wirings
 
@@ -57,7 +57,8 @@ def identify(
     usual history.
 
     Args:
-        recording: presses at known places, over most of the pad. pad: as it was planned. seed: of what is drawn.
+        recording: presses at known places, over most of the pad; of those of several depths the most common.
+        pad: as it was planned. seed: of what is drawn.
         report: hears how far it is.
 
     Raises:
@@ -66,6 +67,7 @@ def identify(
     """
     instance("recording", recording, Recording)
     instance("pad", pad, Morphology)
+    recording = of_one_depth(recording)
     rng = np.random.default_rng(whole("seed", seed, 0, 2**32 - 1))
     places = recording.presses_mm[recording.known]
     _refuse_places(places, pad)
@@ -110,7 +112,8 @@ def _refuse_places(places_mm: Array, pad: Morphology) -> None:
     """Refuse too few presses, and such as do not go over most of the pad."""
     if len(places_mm) < LEAST_PRESSES:
         raise InputError(
-            f"the recording has {len(places_mm)} presses of known place, allowed are {LEAST_PRESSES} or more"
+            f"the recording has {len(places_mm)} presses of known place and about one depth, allowed are"
+            f" {LEAST_PRESSES} or more"
         )
     width, height = np.subtract(*np.quantile(places_mm, [0.95, 0.05], axis=0))
     least = LEAST_SIDE * pad.grid * pad.pitch_mm

@@ -5,7 +5,7 @@ place once more. By how much is told by Fisher's information: J' S^-1 J, with J 
 place by the response model, and S the covariance of what that model leaves of presses it has not seen.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -15,6 +15,8 @@ from sense.localizer.response_model import STEPS, ResponseModel, settled
 from sense.recordings.processing.limits import Array, Indices, Mask
 from sense.recordings.recording import Recording
 
+ALIKE = 0.15
+"""Share of its depth by which another press may differ that counts as deep as one."""
 HELD = 3
 """First window of the press that counts as held: the tip has come to rest in the silicone."""
 HOLD = np.array([(end - first) * (k >= HELD) for k, (first, end) in enumerate(DOWN)], float)
@@ -55,6 +57,22 @@ class Responses:
         counts = np.maximum(self.there.sum(axis=0), 1)
         left = np.where(self.there, (self.volts - predicted) ** 2, 0).sum(axis=0) / counts
         return 1 - left / self.spread
+
+
+def of_one_depth(recording: Recording) -> Recording:
+    """The recording, the places of presses unknown that are not about as deep as most: a deeper one gives more.
+
+    They stay in what came before the others. Where no depth is known, all are taken to be alike.
+    """
+    deep_mm = np.where(recording.known, recording.deep_mm, np.nan)
+    known = np.sort(deep_mm[deep_mm > 0])[::-1]
+    if not len(known):
+        return recording
+    as_deep = np.searchsorted(-known, -(1 - ALIKE) * known, "right")
+    deeper = np.searchsorted(-known, -(1 + ALIKE) * known, "left")
+    usual = known[np.argmax(as_deep - deeper)]  # the deepest of the most common, as it is heard best
+    alike = np.abs(deep_mm - usual) <= ALIKE * usual
+    return replace(recording, presses_mm=np.where(alike[:, None], recording.presses_mm, np.nan))
 
 
 def responses(recording: Recording, learnt: Mask) -> Responses:

@@ -84,7 +84,7 @@ def test_channels_that_are_missing_or_dead_are_said_to_read_nothing(recording: R
 
 
 def test_too_few_presses_are_refused(recording: Recording) -> None:
-    few = {name: getattr(recording, name)[:10] for name in ("presses_mm", "begun", "lifted")}
+    few = {name: getattr(recording, name)[:10] for name in ("presses_mm", "begun", "lifted", "depths_mm")}
     with pytest.raises(InputError, match="10 presses of known place"):
         identify(replace(recording, **few), PLAN)
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from design import Twin
+from design import Morphology, Twin
 from design.pad.twin import TwinReadings
 from sense import Recording, RigSettings, simulate
-from sense.twin.responses import information
+from sense.twin.responses import information, of_one_depth
 
 QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
 
@@ -49,3 +49,12 @@ def test_presses_in_which_a_channel_gave_nothing_do_not_count(noisy: Twin, recor
     spoilt = Recording(readings, recording.times_s, **presses)
     only = np.array([channel])
     assert information(spoilt, only) == pytest.approx(information(recording, only), rel=0.35)
+
+
+def test_presses_as_deep_as_most_are_kept_the_deeper_of_two_kinds_and_all_of_unknown_depth() -> None:
+    recording = simulate(Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)))
+    kept = of_one_depth(recording)
+    assert kept.presses_mm[kept.known].tolist() == recording.presses_mm[2::3].tolist()
+    unknown = replace(recording, depths_mm=np.full(9, np.nan))
+    assert of_one_depth(unknown) is unknown
+    assert of_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).known.all()
