@@ -1,8 +1,5 @@
 """The converter of the real rig: an Arduino Due on its native USB port, with the firmware beside this module."""
 
-import threading
-import time
-from collections import deque
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -10,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from design.common.errors import InputError
+from sense.rig.boards.block_reader import BlockReader
+from sense.rig.boards.inputs import chosen_inputs
+from sense.rig.boards.sample_clock import SampleClock
 from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.settings import RigSettings
 
 from .framing import FULL_SCALE, MAX_AVERAGING, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Request, Status
-from .sample_clock import SampleClock
-from .serial_link import POLL_S, SerialLink, port_of
+from .serial_link import SerialLink, port_of
 
 FIRMWARE_MAJOR = 1
 """Boards with another first number of the firmware version speak another wire format."""
@@ -23,11 +22,6 @@ MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 
 _FIRMWARE = "sense/rig/boards/due/firmware/padforge_due"
 _ANSWER_S = 1.0
-_SETTLE_S = 0.5
-"""Blocks gathered before the first reading is given, so that its time rests on more than one arrival."""
-_START_S = 1.5
-_STALL_S = 1.0
-_UNREAD_S = 60.0
 _JUMP_US = 5000
 """Board time and sample index may differ by so much from block to block: interrupts come late."""
 
@@ -36,35 +30,39 @@ Arrival = tuple[float, Block]
 
 
 class Arduino:
-    """An Arduino Due that reads `channels` fibres, at A0 and on, every 1 / `rate_hz`; implements `Converter`.
+    """An Arduino Due that reads fibres every 1 / `rate_hz`; implements `Converter`.
 
     The host time of a sample is when its last conversion was complete, apart from the least delay of the USB link.
     """
 
-    def __init__(self, port: str, rate_hz: float, channels: int = 8, supply_v: float = 3.3, averaging: int = 1) -> None:
+    def __init__(
+        self, port: str, rate_hz: float, inputs: Sequence[int] = (), supply_v: float = 3.3, averaging: int = 1
+    ) -> None:
         """Take the settings; nothing is opened before `connect`.
 
         Args:
-            port: name of the native USB port. rate_hz: samples per second, 10 to 10 000. channels: 1 to 12.
+            port: name of the native USB port. rate_hz: samples per second, 10 to 10 000.
+            inputs: which to read, fibre by fibre, 0 for A0 to 11; all in order where empty.
             supply_v: reading at full scale, V. averaging: conversions summed to a sample, 1 to 16.
 
         Raises:
             InputError: a value is out of range.
+            RigFault: "refused" for an input that the board has not.
         """
         _within("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        _within("channels", channels, 1, MAX_CHANNELS)
         _within("averaging", averaging, 1, MAX_AVERAGING)
+        self._inputs = chosen_inputs(inputs, MAX_CHANNELS, "an Arduino Due")
         self._port = port
-        self._wanted = BoardSettings(round(1e9 / rate_hz), (1 << channels) - 1, averaging)
+        self._wanted = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
         self._supply_v = supply_v
         self._link: SerialLink | None = None
-        self._reader: _Reader | None = None
+        self._reader: BlockReader[Block] | None = None
         self._assembler: Assembler | None = None
 
     @classmethod
     def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "Arduino":
         """The board that `[rig]` names, looked for where its port is "auto"; see `__init__` and `port_of`."""
-        return cls(port_of(rig), rig.converter_rate_hz, len(inputs))
+        return cls(port_of(rig), rig.converter_rate_hz, inputs)
 
     def connect(self) -> dict[str, Any]:
         """Open the port, check the firmware, set the board and start it; see `Converter`."""
@@ -73,7 +71,7 @@ class Arduino:
         try:
             identity = self._identify(link)
             settings = self._set(link)
-            self._assembler = Assembler(settings, self._supply_v)
+            self._assembler = Assembler(settings, self._inputs, self._supply_v)
             self._start(link, settings)
         except BaseException:
             self.close()
@@ -82,7 +80,8 @@ class Arduino:
             "name": identity.name,
             "firmware": ".".join(map(str, identity.firmware)),
             "serial": identity.serial.hex(),
-            "channels": settings.mask.bit_count(),
+            "channels": len(self._inputs),
+            "inputs": list(self._inputs),
             "bits": identity.bits,
             "rate_hz": 1e9 / settings.period_ns,
             "averaging": settings.averaging,
@@ -152,30 +151,33 @@ class Arduino:
         return ack.settings
 
     def _start(self, link: SerialLink, settings: BoardSettings) -> None:
+        halted = False
+
+        def receive() -> tuple[float, list[Block]]:
+            nonlocal halted
+            if halted:
+                raise RigFault("data", f"{self._port}: the board has lost conversions and stopped")
+            now_s, frames = link.receive()
+            halted = any(isinstance(frame, Ack) and frame.status == Status.HALTED for frame in frames)
+            return now_s, [frame for frame in frames if isinstance(frame, Block)]
+
         link.decoder.damaged = 0
-        self._reader = reader = _Reader(link, round(_UNREAD_S * 1e9 / settings.period_ns))
-        reader.start()
-        deadline = time.monotonic() + _START_S
-        while reader.span_s() < _SETTLE_S:
-            if reader.span_s() == 0:
-                link.send(Request(Kind.START))
-            reader.check()
-            if time.monotonic() > deadline:
-                raise RigFault("stale", f"{self._port}: the board does not send", "reset it and connect again")
-            time.sleep(POLL_S)
+        self._reader = BlockReader(self._port, receive, 1e9 / settings.period_ns)
+        self._reader.begin(lambda: link.send(Request(Kind.START)))
 
 
 class Assembler:
-    """Makes `Samples` of blocks: times by a `SampleClock`, volts, and what is missing by the index.
+    """Makes `Samples` of blocks: times by a `SampleClock`, volts fibre by fibre, what is missing by the index.
 
     Attributes:
         blocks, missing, overruns: blocks so far, samples that are missing, those of them dropped by the board.
     """
 
-    def __init__(self, settings: BoardSettings, supply_v: float) -> None:
+    def __init__(self, settings: BoardSettings, inputs: Sequence[int], supply_v: float) -> None:
         self.clock = SampleClock(settings.period_ns * 1e-9)
         self.blocks = self.missing = self.overruns = 0
         self._settings = settings
+        self._columns = [sorted(set(inputs)).index(i) for i in inputs]  # blocks hold the inputs in ascending order
         self._volts = supply_v / (settings.averaging * FULL_SCALE)
         self._next = 0
         self._time_us: int | None = None
@@ -191,12 +193,12 @@ class Assembler:
             first, lost = self._place(block)
             self.clock.observe(first + len(block.counts) - 1, arrival_s)
             placed.append((first, lost, block.counts))
-        times = [self.clock.times(first, len(counts)) for first, _, counts in placed]
+        times = [self.clock.times(np.arange(first, first + len(counts))) for first, _, counts in placed]
         missing = [np.r_[lost, np.zeros(len(counts) - 1, np.int64)] for _, lost, counts in placed]
-        channels = self._settings.mask.bit_count()
         return ConverterSamples(
             np.concatenate([np.empty(0), *times]),
-            np.concatenate([np.empty((0, channels)), *(counts for *_, counts in placed)]) * self._volts,
+            np.concatenate([np.empty((0, len(self._columns))), *(counts[:, self._columns] for *_, counts in placed)])
+            * self._volts,
             np.concatenate([np.empty(0, np.int64), *missing]),
         )
 
@@ -219,75 +221,6 @@ class Assembler:
         self.missing += lost
         self.overruns = block.overruns
         return first, lost
-
-
-class _Reader(threading.Thread):
-    """Drains the port into a buffer of at most `capacity` samples, until stopped or something fails."""
-
-    def __init__(self, link: SerialLink, capacity: int) -> None:
-        super().__init__(name=f"reader of {link.port}", daemon=True)
-        self._link = link
-        self._capacity = capacity
-        self._arrivals: deque[Arrival] = deque()
-        self._waiting = 0
-        self._lock = threading.Lock()
-        self._stopped = threading.Event()
-        self._fault: RigFault | None = None
-
-    def run(self) -> None:
-        try:
-            self._drain()
-        except RigFault as fault:
-            self._fault = fault
-        except Exception as error:  # a reader that dies silently would look like a pad at rest
-            self._fault = RigFault("lost", f"{self._link.port}: the reader has failed ({error!r})")
-
-    def take(self) -> list[Arrival]:
-        """All that waits; raises the fault that ended the reading once nothing does."""
-        with self._lock:
-            arrivals = list(self._arrivals)
-            self._arrivals.clear()
-            self._waiting = 0
-        if not arrivals:
-            self.check()
-        return arrivals
-
-    def check(self) -> None:
-        """Raise the fault that ended the reading, if any."""
-        if self._fault is not None:
-            raise self._fault
-
-    def span_s(self) -> float:
-        """Time between the first and the last arrival that wait."""
-        with self._lock:
-            return self._arrivals[-1][0] - self._arrivals[0][0] if self._arrivals else 0.0
-
-    def stop(self) -> None:
-        """End the reading, within `POLL_S`."""
-        self._stopped.set()
-        self.join()
-
-    def _drain(self) -> None:
-        silent_s, before_s = 0.0, time.monotonic()
-        while not self._stopped.is_set():
-            now_s, frames = self._link.receive()
-            silent_s += min(now_s - before_s, 2 * POLL_S)  # a host that slept has not waited in vain
-            before_s = now_s
-            for frame in frames:
-                if isinstance(frame, Block):
-                    silent_s = 0.0
-                    self._put((now_s, frame))
-                elif isinstance(frame, Ack) and frame.status == Status.HALTED:
-                    raise RigFault("data", f"{self._link.port}: the board has lost conversions and stopped")
-            if silent_s > _STALL_S:
-                raise RigFault("stale", f"{self._link.port}: no sample for {silent_s:.1f} s", "reset the board")
-
-    def _put(self, arrival: Arrival) -> None:
-        with self._lock:
-            self._arrivals.append(arrival)
-            self._waiting += len(arrival[1].counts)
-        if self._waiting > self._capacity:
-            raise RigFault("data", f"{self._link.port}: nobody has read the samples for {_UNREAD_S:g} s")
 
 
 def _within(name: str, value: float, least: float, most: float) -> None:

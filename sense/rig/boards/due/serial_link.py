@@ -1,21 +1,19 @@
-"""A serial port that speaks frames, with pyserial's ways to fail told apart for a person."""
+"""The port of an Arduino Due: where it is found, and frames to and from it."""
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
 
+from sense.rig.boards.byte_stream import ByteStream
 from sense.rig.devices.protocols import RigFault
-from sense.rig.devices.serial_port import host_ports, open_port
+from sense.rig.devices.serial_port import host_ports
 from sense.settings import RigSettings
 
 from .framing import BoardSettings, Decoder, Frame, Request, encode
 
 BAUD = 115_200
 """Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
-POLL_S = 0.1
-"""The longest time `Link.receive` waits."""
 
 F = TypeVar("F", bound=Frame)
 
@@ -53,30 +51,22 @@ def port_of(rig: RigSettings) -> str:
 
 
 class SerialLink:
-    """An open port. Any method but `close` raises RigFault("lost") once the board is gone."""
+    """An open port that speaks frames. Any method but `close` raises RigFault("lost") once the board is gone."""
 
     def __init__(self, port: str) -> None:
         """Open `port` for this process alone; raises RigFault("refused") where that cannot be."""
         self.port = port
         self.decoder = Decoder()
-        self._serial = open_port(port, BAUD, POLL_S)
+        self._stream = ByteStream(port, BAUD)
 
     def receive(self) -> tuple[float, list[Frame]]:
-        """The frames that have come, after waiting for at most `POLL_S`, and when they came."""
-        try:
-            data = self._serial.read(1)
-            if data:
-                data += self._serial.read(self._serial.in_waiting)
-        except OSError as error:
-            raise self._lost(error) from error
-        return time.monotonic(), self.decoder.feed(data)
+        """When bytes have come, after a short wait, and the frames they completed."""
+        now_s, data = self._stream.receive()
+        return now_s, self.decoder.feed(data)
 
     def send(self, command: Request | BoardSettings) -> None:
         """Send one command."""
-        try:
-            self._serial.write(encode(command))
-        except OSError as error:
-            raise self._lost(error) from error
+        self._stream.send(encode(command))
 
     def ask(self, command: Request | BoardSettings, kind: type[F], fits: Callable[[F], bool], wait_s: float) -> F:
         """Send `command` until a frame of `kind` that `fits` comes; all other frames are thrown away.
@@ -97,8 +87,4 @@ class SerialLink:
 
     def close(self) -> None:
         """Close the port; never raises."""
-        with suppress(OSError):
-            self._serial.close()
-
-    def _lost(self, error: OSError) -> RigFault:
-        return RigFault("lost", f"{self.port}: the board is gone ({error})", "check its cable and connect again")
+        self._stream.close()

@@ -24,7 +24,7 @@ def test_any_number_of_samples_with_all_numbers_wrapping_takes_no_more_memory_th
     """A million under stress."""
     count = 120_000 if few(1).max_examples == 1 else 1_000_000
     start = 2**32 - count // 32 * 16
-    decoder, assembler, held, before = Decoder(), Assembler(SETTINGS, 3.3), [], -np.inf
+    decoder, assembler, held, before = Decoder(), Assembler(SETTINGS, range(8), 3.3), [], -np.inf
     for first in range(start, start + count, 400):
         sent = [encode(block(index)) for index in range(first, first + 400, 16)]
         frames = [frame for frame in decoder.feed(b"".join(sent)) if isinstance(frame, Block)]
@@ -44,7 +44,7 @@ def test_any_number_of_samples_with_all_numbers_wrapping_takes_no_more_memory_th
     ids=["again", "too early", "too late", "far away"],
 )
 def test_a_block_that_cannot_follow_is_a_fault(second: Block) -> None:
-    assembler = Assembler(SETTINGS, 3.3)
+    assembler = Assembler(SETTINGS, range(8), 3.3)
     assembler.samples([(1.0, block(0))])
     with pytest.raises(RigFault, match="off its time") as caught:
         assembler.samples([(1.1, second)])
@@ -53,12 +53,19 @@ def test_a_block_that_cannot_follow_is_a_fault(second: Block) -> None:
 
 def test_blocks_of_other_channels_are_a_fault() -> None:
     with pytest.raises(RigFault, match="other channels"):
-        Assembler(BoardSettings(1_000_000, 0x0F, 1), 3.3).samples([(1.0, block(0))])
+        Assembler(BoardSettings(1_000_000, 0x0F, 1), range(4), 3.3).samples([(1.0, block(0))])
 
 
 def test_nothing_new_is_an_empty_reading_of_the_right_shape() -> None:
-    samples = Assembler(SETTINGS, 3.3).samples([])
+    samples = Assembler(SETTINGS, range(8), 3.3).samples([])
     assert samples.times_s.shape == (0,)
     assert samples.volts.shape == (0, 8)
     assert samples.missing.shape == (0,)
     assert samples.missing.dtype == np.int64
+
+
+def test_columns_come_in_the_order_of_the_fibres() -> None:
+    counts = np.array([[10, 30, 70]], np.uint16)
+    assembler = Assembler(BoardSettings(1_000_000, 0b1000_1010, 1), (7, 1, 3), 3.3)
+    samples = assembler.samples([(1.0, Block(counts, 1, 0b1000_1010, 0, 0, 1000, 0))])
+    assert samples.volts / STEP_V == pytest.approx(np.array([[70, 10, 30]]))

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any
 
@@ -11,26 +11,20 @@ import numpy as np
 import pytest
 
 from design.common.errors import InputError
-from sense.rig.boards.due import driver as module
+from sense.rig.boards import block_reader
 from sense.rig.boards.due.driver import Arduino
 from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.rig.emulators.due_board import EmulatedBoard
+from tests.sense.rig.boards.reading import STEP_V, fault_of, joined, read_for, waves
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
-
-STEP_V = 3.3 / 4095
 
 
 @pytest.fixture(autouse=True)
 def soon_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where times need not be exact, connecting need not take long."""
-    monkeypatch.setattr(module, "_SETTLE_S", 0.15)
-
-
-def waves(times_s: np.ndarray) -> np.ndarray:
-    """Eight different slow voltages."""
-    return 1.65 + 1.5 * np.sin(2 * np.pi * (0.7 + 0.1 * np.arange(12)) * times_s[:, None])
+    monkeypatch.setattr(block_reader, "SETTLE_S", 0.15)
 
 
 @contextmanager
@@ -40,41 +34,16 @@ def connected(board: EmulatedBoard, rate_hz: float = 1000.0, **options: Any) -> 
         yield converter
 
 
-def joined(parts: list[ConverterSamples]) -> ConverterSamples:
-    return ConverterSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
-
-
-def read_for(converter: Arduino, seconds: float) -> ConverterSamples:
-    parts, end = [converter.read()], time.monotonic() + seconds
-    while time.monotonic() < end:
-        time.sleep(0.02)
-        parts.append(converter.read())
-    return joined(parts)
-
-
-def check(samples: ConverterSamples, board: EmulatedBoard, within_s: float = 0.05) -> np.ndarray:
+def check(
+    samples: ConverterSamples, board: EmulatedBoard, within_s: float = 0.05, inputs: Sequence[int] = range(12)
+) -> np.ndarray:
     """Every reading is what the board read at that index, at the right time; returns the indices."""
     index = np.arange(len(samples.times_s)) + np.cumsum(samples.missing)
     truth = board.truth_s(index)
-    assert samples.volts == pytest.approx(waves(truth)[:, : samples.volts.shape[1]], abs=0.501 * STEP_V)
+    assert samples.volts == pytest.approx(waves(truth)[:, list(inputs)], abs=0.501 * STEP_V)
     assert (np.diff(samples.times_s) > 0).all()
     assert np.abs(samples.times_s - truth).max() < within_s
     return index
-
-
-def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> float:
-    """Call `action` until it raises the fault; returns how long that took."""
-
-    def repeat() -> None:
-        while time.monotonic() < begun + 10:
-            action()
-            time.sleep(0.01)
-
-    begun = time.monotonic()
-    with pytest.raises(RigFault, match=match) as caught:
-        repeat()
-    assert caught.value.cause == cause
-    return time.monotonic() - begun
 
 
 def test_a_second_without_a_gap_right_to_a_step_and_on_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,7 +51,7 @@ def test_a_second_without_a_gap_right_to_a_step_and_on_time(monkeypatch: pytest.
     board = EmulatedBoard(waves, skew_ppm=150)
     with board, closing(Arduino(board.port, 1000)) as converter:
         said = converter.connect()
-        assert said.items() >= {"name": "padforge-due", "firmware": "1.0.0", "channels": 8, "bits": 12}.items()
+        assert said.items() >= {"name": "padforge-due", "firmware": "1.0.0", "channels": 12, "bits": 12}.items()
         assert said["rate_hz"] == pytest.approx(1000)
         begun = time.process_time(), time.monotonic()
         samples = read_for(converter, 1.0)
@@ -96,15 +65,15 @@ def test_a_second_without_a_gap_right_to_a_step_and_on_time(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "options"), [(10.0, {}), (4000.0, {}), (1000.0, {"averaging": 16}), (500.0, {"channels": 12})]
+    ("rate_hz", "options"),
+    [(10.0, {}), (4000.0, {}), (1000.0, {"inputs": range(8), "averaging": 16}), (500.0, {"inputs": (11, 3, 0)})],
 )
 def test_other_rates_channels_and_averages(rate_hz: float, options: dict[str, Any]) -> None:
     board = EmulatedBoard(waves)
     with connected(board, rate_hz, **options) as converter:
         samples = read_for(converter, 0.1)
-        assert samples.volts.shape[1] == options.get("channels", 8)
         assert len(samples.times_s) > 0.2 * rate_hz
-        check(samples, board)
+        check(samples, board, inputs=options.get("inputs", range(12)))
 
 
 def test_a_sample_is_complete_a_period_after_the_one_before() -> None:
@@ -172,7 +141,7 @@ def test_a_board_that_has_lost_conversions_ends_the_reading() -> None:
 
 
 def test_a_host_that_never_reads_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_UNREAD_S", 0.4)
+    monkeypatch.setattr(block_reader, "UNREAD_S", 0.4)
     board = EmulatedBoard(waves)
     with connected(board) as converter:
         time.sleep(0.5)
@@ -189,9 +158,15 @@ def test_a_board_that_is_not_ours_is_refused(options: dict[str, Any], match: str
         assert fault_of(Arduino(board.port, 1000).connect, "refused", match) < 5
 
 
+def test_an_input_the_board_has_not_is_refused_before_it_is_opened() -> None:
+    with pytest.raises(RigFault, match=r"channels: fibre 2 is on input 12, an Arduino Due has 0 to 11") as caught:
+        Arduino("port", 1000, (3, 12))
+    assert caught.value.cause == "refused"
+
+
 def test_a_rate_the_board_cannot_keep_is_refused_by_it() -> None:
     with EmulatedBoard(waves) as board:
-        fault_of(Arduino(board.port, 10_000, averaging=16).connect, "refused", "8 channels at 10000 Hz")
+        fault_of(Arduino(board.port, 10_000, averaging=16).connect, "refused", "12 channels at 10000 Hz")
 
 
 def test_a_port_in_use_is_refused_and_free_again_after_close() -> None:
@@ -206,7 +181,7 @@ def test_a_port_in_use_is_refused_and_free_again_after_close() -> None:
     assert not any(thread.name == f"reader of {board.port}" for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize("values", [{"rate_hz": 9}, {"rate_hz": 10_001}, {"channels": 13}, {"averaging": 0}])
+@pytest.mark.parametrize("values", [{"rate_hz": 9}, {"rate_hz": 10_001}, {"averaging": 0}])
 def test_settings_out_of_range_are_named(values: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"{next(iter(values))} is .*expected"):
         Arduino("port", **{"rate_hz": 1000, **values})

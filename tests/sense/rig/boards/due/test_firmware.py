@@ -1,7 +1,5 @@
 """The sketch itself, compiled for this computer with a stand-in for the chip; the program's decoder reads it."""
 
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +19,8 @@ from sense.rig.boards.due.framing import (
     encode,
 )
 from sense.rig.emulators.due_board import judge_settings
+from tests.sense.rig.boards.compiling import compiled, sent
 
-HERE = Path(__file__).parent
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"
 ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]
 """Of inputs A0 to A11."""
@@ -30,14 +28,7 @@ ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("there is no g++")
-    path = tmp_path_factory.mktemp("firmware") / "board"
-    folders = ["-I", str(HERE / "stub"), "-I", str(FIRMWARE)]
-    warnings = ["-std=gnu++11", "-Wall", "-Wextra", "-Werror"]
-    subprocess.run([compiler, *warnings, *folders, str(HERE / "stub" / "board.cpp"), "-o", str(path)], check=True)
-    return path
+    return compiled("due", FIRMWARE, tmp_path_factory.mktemp("firmware"))
 
 
 class Board:
@@ -56,8 +47,7 @@ class Board:
         return self
 
     def bytes(self) -> bytes:
-        script = "\n".join(self.script).encode()
-        return subprocess.run([self.program], input=script, capture_output=True, check=True, timeout=20).stdout
+        return sent(self.program, self.script)
 
     def frames(self) -> list[Frame]:
         decoder = Decoder()

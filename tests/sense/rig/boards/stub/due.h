@@ -1,10 +1,7 @@
-// A stand-in for the Arduino core of the Due: just what the sketch uses, for a test on a computer.
+// What the Due has beyond other boards: its timers, converter and flash, as far as the sketch uses them.
 #pragma once
 
-#include <stdint.h>
-
-#include <deque>
-#include <vector>
+#include "Arduino.h"
 
 typedef volatile uint32_t Reg;
 typedef volatile uintptr_t PointerReg;
@@ -33,7 +30,6 @@ struct Efc {
 extern Tc stub_tc;
 extern Adc stub_adc;
 extern Efc stub_efc;
-extern uint32_t stub_us;
 extern bool stub_adc_irq;
 extern const char stub_flash[17];
 
@@ -54,33 +50,13 @@ const uint32_t ADC_PTCR_RXTEN = 1, ADC_PTCR_RXTDIS = 2;
 const uint32_t ADC_IER_GOVRE = 1u << 25, ADC_IER_ENDRX = 1u << 27, ADC_IER_RXBUFF = 1u << 28;
 const uint32_t ADC_ISR_GOVRE = 1u << 25, ADC_ISR_ENDRX = 1u << 27, ADC_ISR_RXBUFF = 1u << 28;
 const uint32_t EFC_FCMD_STUI = 0x0E, EFC_FCMD_SPUI = 0x0F, EEFC_FSR_FRDY = 1;
-enum { ADC_IRQn, ID_ADC, ID_TC0, INPUT, A0 = 54 };
+enum { ADC_IRQn, ID_ADC, ID_TC0 };
 
 inline void NVIC_EnableIRQ(int) { stub_adc_irq = true; }
 inline void NVIC_DisableIRQ(int) { stub_adc_irq = false; }
 inline void NVIC_ClearPendingIRQ(int) {}
 inline void pmc_enable_periph_clk(int) {}
-inline void pinMode(int, int) {}
 inline void watchdogEnable(int) {}
 inline void watchdogReset() {}
-inline uint32_t micros() { return stub_us; }
 
-struct StubSerial {
-  std::deque<uint8_t> in;
-  std::vector<uint8_t> out;
-  bool open = true;
-
-  void begin(int) {}
-  int available() { return static_cast<int>(in.size()); }
-  int read() {
-    const int byte = in.front();
-    in.pop_front();
-    return byte;
-  }
-  bool dtr() { return open; }
-  size_t write(const uint8_t *data, size_t size) {
-    out.insert(out.end(), data, data + size);
-    return size;
-  }
-};
 extern StubSerial SerialUSB;

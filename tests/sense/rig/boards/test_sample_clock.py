@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from sense.rig.boards.due import sample_clock as clock
-from sense.rig.boards.due.sample_clock import SampleClock
+from sense.rig.boards import sample_clock as clock
+from sense.rig.boards.sample_clock import QUARTZ_SKEW, SampleClock
 from tests.helpers.effort import few
 
 SETTLE_S = 0.5
@@ -41,6 +41,11 @@ class Link:
         return last, taken, np.maximum.accumulate(arrived)
 
 
+def block_of(last: int, samples: int) -> np.ndarray:
+    """Indices of a block."""
+    return np.arange(last - samples + 1, last + 1)
+
+
 def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     """Error of the time of each block's last sample; checks that all times ascend and are given as blocks come."""
     last, taken, arrived = link.blocks()
@@ -51,7 +56,7 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
         if arrived[i] < arrived[0] + SETTLE_S:
             continue
         for j in range(given_to, i + 1):
-            times = clock.times(int(last[j]) - link.block + 1, link.block)
+            times = clock.times(block_of(int(last[j]), link.block))
             assert times[0] > before
             assert (np.diff(times) > 0).all()
             before = times[-1]
@@ -90,7 +95,7 @@ def test_without_delay_the_times_are_the_arrivals(start_s: float, period_s: floa
     for block in range(1, 40):
         last = first + block * count
         clock.observe(last, start_s + block * count * period_s)
-        times = clock.times(last - count + 1, count)
+        times = clock.times(block_of(last, count))
         assert times[-1] == pytest.approx(start_s + block * count * period_s, abs=1e-6)
         assert (np.diff(times) > 0).all()
 
@@ -98,9 +103,9 @@ def test_without_delay_the_times_are_the_arrivals(start_s: float, period_s: floa
 def test_a_gap_in_the_samples_is_a_gap_in_the_times() -> None:
     clock = SampleClock(1e-3)
     clock.observe(15, 100.015)
-    early = clock.times(0, 16)
+    early = clock.times(block_of(15, 16))
     clock.observe(1015, 101.015)
-    late = clock.times(1000, 16)
+    late = clock.times(block_of(1015, 16))
     assert late[0] - early[-1] == pytest.approx(0.985)
 
 
@@ -108,15 +113,29 @@ def test_a_step_of_the_delay_is_caught_up_with_without_ever_going_back() -> None
     clock, before = SampleClock(1e-3), -np.inf
     for first in range(0, 3200, 16):
         clock.observe(first + 15, (first + 15) * 1e-3 + (0.3 if first < 320 else 0.0))
-        times = clock.times(first, 16)
+        times = clock.times(block_of(first + 15, 16))
         assert times[0] > before
         before = times[-1]
     assert before == pytest.approx(3.199, abs=1e-3)
 
 
+def test_counts_that_are_no_steps_of_one_keep_their_distance() -> None:
+    """A board that counts microseconds, with a resonator that is off by 3 in a thousand."""
+    rng = np.random.default_rng(2)
+    clock, taken_us = SampleClock(1e-6, 5e-3), np.cumsum(rng.integers(900, 1100, 90_000))
+    taken_s = 50 + taken_us * 1e-6 * 1.003
+    times = np.empty(0)
+    for block in np.split(np.arange(len(taken_us)), 9000):
+        clock.observe(int(taken_us[block[-1]]), float(taken_s[block[-1]]) + rng.uniform(0, 5e-3))
+        times = clock.times(taken_us[block])
+    assert times == pytest.approx(taken_s[-10:], abs=1e-3)
+    assert np.diff(times) == pytest.approx(np.diff(taken_s[-10:]), rel=1e-2)
+    assert clock.skew_ppm == pytest.approx(3000, abs=60)
+
+
 def test_there_is_no_time_before_the_first_block() -> None:
     with pytest.raises(ValueError, match="no block"):
-        SampleClock(1e-3).times(0, 1)
+        SampleClock(1e-3).times(block_of(0, 1))
 
 
 @few(40)
@@ -125,8 +144,8 @@ def test_the_line_under_the_points_is_the_highest_at_their_middle(seed: int, cou
     """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
     rng = np.random.default_rng(seed)
     x, y = np.sort(rng.uniform(0, 100, count)), size * rng.uniform(0, 1, count)
-    offset, slope = clock._line_under(list(zip(x.tolist(), y.tolist(), strict=True)))
-    steepest = clock._MAX_SKEW
+    steepest = QUARTZ_SKEW
+    offset, slope = clock._line_under(list(zip(x.tolist(), y.tolist(), strict=True)), steepest)
     below = np.column_stack([np.ones(count), x])
     best = linprog([-1, -x.mean()], below, y, bounds=[(None, None), (-steepest, steepest)])
     assert abs(slope) <= steepest

@@ -10,7 +10,7 @@
 #include <iostream>
 #include <string>
 
-#include "Arduino.h"
+#include "due.h"
 
 Tc stub_tc;
 Adc stub_adc;
@@ -19,6 +19,8 @@ uint32_t stub_us = 4294000000u;  // the clock wraps around soon after the start
 bool stub_adc_irq = false;
 const char stub_flash[17] = "serial-of-a-chip";
 StubSerial SerialUSB;
+
+void pinMode(int, int) {}
 
 #include "padforge_due.ino"
 

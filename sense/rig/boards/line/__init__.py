@@ -1,0 +1,1 @@
+"""Any board that sends its samples as lines of text."""

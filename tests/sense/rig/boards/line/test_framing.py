@@ -1,0 +1,149 @@
+"""Lines of text, written and read back, in any portions and damaged in every way."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sense.rig.boards.line import framing
+from sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line
+from tests.helpers.effort import few
+
+HEADER = Header(500, 12, 3.3, 4, said=(("name", "my-board"),))
+SAMPLES = [Sample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
+LINES = [sample_line(sample.time_us, sample.counts, True) for sample in SAMPLES]
+
+
+def decoded(*lines: bytes, header: bytes = header_line(HEADER)) -> tuple[list[Header | Sample], Decoder]:
+    decoder = Decoder()
+    decoder.feed(header)
+    return decoder.feed(b"".join(lines)), decoder
+
+
+def test_the_example_of_the_protocol_is_read() -> None:
+    """The one that whoever writes a board's program has before him."""
+    text = "\n".join(line.strip() for line in (framing.__doc__ or "").splitlines() if line.startswith("    "))
+    found = Decoder().feed(text.encode() + b"\n")
+    assert found[0] == HEADER
+    assert found[1:] == [Sample(2000, (2048, 1991, 870, 2003)), Sample(4000, (2049, 1990, 871, 2004))]
+
+
+@few(50)
+@given(st.data())
+def test_what_is_written_is_read_in_any_portions(data: st.DataObject) -> None:
+    header = Header(
+        data.draw(st.sampled_from([10.0, 333.25, 10_000.0])),
+        data.draw(st.integers(1, 24)),
+        data.draw(st.sampled_from([0.1, 1.1, 5.0])),
+        data.draw(st.integers(1, 20)),
+        data.draw(st.booleans()),
+    )
+    counts = st.tuples(*[st.integers(0, header.full_scale)] * header.channels)
+    samples = data.draw(st.lists(st.builds(Sample, st.integers(0, 2**64), counts), max_size=9))
+    sent = [header_line(header), *(sample_line(each.time_us, each.counts, header.checked) for each in samples)]
+    stream = b"".join(sent)
+    if data.draw(st.booleans()):
+        stream = stream.replace(b"\n", b"\r\n")
+    decoder, found, at = Decoder(), [], 0
+    while at < len(stream):
+        size = data.draw(st.integers(1, 100))
+        found += decoder.feed(stream[at : at + size])
+        at += size
+    assert found == [header, *samples]
+    assert decoder.damaged == 0
+
+
+def test_any_bit_byte_or_newline_that_is_wrong_costs_its_lines_and_gives_no_other() -> None:
+    """Every flipped bit, every byte dropped, doubled or replaced, and every pair of neighbours swapped."""
+    line = LINES[1]
+    for i in range(len(line)):
+        others = [bytes([line[i] ^ 1 << bit]) for bit in range(8)] + [b"", line[i : i + 1] * 2, b"7", b",", b"\n"]
+        damaged = [line[:i] + other + line[i + 1 :] for other in others if other != line[i : i + 1]]
+        damaged.append(line[:i] + line[i : i + 2][::-1] + line[i + 2 :])
+        for each in damaged:
+            found, _ = decoded(LINES[0], each, LINES[2])
+            assert [sample for sample in found if sample not in (SAMPLES[0], SAMPLES[2])] in ([], [SAMPLES[1]])
+            assert found[0] == SAMPLES[0]
+
+
+@few(30)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_noise_gives_nothing_that_was_not_sent(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    samples = [Sample(k * 2000, tuple(rng.integers(4096, size=4).tolist())) for k in range(300)]
+    stream = bytearray(b"".join(sample_line(each.time_us, each.counts, True) for each in samples))
+    for at in np.flatnonzero(rng.random(len(stream)) < 3e-3)[::-1].tolist():
+        stream[at : at + 1] = rng.bytes(int(rng.integers(4)))
+    found, decoder = decoded(bytes(stream))
+    assert set(found) <= set(samples)
+    assert len(found) + decoder.damaged >= 250
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        (b"2000,1,2,3,4\n", "a line has no check"),
+        (sample_line(2000, (1, 2, 3), True), "has 4 numbers, expected 5: the time and the inputs"),
+        (sample_line(2000, (1, 2, 3, 4, 5), True), "has 6 numbers, expected 5"),
+        (sample_line(2000, (1, 2, 3, 4096), True), "a count is 4096, its header allows 4095"),
+        (sample_line(-2000, (1, 2, 3, 4), True), "begins '-2000,1,2,3,4*b292ef', expected whole numbers"),
+        (framing._line("2000,1,2,,4", True), "expected whole numbers"),
+        (framing._line("2000,1,2,1_0,4", True), "expected whole numbers"),
+        (framing._line("2000,1,2, 3,4", True), "expected whole numbers"),
+        (b"9" * 9000 + b"\n", "a line of more than 8192 bytes"),
+        (LINES[0][:-2] + b"!\n", "the check does not fit"),
+    ],
+)
+def test_a_line_that_is_no_sample_is_counted_and_said(line: bytes, complaint: str) -> None:
+    found, decoder = decoded(line)
+    assert found == []
+    assert (decoder.damaged, decoder.in_a_row) == (1, 1)
+    assert complaint in decoder.complaint
+    assert decoder.feed(LINES[0]) == [SAMPLES[0]]
+    assert (decoder.damaged, decoder.in_a_row) == (1, 0)
+
+
+def test_what_is_wrong_with_most_lines_is_said() -> None:
+    short = sample_line(2000, (1, 2, 3), True)
+    _, decoder = decoded(short, short, b"1,2\n", b"# hot\n")
+    assert decoder.in_a_row == 3
+    assert "4 numbers" in decoder.complaint
+
+
+def test_lines_for_people_are_passed_over() -> None:
+    found, decoder = decoded(b"# warming up\n", LINES[0], b"#\n\n")
+    assert found == [SAMPLES[0]]
+    assert decoder.damaged == 0
+
+
+def test_without_a_header_nothing_is_a_sample() -> None:
+    assert Decoder().feed(b"boot: 1,2,3\n" + LINES[0]) == []
+
+
+def test_a_board_may_leave_the_check_out_but_one_that_is_there_must_fit() -> None:
+    header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"
+    found, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
+    assert found == [Sample(10, (1, 2))]
+    assert decoder.header == Header(100, 10, 5, 2, checked=False)
+    assert decoder.damaged == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("2 rate_hz=100 bits=10 reference_v=5 channels=2", "version 2 of the line protocol, expected 1"),
+        ("1 rate_hz=100 bits=10 reference_v=5", "channels of its header is 'missing', allowed is 1 to 512"),
+        ("1 rate_hz=fast bits=10 reference_v=5 channels=2", "rate_hz of its header is 'fast', allowed is 10 to 10000"),
+        ("1 rate_hz=9.9 bits=10 reference_v=5 channels=2", "rate_hz of its header is '9.9'"),
+        ("1 rate_hz=nan bits=10 reference_v=5 channels=2", "rate_hz of its header is 'nan'"),
+        ("1 rate_hz=100 bits=10.5 reference_v=5 channels=2", "bits of its header is '10.5', allowed is 1 to 24"),
+        ("1 rate_hz=100 bits=10 reference_v=0 channels=2", "reference_v of its header is '0'"),
+        ("1 rate_hz=100 bits=10 reference_v=5 channels=513", "channels of its header is '513'"),
+        ("1 rate_hz=100 bits=10 reference_v=5 channels=2 check=xor", "check is 'xor', allowed are crc32 and none"),
+    ],
+)
+def test_a_header_that_cannot_be_is_told(text: str, complaint: str) -> None:
+    decoder = Decoder()
+    assert decoder.feed(f"# padforge-line {text}\n".encode()) == []
+    assert decoder.header is None
+    assert complaint in decoder.complaint
