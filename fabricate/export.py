@@ -20,8 +20,10 @@ from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND, sound
 from fabricate.checks.plan_checks import inspect
 from fabricate.mould.assembly import (
+    bed_frame,
     conductive_body,
     conductive_plan,
+    holder_body,
     lid_body,
     lid_holes,
     mould_body,
@@ -118,6 +120,9 @@ def _bodies(plan: Plan) -> list[tuple[str, Body]]:
         bodies.append(("lid", lid_body(plan)))
     if plan.settings.mould.conductive:
         bodies.append(("conductive", conductive_body(conductive_plan(plan))))
+    if plan.settings.mould.holder:
+        wide = conductive_plan(plan) if plan.settings.mould.conductive else plan  # so that either pad fits
+        bodies.append(("holder", holder_body(wide)))
     return bodies
 
 
@@ -182,6 +187,7 @@ def _document(
         "silicone_volume_ml": bench["silicone"]["volume_ml"],
         "findings": [finding.document() for finding in findings],
         **bench,
+        **({"frame": bed_frame(plan)} if settings.mould.holder else {}),
         "settings": {
             "pitch_mm": plan.pad.pitch_mm,
             "mould": settings.mould.model_dump(),

@@ -22,6 +22,8 @@ class MouldSettings(Settings):
             much taller as the deep family is than the shallow one; "two": a pad with such crossings is refused.
         exit_mm, exit_width_mm: slots in the wall around every ridge end; they leave a tongue of silicone on the pad
             that relieves the lead of strain.
+        holder: a shallow tray without ridges, to be printed last and left on the bed, in which the finished pad lies as
+            it was cast while the printer presses it; its place is then known (`frame` in fabrication.json).
         conductive: a second mould with a well at every ridge end, for casting a conductive material into the tracks
             in place of laid fibres.
     """
@@ -45,6 +47,7 @@ class MouldSettings(Settings):
     pins: bool = Field(default=False, description="registration pins on the wall, with holes in the lid")
     lid: bool = Field(default=False, description="a lid that levels the silicone")
     spout: bool = Field(default=False, description="a pour spout in the lid")
+    holder: bool = Field(default=False, description="a tray that holds the pad on the bed while a printer presses it")
     conductive: bool = Field(default=False, description="a second mould with wells for conductive material")
     lead_mm: float = Field(default=30.0, ge=0, le=1000, description="fibre left over at each end, mm")
     tolerance_mm: float = Field(default=0.01, ge=1e-3, le=0.1, description="greatest deviation of a ridge, mm")

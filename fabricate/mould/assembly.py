@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError
@@ -16,7 +17,7 @@ from design.pad.morphology import Morphology
 from fabricate.settings import DEFAULTS, FabricationSettings
 
 from . import parts
-from .plan import Plan
+from .plan import Plan, square
 from .prisms import Body
 
 if TYPE_CHECKING:
@@ -31,6 +32,10 @@ _VENT_INSET_MM = 3.0
 """How far from the cavity's rim the lid's vents lie."""
 LID_MM = 3.0
 """Thickness of the lid."""
+HOLDER_WALL_MM = 1.0
+"""Height of the holder's walls above its floor: far below the pad's surface, so that no probe meets them."""
+HOLDER_PLAY_MM = 0.2
+"""Room on every side of the pad in its holder."""
 
 
 def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> "Solid":
@@ -144,6 +149,44 @@ def lid_holes(plan: Plan) -> int:
     """How many holes lead through the lid: vents, those for pins, and the spout."""
     mould = plan.settings.mould
     return 4 + 3 * mould.pins + mould.spout
+
+
+def holder_body(plan: Plan) -> Body:
+    """The tray in which the finished pad lies, tracks down as it was cast.
+
+    Slots let the leads out. The corner where the first horizontal and the first vertical fibre start is cut.
+    """
+    mould, edge, out, cut = plan.settings.mould, plan.cavity.bounds[2], plan.tray.bounds[2], plan.corner_mm
+    half = mould.exit_width_mm / 2 + HOLDER_PLAY_MM
+    slots = []
+    for fibre, line in enumerate(plan.lines):
+        across = line.coords[0][1 - plan.family(fibre)], line.coords[-1][1 - plan.family(fibre)]
+        for side, middle in zip((-1, 1), across, strict=True):
+            along, beside = sorted((0.0, side * (out + 1))), (middle - half, middle + half)
+            (x0, x1), (y0, y1) = (beside, along) if plan.family(fibre) else (along, beside)
+            slots.append(shapely.box(x0, y0, x1, y1))
+    marked = plan.tray - shapely.Polygon([(-out, -out), (cut - out, -out), (-out, cut - out)])
+    hollow = shapely.union_all([square(edge + HOLDER_PLAY_MM), *slots])
+    return parts.tray(marked, [hollow], floor_mm=mould.floor_mm, depth_mm=HOLDER_WALL_MM)
+
+
+def bed_frame(plan: Plan) -> dict[str, float | list[float]]:
+    """Where the pad lies while its holder stands where a slicer puts it, in the middle of the bed; mm and degrees.
+
+    Returns:
+        "bed_mm": width, depth and height of the printer. "centre_mm": of the pad, x and y. "angle_deg": from the bed's
+        x axis to the pad's. "pad_mm": side of the pad. "surface_mm", "walls_mm": of the pad and of the holder's walls
+        above the bed.
+    """
+    floor_mm, bed_mm = plan.settings.mould.floor_mm, plan.settings.printer.bed_mm
+    return {
+        "bed_mm": list(bed_mm),
+        "centre_mm": [side / 2 for side in bed_mm[:2]],
+        "angle_deg": 0.0,
+        "pad_mm": round(2 * plan.cavity.bounds[2], 6),
+        "surface_mm": round(floor_mm + plan.silicone_mm, 6),
+        "walls_mm": round(floor_mm + HOLDER_WALL_MM, 6),
+    }
 
 
 def conductive_plan(plan: Plan) -> Plan:

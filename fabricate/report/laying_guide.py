@@ -129,6 +129,12 @@ def _printing(document: Mapping[str, Any]) -> Iterator[str]:
         yield "- Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."
     if mould["lid"]:
         yield "- Print the lid as well."
+    if mould["holder"]:
+        yield (
+            "- Print the holder last, in the middle of the bed, and leave it there. The finished pad lies in it with"
+            " its tracks down; fibres 1 and "
+            f"{len(document['fibres']) // 2 + 1} start at the cut corner."
+        )
     if mould["conductive"]:
         yield "- The mould called `conductive` is for casting a conductive material in place of fibres."
 

@@ -20,10 +20,10 @@ PAD = Morphology.random(1, 2, seed=7)
 
 
 FILES = {
-    *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive") for suffix in ("stl", "3mf", "step")),
+    *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf", "step")),
     *("tracks.svg", "tracks.dxf", "mould.png", "tracks.png", "laying.md", "fabrication.json"),
 }
-SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True})
+SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +93,7 @@ def test_the_document_has_what_a_lab_needs(built):
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
     assert document["size_mm"] == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
     assert document["sizes"]["tray_mm"] == pytest.approx(side)
+    assert document["frame"]["centre_mm"] == [110, 110]
     assert {finding["name"] for finding in document["findings"]} >= {"watertight", "bed", "layers", "tray_wall"}
     assert set(document["provenance"]) == {"command", "seed", "versions", "inputs"}
     assert len(document["crossings"]["table"]) == document["crossings"]["total"] >= PAD.grid**2
@@ -103,6 +104,10 @@ def test_the_document_has_what_a_lab_needs(built):
 
 def test_same_family_crossings_are_counted(tmp_path):
     assert build(level_pad(1.8, 1.2), tmp_path, [])["crossings"]["same_family"] == 2
+
+
+def test_without_a_holder_nobody_knows_where_the_pad_lies(tmp_path):
+    assert "frame" not in build(PAD, tmp_path, [])
 
 
 def test_nothing_is_written_from_a_mould_in_two_pieces(tmp_path, monkeypatch):

@@ -98,6 +98,7 @@ def test_the_defaults_are_those_the_pads_were_made_with():
         "pins": False,
         "lid": False,
         "spout": False,
+        "holder": False,
         "conductive": False,
         "lead_mm": 30.0,
         "tolerance_mm": 0.01,

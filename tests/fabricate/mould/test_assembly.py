@@ -10,9 +10,11 @@ from design.pad.morphology import Morphology
 from fabricate.checks.plan_checks import check_plan
 from fabricate.mould.assembly import (
     WELL_MM,
+    bed_frame,
     build_mould,
     conductive_body,
     conductive_plan,
+    holder_body,
     lid_body,
     mould_body,
     plan_mesh,
@@ -122,6 +124,38 @@ def test_all_ways_to_the_solid_agree(settings):
     assert_one_closed_body(as_read(body))
     if settings.mould.conductive:
         assert_all_ways_agree(conductive_body(conductive_plan(plan)))
+
+
+@pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0, "border_mm": 1.5}, {"floor_mm": 1.2, "wall_mm": 0.8}])
+def test_the_holder_takes_the_pad_with_its_leads(mould):
+    plan = Plan(Morphology.random(3, 2, seed=4), with_settings(mould))
+    read, frame = as_read(holder_body(plan)), bed_frame(plan)
+    assert_one_closed_body(read)
+    floor, wall, out = plan.settings.mould.floor_mm, frame["walls_mm"], plan.tray.bounds[2]
+    assert read.bounds == pytest.approx(np.array([[-out, -out, 0], [out, out, wall]]), abs=1e-4)
+    rim = shapely.segmentize(plan.silicone.buffer(0.1, join_style="mitre").exterior, 1.3)
+    leads = [end for line in plan.lines for end in (line.coords[0], line.coords[-1])]
+    beyond = [(x * 50, y) if abs(x) > abs(y) else (x, y * 50) for x, y in leads]
+    ways = [
+        shapely.LineString([end, away]).intersection(plan.tray).coords[-1]
+        for end, away in zip(leads, beyond, strict=True)
+    ]
+    for x, y in [*rim.coords, *leads, *(0.999 * np.array(ways))]:
+        assert height_at(read, x, y) == pytest.approx(floor)
+    inside = out - 0.2
+    assert [
+        height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (inside, -inside))
+    ] == pytest.approx([wall] * 3)
+    with pytest.raises(ValueError, match="zero-size array"):
+        height_at(read, -inside, -inside)
+
+
+def test_the_frame_on_the_bed_is_that_of_the_mould():
+    plan = Plan(Morphology.straight(2), with_settings({"border_mm": 1.0}, printer={"bed_mm": [300.0, 200.0, 100.0]}))
+    frame = bed_frame(plan)
+    assert (frame["centre_mm"], frame["angle_deg"]) == ([150.0, 100.0], 0.0)
+    assert frame["pad_mm"] == sizes(plan)["pad_mm"]
+    assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
 
 
 @LONG

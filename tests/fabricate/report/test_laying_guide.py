@@ -159,6 +159,12 @@ def test_the_page_has_what_to_mix_and_to_cut():
     assert "4 hours" in page
 
 
+def test_the_page_tells_how_the_pad_lies_in_its_holder():
+    page = laying_guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
+    assert "tracks down; fibres 1 and 5 start at the cut corner" in page
+    assert "holder" not in laying_guide.laying_page(whole(Plan(Morphology.straight(4))))
+
+
 def test_the_page_has_places_as_on_the_pad_turned_over():
     plan = Plan(Morphology.straight(2))
     table = rows(laying_guide.laying_page(whole(plan)), "fibres")

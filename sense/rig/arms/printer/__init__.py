@@ -1,0 +1,1 @@
+"""A 3D printer with a probe clamped beside its nozzle."""

@@ -1,0 +1,1 @@
+"""A 3D printer of this machine: its firmware, and the pseudo-terminal at which it listens."""

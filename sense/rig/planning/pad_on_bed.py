@@ -1,0 +1,70 @@
+"""Where the pad lies on a printer's bed: in the holder, which was printed there and left, so that nobody teaches it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from design.common.errors import InputError
+from design.common.files import read_json
+from sense.rig.devices.protocols import RigFault
+from sense.settings import RigSettings
+
+FILE, FORMAT = "fabrication.json", "padforge-fabrication/1"
+_LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "pad_mm": 1, "surface_mm": 1, "walls_mm": 1}
+_SLACK_MM = 1e-6
+
+
+def on_bed(rig: RigSettings, folder: Path) -> RigSettings:
+    """`rig` with the place of the pad, the height of its surface and the workspace above it, where it leaves them open.
+
+    The workspace is the pad seen from above, as far as the nozzle gets; down to `max_depth_mm`, but never below the top
+    of the holder's walls.
+
+    Args:
+        folder: with the `fabrication.json` of a pad with a holder, see "frame" in it.
+
+    Raises:
+        RigFault: "refused" where something is open, and the folder or the tip's place does not tell it.
+        InputError: the file is damaged.
+    """
+    if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
+        return rig
+    if rig.tcp_mm is None:
+        message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
+        raise RigFault("refused", message, "measure them with the probe in place")
+    frame = _frame(folder)
+    (x, y), surface = rig.pad_mm or frame["centre_mm"], frame["surface_mm"]
+    contact = surface if rig.contact_mm is None else rig.contact_mm
+    half, (width, depth, height) = frame["pad_mm"] / 2, frame["bed_mm"]
+    dx, dy, dz = rig.tcp_mm
+    box = (
+        *(max(x - half, dx), min(x + half, width + dx)),
+        *(max(y - half, dy), min(y + half, depth + dy)),
+        *(max(contact - rig.max_depth_mm, frame["walls_mm"]) - _SLACK_MM, height + dz),
+    )
+    place = {"pad_mm": (x, y), "contact_mm": contact, "box_mm": rig.box_mm or box}
+    return rig.model_copy(update=place | {"pad_angle_deg": rig.pad_angle_deg + frame["angle_deg"]})
+
+
+def _frame(folder: Path) -> Mapping[str, Any]:
+    """The frame in the folder's fabrication.json, checked: numbers, and rows of them as tuples."""
+    path = folder / FILE
+    if not path.is_file():
+        message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and there is no {path}"
+        raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
+    frame = read_json(path, FORMAT).get("frame")
+    if not isinstance(frame, Mapping):
+        message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {path} is of a pad without a holder"
+        raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
+    read = {name: _numbers(frame.get(name), count) for name, count in _LENGTHS.items()}
+    if wrong := [name for name, value in read.items() if value is None]:
+        raise InputError(f"{path}: frame has no {wrong[0]}, expected {_LENGTHS[wrong[0]]} finite numbers")
+    return read
+
+
+def _numbers(value: object, count: int) -> Any:
+    """The value as a number or as a tuple of so many; None where it is something else."""
+    values: list[Any] = value if isinstance(value, list) else [value]
+    if len(values) != count or not all(type(one) in (int, float) and abs(one) <= 1e4 for one in values):
+        return None
+    return tuple(map(float, values)) if count > 1 else float(values[0])

@@ -1,0 +1,203 @@
+"""The printer as an arm, through a real pseudo-terminal and real pyserial, against the emulated firmware."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sense.rig.arms.printer import driver as module
+from sense.rig.arms.printer.driver import Printer
+from sense.rig.devices.protocols import ArmState, RigFault
+from sense.rig.emulators.printer import firmware
+from sense.rig.emulators.printer.emulator import EmulatedPrinter
+from sense.settings import RigSettings
+
+pytest.importorskip("serial")
+pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
+
+AT = (80.0, 110.0, 60.0)
+TCP = (30.0, 0.0, -20.0)
+RIG = RigSettings(tcp_mm=TCP, clearance_mm=2.0, depth_mm=3.0)
+QUICK: dict[str, Any] = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.0)}
+
+
+def driven(printer: EmulatedPrinter, **settings: Any) -> Printer:
+    return Printer.of(RIG.model_copy(update={"printer_port": printer.port, **settings}))
+
+
+@contextmanager
+def connected(at: tuple[float, float, float] = AT, **options: Any) -> Iterator[tuple[Printer, EmulatedPrinter]]:
+    with EmulatedPrinter(at, **{**QUICK, **options}) as printer, closing(driven(printer)) as arm:
+        arm.connect()
+        yield arm, printer
+
+
+def pose(x: float, y: float, z: float) -> tuple[float, ...]:
+    return (x, y, z, *RIG.tool_rad)
+
+
+def to_rest(arm: Printer) -> ArmState:
+    while (state := arm.state()).moving:
+        time.sleep(0.004)
+    return state
+
+
+def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> float:
+    """Call `action` until it raises the fault; returns how long that took."""
+
+    def repeat() -> None:
+        while time.monotonic() < begun + 5:
+            action()
+            time.sleep(0.004)
+
+    begun = time.monotonic()
+    with pytest.raises(RigFault, match=match) as caught:
+        repeat()
+    assert caught.value.cause == cause
+    return time.monotonic() - begun
+
+
+def test_a_printer_says_who_it_is_and_where_its_tip_is():
+    with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
+        told = arm.connect()
+        assert told["firmware"].startswith("Marlin")
+        assert told["max_mm_s"] == [500.0, 500.0, 15.0]
+        state = arm.state()
+        assert state.pose == pytest.approx(pose(110, 110, 40))
+        assert (state.moving, state.force_n) == (False, None)
+
+
+@pytest.mark.parametrize("realtime", [True, False])
+def test_the_tip_goes_straight_and_its_place_is_known_all_the_way(realtime):
+    with connected(realtime=realtime) as (arm, printer):
+        arm.drain()
+        begun = time.monotonic()
+        arm.move(pose(115, 100, 32), 20.0, 500.0)
+        assert to_rest(arm).pose == pytest.approx(pose(115, 100, 32), abs=1e-9)
+        assert time.monotonic() - begun == pytest.approx(0.1 + 13.75 / 20 + 20 / 500, abs=0.2)
+        rows = arm.drain()
+        truth = printer.nozzle_at(rows[:, 0]) + TCP
+        assert truth[-1] == pytest.approx((115, 100, 32), abs=1e-3)
+        assert np.linalg.norm(rows[:, 1:4] - truth, axis=1).max() < 2.5  # 20 mm/s, and a tenth of a second
+        assert np.diff(rows[:, 0]).max() < 0.4
+        assert len(rows) > 10
+        assert np.isnan(rows[:, 8]).all()
+
+
+def test_axes_are_no_faster_than_the_printer_makes_them():
+    with connected(max_mm_s=(500.0, 500.0, 20.0)) as (arm, printer):
+        arm.move(pose(110, 110, 30), 200.0, 3000.0)
+        to_rest(arm)
+        made = printer.firmware.made[-1].move
+        assert made.speed == pytest.approx(20, rel=1e-3)
+        assert made.acceleration == pytest.approx(3000)
+
+
+@pytest.mark.parametrize("emergency_parser", [True, False])
+def test_a_stop_is_one_at_once_and_the_place_is_known_after_it(emergency_parser):
+    with connected(emergency_parser=emergency_parser) as (arm, printer):
+        arm.move(pose(110, 110, 20), 20.0, 3000.0)
+        time.sleep(0.4)
+        begun = time.monotonic()
+        arm.stop()
+        assert time.monotonic() - begun < 0.5
+        stood = printer.nozzle_at(time.monotonic())[0] + TCP
+        assert 25 < stood[2] < 38
+        assert arm.state().pose[:3] == pytest.approx(stood, abs=0.01)
+        assert not arm.state().moving
+        arm.stop()
+        arm.move(pose(110, 110, 40), 20.0, 3000.0)
+        assert to_rest(arm).pose[2] == pytest.approx(40)
+
+
+@pytest.mark.parametrize(
+    ("disturb", "cause", "match", "under_way"),
+    [
+        (EmulatedPrinter.halt, "emergency_stop", "has halted .*kill", True),
+        (EmulatedPrinter.restart, "lost", "has restarted, so that its place is unknown", False),
+        (EmulatedPrinter.unplug, "lost", "the printer is gone", False),
+        (lambda printer: printer.busy(10), "stale", "it may be busy", True),
+    ],
+    ids=["halt", "restart", "unplug", "busy"],
+)
+def test_faults_are_told_within_two_seconds(disturb, cause, match, under_way):
+    with connected() as (arm, printer):
+        if under_way:
+            arm.move(pose(110, 110, 20), 10.0, 3000.0)
+        disturb(printer)
+        assert fault_of(arm.state, cause, match) < 2
+
+
+def test_a_stop_that_is_not_confirmed_halts_the_printer():
+    with connected() as (arm, printer):
+        arm.move(pose(110, 110, 10), 10.0, 3000.0)
+        time.sleep(0.3)
+        printer.busy(10)
+        begun = time.monotonic()
+        with pytest.raises(RigFault, match="did not confirm the stop, and was told to halt"):
+            arm.stop()
+        time.sleep(0.05)
+        assert printer.firmware.halted
+        assert printer.nozzle_at(begun + 0.6)[0] == pytest.approx(printer.nozzle_at(begun + 5)[0])
+
+
+def test_a_place_beyond_the_printers_reach_is_told_before_it_goes_there():
+    with connected() as (arm, printer):
+        with pytest.raises(RigFault, match=r"is about to go to 220\.00, .* but was sent to 230\.00") as fault:
+            arm.move(pose(260, 110, 40), 50.0, 3000.0)
+        assert fault.value.cause == "lost"
+        assert printer.nozzle_at(time.monotonic() + 9)[0] == pytest.approx(AT, abs=0.5)
+        fault_of(arm.state, "lost")
+
+
+@pytest.mark.parametrize(
+    ("options", "settings", "match"),
+    [
+        ({}, {"printer_port": None}, "printer_port is unknown"),
+        ({}, {"tcp_mm": None}, "tcp_mm is unknown"),
+        ({"at": (0.0, 0.0, 0.0)}, {}, "has not been homed"),
+        ({"restarts": True}, {}, "has restarted"),
+        ({"max_mm_s": (500.0, 500.0, 3.0)}, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
+        ({}, {"depths_mm": (1.0, 9.0), "press_mm_s": 2.0}, "way down of 11 mm"),
+    ],
+)
+def test_a_printer_that_cannot_be_used_is_refused(options, settings, match):
+    with EmulatedPrinter(**{"at": AT, **QUICK, **options}) as printer, closing(driven(printer, **settings)) as arm:
+        assert fault_of(arm.connect, "refused", match) < 5
+        fault_of(arm.state, "lost", "connect first")
+        assert len(printer.firmware.made) == 1
+
+
+def test_other_firmware_and_silent_ports_are_refused(monkeypatch):
+    monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:RepRapFirmware FIRMWARE_VERSION:3.4")
+    with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
+        fault_of(arm.connect, "refused", "'RepRapFirmware', allowed is Marlin")
+        monkeypatch.setattr(module, "CONNECT_S", 0.2)
+        printer.busy(60)
+        fault_of(arm.connect, "refused", "no printer answers; check .* printer_baud")
+
+
+def test_orders_that_are_none_are_refused_and_break_nothing():
+    with connected() as (arm, _):
+        with pytest.raises(RigFault, match="a printer cannot turn it"):
+            arm.move((110, 110, 40, 0.0, 3.0, 0.0), 10.0, 100.0)
+        with pytest.raises(RigFault, match="finite numbers"):
+            arm.move(pose(float("nan"), 110, 40), 10.0, 100.0)
+        arm.move(pose(110, 110, 39), 10.0, 100.0)
+        with pytest.raises(RigFault, match="under way"):
+            arm.move(pose(110, 110, 40), 10.0, 100.0)
+        to_rest(arm)
+
+
+def test_a_port_in_use_is_refused_and_free_again_after_close():
+    with connected() as (arm, printer):
+        second = driven(printer)
+        fault_of(second.connect, "refused", "another program uses it")
+        arm.close()
+        arm.close()
+        second.connect()
+        second.close()

@@ -1,0 +1,81 @@
+"""The place of the pad from the file that fabricate writes, the contract of two packages that know nothing else."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design.common.errors import InputError
+from design.pad.morphology import Morphology
+from fabricate import build
+from sense.recordings.press_plan import PressPlan, planned
+from sense.rig.devices.protocols import RigFault
+from sense.rig.planning.pad_on_bed import on_bed
+from sense.rig.session.press_loop import require_safe_plan
+from sense.settings import RigSettings
+from tests.fabricate.planted import with_settings
+
+PAD = Morphology.straight(2)
+RIG = RigSettings(tcp_mm=(30.0, -5.0, -20.0), max_force_n=None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("pad")
+    build(PAD, folder, [], with_settings({"holder": True}, printer={"bed_mm": [200.0, 180.0, 150.0]}))
+    return folder
+
+
+def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
+    rig = on_bed(RIG, folder)
+    assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
+    half = PAD.size_mm / 2
+    assert rig.box_mm == pytest.approx((100 - half, 100 + half, 90 - half, 90 + half, 3.0, 130.0), abs=1e-5)
+    require_safe_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
+
+
+@pytest.mark.parametrize(("place", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
+def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, depth):
+    with pytest.raises(RigFault, match="no move"):
+        require_safe_plan(PressPlan(np.array([place]), np.array([depth])), on_bed(RIG, folder))
+
+
+def test_the_workspace_ends_where_the_nozzle_does(folder):
+    rig = on_bed(RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder)
+    assert rig.box_mm is not None
+    assert rig.box_mm[0] == 95
+    assert rig.box_mm[3] == 90
+
+
+def test_what_rig_says_counts_more(folder):
+    said = RIG.model_copy(update={"pad_mm": (50.0, 60.0), "contact_mm": 9.0, "pad_angle_deg": 90.0})
+    rig = on_bed(said, folder)
+    assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg) == ((50.0, 60.0), 9.0, 90.0)
+    assert rig.box_mm is not None
+    assert rig.box_mm[0] == 50 - PAD.size_mm / 2
+    everything = rig.model_copy(update={"tcp_mm": None})
+    assert on_bed(everything, folder / "nowhere") is everything
+
+
+def test_a_pad_without_a_holder_lies_nobody_knows_where(folder, tmp_path):
+    with pytest.raises(RigFault, match=r"there is no .*fabrication.json; .*holder = true") as fault:
+        on_bed(RIG, tmp_path)
+    assert fault.value.cause == "refused"
+    document = json.loads((folder / "fabrication.json").read_text())
+    (tmp_path / "fabrication.json").write_text(json.dumps(document | {"frame": None}))
+    with pytest.raises(RigFault, match="a pad without a holder"):
+        on_bed(RIG, tmp_path)
+    with pytest.raises(RigFault, match="tcp_mm is unknown"):
+        on_bed(RIG.model_copy(update={"tcp_mm": None}), folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("centre_mm", [1.0]), ("surface_mm", "8"), ("bed_mm", [1, 2, None]), ("walls_mm", 1e9)]
+)
+def test_a_damaged_frame_is_named(folder, tmp_path, key, value):
+    document = json.loads((folder / "fabrication.json").read_text())
+    document["frame"][key] = value
+    (tmp_path / "fabrication.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=f"frame has no {key}"):
+        on_bed(RIG, tmp_path)
