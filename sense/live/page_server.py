@@ -1,18 +1,21 @@
-"""The page of `padforge sense live`: served to browsers on this machine, and told of what happens as it happens.
+"""A page for browsers on this machine, that is told of what happens as it happens, and may say a few words itself.
 
 Every message (a Server-Sent Event) is the whole of what the page shows. So a browser that comes late, comes back or
-cannot keep up needs nothing but the latest.
+cannot keep up needs nothing but the latest. The other way a page says single words that were agreed on before; which of
+them, only its own script can: browsers tell who asks, and another page is not listened to.
 """
 
 import base64
+import contextlib
 import errno
 import hashlib
 import json
 import os
+import queue
 import socketserver
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -33,7 +36,10 @@ POLL_S = 0.05
 RETRY_MS = 1000
 """After so long a browser that has lost its connection tries again."""
 
-_PAGE = Path(__file__).with_name("page.html")
+_PAGES = Path(__file__).with_name("pages")
+_SHARED = ("common.css", "common.js")
+_MOST_WORDS = 16
+"""That wait to be taken: a button may be hit again and again."""
 
 
 class LivePage:
@@ -43,13 +49,16 @@ class LivePage:
         url: of the page.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, page: str = "live.html", words: Collection[str] = ()) -> None:
         """Take `port`, or any that is free if 0.
 
+        Args:
+            page: file among `pages`. words: what the page may say, see `said`.
+
         Raises:
-            InputError: it is taken, or not for this user.
+            InputError: the port is taken, or not for this user.
         """
-        self._server = _listening(port)
+        self._server = _listening(port, page, words)
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(POLL_S,), name="server of the live page", daemon=True
@@ -71,6 +80,10 @@ class LivePage:
             ValueError: it holds what JSON does not, such as NaN.
         """
         self._server.news.tell(json.dumps(view, allow_nan=False))
+
+    def said(self) -> list[str]:
+        """The words that pages have said since the last call, oldest first."""
+        return [self._server.said.get_nowait() for _ in range(self._server.said.qsize())]
 
 
 class News:
@@ -123,10 +136,11 @@ class _Server(socketserver.ThreadingTCPServer):
     # Elsewhere the flag lets two programs share a port; here it only lets go of one that was used a minute ago.
     allow_reuse_address = os.name == "posix"
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, page: str, words: Collection[str]) -> None:
         self.news = News()
-        self.page = _PAGE.read_bytes()
-        self.policy = _policy(self.page.decode())
+        self.words, self.said = frozenset(words), queue.Queue[str](_MOST_WORDS)
+        text = _whole(page)
+        self.page, self.policy = text.encode(), _policy(text)
         super().__init__((HOST, port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -137,9 +151,9 @@ class _Server(socketserver.ThreadingTCPServer):
             super().handle_error(request, client_address)
 
 
-def _listening(port: int) -> _Server:
+def _listening(port: int, page: str, words: Collection[str]) -> _Server:
     try:
-        return _Server(port)
+        return _Server(port, page, words)
     except OSError as error:
         if error.errno not in (errno.EADDRINUSE, errno.EACCES):
             raise
@@ -160,6 +174,25 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_news()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
+
+    def do_POST(self) -> None:
+        if not (self._asked_here() and self.headers.get("Origin") == f"http://{self.headers['Host']}"):
+            self.send_error(HTTPStatus.FORBIDDEN)
+        elif self.path != "/say":
+            self.send_error(HTTPStatus.NOT_FOUND)
+        elif (word := self._word()) not in self.server.words:
+            self.send_error(HTTPStatus.BAD_REQUEST)
+        else:
+            with contextlib.suppress(queue.Full):
+                self.server.said.put_nowait(word)
+            self.send_response(HTTPStatus.NO_CONTENT)
+            self.end_headers()
+
+    def _word(self) -> str:
+        length = self.headers.get("Content-Length", "")
+        most = max(map(len, self.server.words), default=0)
+        fits = length.isascii() and length.isdigit() and len(length) < 4 and int(length) <= most
+        return self.rfile.read(int(length)).decode("ascii", "replace") if fits else ""
 
     def _asked_here(self) -> bool:
         """Whether this machine was asked by its own name: no page from elsewhere gets at it by renaming it."""
@@ -190,6 +223,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: the terminal shows the pad."""
+
+
+def _whole(page: str) -> str:
+    """The text of a page with what it shares with others."""
+    text = (_PAGES / page).read_text(encoding="utf-8")
+    for name in _SHARED:
+        text = text.replace(f"/* {name} */\n", (_PAGES / name).read_text(encoding="utf-8"))
+    return text
 
 
 def _policy(page: str) -> str:

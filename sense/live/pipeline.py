@@ -18,6 +18,7 @@ from sense.health.monitor import FibreFault, Monitor
 from sense.health.trained_model import refuse_other_pad
 from sense.localizer.features import REST, bridged, press_inputs
 from sense.localizer.localizer import Localizer
+from sense.localizer.locating import MEASURED
 from sense.localizer.normalization import Scaled
 from sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
 from sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
@@ -38,6 +39,8 @@ class Estimate:
         x_mm, y_mm: place. sd_x_mm, sd_y_mm: standard deviations.
         r50_mm, r90_mm: radius around the place that holds the press in 50 % and in 90 % of cases.
         lost: fibres that were left out, by index.
+        depth_mm, force_n: how deep and hard it was, where that was learnt. depth_r90_mm, force_r90_n: how far beside
+            them 90 % of presses are at most.
     """
 
     press: int
@@ -51,14 +54,29 @@ class Estimate:
     r50_mm: float
     r90_mm: float
     lost: tuple[int, ...]
+    depth_mm: float | None = None
+    depth_r90_mm: float | None = None
+    force_n: float | None = None
+    force_r90_n: float | None = None
+
+    @property
+    def measured(self) -> str:
+        """Depth and force, as far as they were learnt."""
+        depth = "" if self.depth_mm is None else f", {self.depth_mm:.1f} ± {self.depth_r90_mm:.1f} mm deep"
+        return depth + ("" if self.force_n is None else f", {self.force_n:.1f} ± {self.force_r90_n:.1f} N")
 
     @property
     def text(self) -> str:
         """One line."""
         return (
             f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, "
-            f"within {self.r50_mm:.1f} mm at 50 %, {self.r90_mm:.1f} mm at 90 % ({self.features})"
+            f"within {self.r50_mm:.1f} mm at 50 %, {self.r90_mm:.1f} mm at 90 %{self.measured} ({self.features})"
         )
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """As JSON, without what was not learnt."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 Event = Estimate | FibreFault
@@ -134,7 +152,7 @@ class Live:
                 if change.down:
                     events += self._begin(change.reading)
                 elif self._press is not None:
-                    self._press.let_go(max(self._sent(change.reading, SENT_UP_S), self._press.touched))
+                    self._press.let_go(max(self._ring.sent(change.reading, SENT_UP_S), self._press.touched))
             events += self._advance()
         return events
 
@@ -143,7 +161,7 @@ class Live:
 
         Returns:
             "pressed"; "fibres", for each its "swing" (from its rest, as a share of the usual; None where there is no
-            reading) and "state"; "presses", see `Estimate`, and "text"; "findings", a line each.
+            reading) and "state"; "presses", see `Estimate.document`, "measured" and "text"; "findings", a line each.
         """
         swings = self._swings()
         states = self._states(np.isnan(swings))
@@ -153,7 +171,7 @@ class Live:
                 {"swing": None if np.isnan(swing) else round(swing, 3), "state": state}
                 for swing, state in zip(swings.tolist(), states, strict=True)
             ],
-            "presses": [asdict(press) | {"text": press.text} for press in self.presses],
+            "presses": [press.document | {"measured": press.measured, "text": press.text} for press in self.presses],
             "findings": [finding.text for finding in self.findings],
         }
 
@@ -177,14 +195,9 @@ class Live:
         """(C,) V, mean of the readings just before index `at`."""
         return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
 
-    def _sent(self, reading: int, delay_s: float) -> int:
-        """Index of the reading at which a probe would have been sent that shows its effect `delay_s` later."""
-        times_s = self._ring.rows(0, reading + 1)[:, 0]
-        return reading + 1 - len(times_s) + int(np.searchsorted(times_s, times_s[-1] - delay_s))
-
     def _begin(self, touched: int) -> list[Event]:
         """The pad is touched; what was still to come of the press before comes now."""
-        begun = self._sent(touched, SENT_DOWN_S)
+        begun = self._ring.sent(touched, SENT_DOWN_S)
         events = self._advance(begun)
         begun = max(begun, self._free + 1)
         time_s = float(self._ring.rows(touched, touched + 1)[0, 0])
@@ -225,7 +238,12 @@ class Live:
         found = localizer.locate(Scaled(presses.inputs, alive))
         numbers = np.concatenate([found.places_mm[0], found.sd_mm[0], found.r50_mm, found.r90_mm]).tolist()
         final, lost = localizer is self._localizers[-1], tuple(np.flatnonzero(~alive[0]).tolist())
-        estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, lost=lost)
+        measured = {
+            column: float(values[0])
+            for name, each in found.measures.items()
+            for column, values in zip(MEASURED[name], (each.values, each.r90), strict=True)
+        }
+        estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, lost=lost, **measured)
         if self.presses and self.presses[-1].press == press.number:
             self.presses.pop()
         self.presses.append(estimate)

@@ -52,6 +52,15 @@ class Ring:
         gone = self.end - self._filled
         return self._rows[max(first - gone, 0) : max(min(end - gone, self._filled), 0)]
 
+    def sent(self, reading: int, delay_s: float) -> int:
+        """Index of the reading, times being column 0, at which a probe would have been sent that shows `delay_s` later.
+
+        Args:
+            reading: index of the first one that shows it.
+        """
+        times_s = self.rows(0, reading + 1)[:, 0]
+        return reading + 1 - len(times_s) + int(np.searchsorted(times_s, times_s[-1] - delay_s))
+
 
 class Excerpt(NamedTuple):
     """The readings (n, C) V that tell of a press, and at which of them it begins and ends, and the one before ended."""

@@ -1,9 +1,10 @@
 """Where live readings come from: a converter, the simulated pad of a model, or a recording that is replayed."""
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,11 +38,13 @@ class Source:
 
     Attributes:
         fibres: C. rate_hz: readings a second. blocks: of readings, as they come; they may be empty.
+        converter: what it says of itself, if it is one.
     """
 
     fibres: int
     rate_hz: float
     blocks: Iterator[Block]
+    converter: Mapping[str, Any] = field(default_factory=dict)
 
 
 def connected(converter: Converter, rate_hz: float) -> Source:
@@ -59,7 +62,7 @@ def connected(converter: Converter, rate_hz: float) -> Source:
             yield averager.feed(converter.read())
             time.sleep(PAUSE_S)
 
-    return Source(identity["channels"], identity["rate_hz"] / ratio, blocks())
+    return Source(identity["channels"], identity["rate_hz"] / ratio, blocks(), identity)
 
 
 def replayed(recording: Recording, speed: float) -> Source:
@@ -97,6 +100,7 @@ def simulated(model: Path) -> SimulatedConverter:
     try:
         pad = Morphology(np.array(source["morphology"]["knots"]), source["morphology"]["pitch_mm"])
         contact, rig = dict(source["contact"]), dict(source["rig"])
+        rig.pop("channels", None)  # of no simulated pad; once it was a number
         size = {"grid": pad.grid, "pitch_mm": pad.pitch_mm, "sensed_mm": source.get("sensed_mm", "beyond")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error

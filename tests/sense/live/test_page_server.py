@@ -3,6 +3,7 @@
 import json
 import socket
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
@@ -53,9 +54,12 @@ def told(page: LivePage) -> Iterator[Iterator[dict]]:
         yield (json.loads(line[6:]) for line in lines if line.startswith("data: "))
 
 
-def test_the_page_is_served_and_allows_its_own_script_alone(page: LivePage) -> None:
-    response = get(page, "/")
-    text = response.read().decode()
+@pytest.mark.parametrize("name", ["live.html", "hand.html"])
+def test_the_page_is_served_and_allows_its_own_script_alone(name: str) -> None:
+    with LivePage(0, name) as page:
+        response = get(page, "/")
+        text = response.read().decode()
+    assert "common." not in text
     assert response.status == 200
     assert text.startswith("<!doctype html>")
     policy = response.headers["Content-Security-Policy"]
@@ -124,6 +128,48 @@ def test_a_browser_that_goes_away_is_forgotten(page: LivePage, capfd: pytest.Cap
     assert capfd.readouterr().err == ""
 
 
+@pytest.fixture
+def asking() -> Iterator[LivePage]:
+    with LivePage(0, "hand.html", ("back", "skip")) as page:
+        yield page
+
+
+def said(page: LivePage, body: bytes, path: str = "/say", **headers: str) -> int:
+    """The status of what a page says; by default it is the one that was served."""
+    connection = HTTPConnection(HOST, port_of(page), timeout=10)
+    connection.request("POST", path, body, {"Origin": page.url.rstrip("/")} | headers)
+    return connection.getresponse().status
+
+
+def test_what_its_own_page_says_is_heard(asking: LivePage) -> None:
+    assert [said(asking, word) for word in (b"skip", b"back", b"skip")] == [204, 204, 204]
+    assert asking.said() == ["skip", "back", "skip"]
+    assert asking.said() == []
+    for word in (b"", b"quit", b"skip\n", b"\xff" * 4, b"back" * 1000):
+        assert said(asking, word) == 400
+    assert said(asking, b"skip", "/") == 404
+    assert asking.said() == []
+
+
+def test_another_page_is_not_listened_to(asking: LivePage) -> None:
+    port = port_of(asking)
+    for origin in ("http://elsewhere.example", "null", f"https://{HOST}:{port}", f"http://{HOST}:{port + 1}"):
+        assert said(asking, b"skip", Origin=origin) == 403
+    assert said(asking, b"skip", Host="elsewhere.example", Origin="http://elsewhere.example") == 403
+    connection = HTTPConnection(HOST, port, timeout=10)
+    connection.request("POST", "/say", b"skip")
+    assert connection.getresponse().status == 403
+    assert asking.said() == []
+    assert said(asking, b"skip", Host=f"localhost:{port}", Origin=f"http://localhost:{port}") == 204
+
+
+def test_a_page_that_says_nothing_is_not_heard_and_words_do_not_pile_up(page: LivePage, asking: LivePage) -> None:
+    assert said(page, b"skip") == 400
+    for _ in range(20):
+        assert said(asking, b"skip") == 204
+    assert len(asking.said()) == 16
+
+
 def test_what_is_no_json_is_refused(page: LivePage) -> None:
     with pytest.raises(ValueError, match="JSON"):
         page.show({"swing": float("nan")})
@@ -172,6 +218,40 @@ def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
         True,
         True,
     ]
+
+
+HAND = VIEW | {
+    "courses": [[[-20, 0], [0, 1], [20, 0]]],
+    "words": [{"key": "s", "word": "skip", "text": HOSTILE}],
+    "said": "press x 1, y -2 mm",
+    "told": HOSTILE,
+    "phase": "press",
+    "progress": 0.5,
+    "target": [1.0, -2.0],
+    "refused": None,
+    "done": 2,
+    "of": 8,
+}
+
+
+def test_a_browser_shows_where_to_press_and_says_what_is_said(asking: LivePage, browser: Chromium) -> None:
+    asking.show(HAND)
+    browser.open(asking.url)
+    browser.wait_for("document.getElementById('said').textContent == 'press x 1, y -2 mm'")
+    assert "2 of 8 presses" in browser.ask("document.body.innerText")
+    centre = "(({x, y, width, height}) => [x + width / 2, y + height / 2])(document.querySelector('{}').getBBox())"
+    ring, edge = (browser.ask(centre.replace("{}", part)) for part in (".press .ring", "#pad .edge"))
+    assert ring == pytest.approx(edge)  # the middle of the pad, as VIEW has it
+    assert browser.ask("document.querySelectorAll('.course').length") == 1
+    browser.ask("document.querySelector('button').click()")
+    browser.press("s")
+    browser.wait_for("document.getElementById('bar').value == .25")
+    deadline = time.monotonic() + 10
+    heard: list[str] = []
+    while len(heard) < 2 and time.monotonic() < deadline:
+        heard += asking.said()
+        time.sleep(0.02)
+    assert heard == ["skip", "skip"]
 
 
 def test_a_browser_comes_back_to_a_page_that_was_away(browser: Chromium) -> None:

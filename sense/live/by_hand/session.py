@@ -1,0 +1,268 @@
+"""A session by hand: what the fibres give is kept, presses are found in it, and a person is told what to do next.
+
+A press that does not count stays in the recording, as one at an unknown place: what it does to the pad shows in the
+presses around it.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sense.live.press_buffer import HISTORY, SLACK, Ring
+from sense.live.sources import connected
+from sense.localizer.features import REST, bridged
+from sense.recordings.processing.limits import Array
+from sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+from sense.recordings.recorder import Recorder, refuse_existing
+from sense.recordings.recording import Recording
+from sense.rig.devices.protocols import Converter, RigFault
+from sense.rig.planning.setup import Setup
+
+from .judging import GONE_S, SOON_S, Judge, answers
+from .run_directory import opened
+from .turns import MOST, Phase, Place, Turns
+
+TRAIL = 12
+"""Presses that are kept to be shown."""
+UNKNOWN = (np.nan, np.nan)
+WORDS = (
+    {"key": "b", "word": "back", "text": "Take the last press back"},
+    {"key": "s", "word": "skip", "text": "Skip this place"},
+    {"key": "f", "word": "free", "text": "Nothing touches the pad"},
+    {"key": "q", "word": "quit", "text": "End"},
+)
+"""What a person may say, by a key or a button."""
+
+Show = Callable[[dict[str, Any]], None]
+Said = Callable[[], Sequence[str]]
+
+
+class HandSession:
+    """One stretch of recording by hand.
+
+    Args:
+        recorder: new or resumed, of so many fibres. targets_mm: (Q, 2) places to press, in this order; `made` presses
+            were made before them.
+        hold_s: for how long a press is to be held, and the pad left alone after it.
+    """
+
+    def __init__(self, recorder: Recorder, fibres: int, targets_mm: Array, hold_s: float, made: int = 0) -> None:
+        self._recorder, self._fibres = recorder, fibres
+        # Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
+        self._start_s = recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0
+        self._zero_s: float | None = None
+        self._first = recorder.readings
+        self._number = max(recorder.done, default=-1) + 1
+        self._made = made
+        self._turns = Turns(targets_mm, hold_s, self._start_s)
+        self._ring, self._now_s = Ring(1 + fibres), self._start_s
+        self._finder: Finder | None = Finder(fibres)  # None while it has lost its way
+        self._found_from, self._judge = 0, Judge()
+        self._touched = self._begun = self._free = 0
+        self._free_s = self._start_s
+        self._rest = np.zeros(fibres)  # before the press under way
+        self._kept: list[tuple[int, int, int]] = []  # number, begun and lifted in the recording
+        self._most_v = 1e-3
+        self._told, self._refused = "", None
+
+    def run(self, blocks: Iterable[tuple[Array, Array]], show: Show, said: Said = lambda: ()) -> None:
+        """Go on until all presses are made, or it is said to end.
+
+        Args:
+            blocks: times (n,) s and readings (n, C) V as they come. show: given what there is to show, see `view`.
+            said: the words of `WORDS` that were said since it was called last.
+
+        Raises:
+            RigFault: the board failed, or the disk; what is done is on the disk.
+        """
+        try:
+            for times_s, readings in blocks:
+                for word in said():
+                    if word == "quit":
+                        return
+                    self._obey(word)
+                if len(times_s):
+                    self.feed(times_s, readings)
+                    show(self.view())
+                if self._phase() == "done":
+                    return
+        except OSError as error:
+            raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
+        finally:
+            self._recorder.abort("the session ended")
+
+    def feed(self, times_s: Array, readings: Array) -> None:
+        """Take readings, and what they bring to light."""
+        if self._zero_s is None:
+            self._zero_s = float(times_s[0]) - self._start_s
+        times_s = times_s - self._zero_s
+        self._recorder.append(times_s, readings)
+        for row in np.column_stack([times_s, readings]):
+            self._ring.append(row)
+            self._now_s = float(row[0])
+            for event in self._finder.feed(row[:1], row[None, 1:]) if self._finder else ():
+                reading = self._found_from + event.reading
+                self._touch(reading) if event.down else self._release(reading)
+        self._doubt()
+
+    def _touch(self, touched: int) -> None:
+        place = self._turns.touch(self._time_s(touched))
+        self._touched = touched
+        self._begun = max(self._ring.sent(touched, SENT_DOWN_S), self._free + 1)
+        self._rest = self._rest_before(self._begun)
+        self._refused = None
+        self._recorder.begin(place or UNKNOWN, self._first + self._begun, self._number)
+        self._recorder.sync()
+
+    def _release(self, released: int) -> None:
+        lifted = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._begun + 1)
+        target, fault = self._turns.target, self._turns.release(self._time_s(released))
+        answered = self._answers(lifted)
+        fault = fault or self._judge.fault_of(answered)
+        if fault:
+            self._refuse(self._number, self._first + self._begun, self._first + lifted, fault)
+            self._told, self._refused = f"not counted: {fault}", target
+        else:
+            self._recorder.finish(self._first + lifted)
+            self._kept.append((self._number, self._first + self._begun, self._first + lifted))
+            self._judge.keep(answered, self._rest)
+            self._most_v = max(self._most_v, float(np.abs(answered).max()))
+            self._turns.keep(self._now_s)
+            self._told = f"counted: {shown(target)}"
+        self._recorder.sync()
+        self._number, self._free = self._number + 1, lifted
+        self._free_s = self._now_s
+
+    def _refuse(self, press: int, begun: int, lifted: int, why: str) -> None:
+        """Note that a press was at an unknown place."""
+        self._recorder.begin(UNKNOWN, begun, press)
+        self._recorder.finish(lifted, refused=why)
+
+    def _obey(self, word: str) -> None:
+        if word == "skip":
+            self._turns.skip(self._now_s)
+        elif word == "back":
+            if self._turns.take_back(self._now_s):
+                self._refuse(*self._kept.pop(), "it was taken back")
+                self._recorder.sync()
+                self._judge.take_back()
+                self._told = "the last press was taken back"
+        elif word == "free":
+            self._judge.rest_anew()
+            self._let_go()
+
+    def _doubt(self) -> None:
+        """Where readings say otherwise than the finder of presses, believe them and begin to find anew."""
+        volts = self._late()
+        if self._turns.pressed:
+            if self._judge.untouched(volts, self._rest, self._turns.held_s(self._now_s)):
+                self._let_go()
+        elif self._now_s - self._free_s > GONE_S:
+            touched = self._judge.touched(volts)
+            if touched and self._finder is not None:
+                self._finder = None
+            elif touched is False and self._finder is None:
+                self._let_go()
+
+    def _let_go(self) -> None:
+        """Nothing touches the pad, whatever was found."""
+        if self._turns.pressed:
+            self._turns.drop()
+            self._release(self._ring.end - 1)
+        self._turns.wait(self._now_s)
+        self._finder, self._found_from = Finder(self._fibres), self._ring.end
+
+    def _late(self) -> Array:
+        """(C,) V, mean of the latest readings."""
+        rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
+        return bridged(rows[np.searchsorted(rows[:, 0], self._now_s - SOON_S) :, 1:]).mean(axis=0)
+
+    def _time_s(self, reading: int) -> float:
+        return float(self._ring.rows(reading, reading + 1)[0, 0])
+
+    def _answers(self, lifted: int) -> Array:
+        """See `judging.answers`; of a press of which the begin is forgotten, by its end alone."""
+        first = max(self._begun + REST[0], self._free, self._ring.end - HISTORY - SLACK)
+        readings = self._ring.rows(first, self._ring.end)[:, 1:]
+        return answers(readings, max(self._begun - first, 1), lifted - first)
+
+    def _rest_before(self, at: int) -> Array:
+        """(C,) V, mean of the readings just before index `at`."""
+        return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
+
+    def view(self) -> dict[str, Any]:
+        """What there is to show now, as JSON.
+
+        Returns:
+            "phase" and "progress", see `Turns`; "said", what is asked for, and "told", what became of the last press,
+            a line each; "target", and "refused", the place of the last press if that did not count, [x, y] mm or None;
+            "done" and "of" presses; "presses" kept last, "x_mm" and "y_mm"; "fibres", for each its "swing" (from its
+            rest, as a share of the largest so far; None where there is no reading) and "state".
+        """
+        turns, now_s = self._turns, self._now_s
+        end = self._ring.end
+        rest = self._rest if turns.pressed else self._rest_before(end)
+        swings = (self._ring.rows(end - 1, end)[0, 1:] - rest) / self._most_v
+        done = self._made + len(turns.kept)
+        return {
+            "phase": self._phase(),
+            "progress": round(turns.progress(now_s), 3),
+            "said": self._asked(),
+            "told": self._told,
+            "target": turns.target,
+            "refused": self._refused,
+            "done": done,
+            "of": done + turns.left,
+            "presses": [{"x_mm": x, "y_mm": y} for x, y in turns.kept[-TRAIL:]],
+            "fibres": [
+                {"swing": None, "state": "missing"} if np.isnan(swing) else {"swing": round(swing, 3), "state": ""}
+                for swing in swings.tolist()
+            ],
+        }
+
+    def _phase(self) -> Phase:
+        return "lift" if self._finder is None else self._turns.phase(self._now_s)
+
+    def _asked(self) -> str:
+        """What is asked for now, in a line."""
+        turns, phase = self._turns, self._phase()
+        at = shown(turns.target)
+        if self._finder is None or turns.held_s(self._now_s) > MOST * turns.hold_s:
+            return "lift; if nothing touches the pad, say so (f)"
+        return {
+            "settle": "hands off the pad",
+            "wait": f"next {at}: wait" if at else "hands off the pad",
+            "press": f"press {at}",
+            "hold": "hold",
+            "lift": "lift",
+            "done": "all presses are made",
+        }[phase]
+
+
+def record_by_hand(
+    setup: Setup, converter: Converter, show: Show, said: Said = lambda: (), resume: bool = False
+) -> Recording:
+    """Record presses by hand into `setup.out`; what is done is on the disk whatever happens.
+
+    Args:
+        converter: not yet connected. show, said: see `HandSession.run`. resume: go on with what is in `setup.out`.
+
+    Raises:
+        InputError: settings, places or a run directory that cannot be, or no press was made.
+        RigFault: the board failed, or the disk.
+    """
+    if not resume:
+        refuse_existing(setup.out)
+    rig = setup.rig
+    source = connected(converter, rig.rate_hz)
+    recorder, targets, left = opened(setup, source.converter, resume)
+    with recorder:
+        hold_s = rig.readings_per_press / 2 / source.rate_hz
+        HandSession(recorder, source.fibres, left, hold_s, len(targets) - len(left)).run(source.blocks, show, said)
+    return Recording.open(setup.out)
+
+
+def shown(place: Place | None) -> str:
+    """A place as a person reads it."""
+    return "" if place is None else "x {}, y {} mm".format(*(f"{value:.1f}".removesuffix(".0") for value in place))

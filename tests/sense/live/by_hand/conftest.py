@@ -1,0 +1,3 @@
+from .hands import hands
+
+__all__ = ["hands"]

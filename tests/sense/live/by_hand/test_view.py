@@ -1,0 +1,40 @@
+import json
+
+import numpy as np
+
+from design import Morphology
+from sense.live.by_hand.view import COLUMNS, ROWS, pad_view, view_lines
+
+VIEW = {
+    "said": "press x 5, y 5 mm",
+    "told": "counted: x 0, y 0 mm",
+    "phase": "press",
+    "progress": 0.5,
+    "target": (16.875, 16.875),
+    "refused": None,
+    "presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}],
+    "done": 2,
+    "of": 7,
+}
+
+
+def test_the_pad_is_shown_as_it_is_planned() -> None:
+    pad = Morphology.random(2, knots=3, seed=1)
+    view = json.loads(json.dumps(pad_view(pad, "out/hand")))
+    assert view["half_mm"] == pad.size_mm / 2
+    assert len(view["courses"]) == 4
+    ends = np.array([[course[0], course[-1]] for course in view["courses"]])
+    np.testing.assert_allclose(ends, pad.to_mm(pad.knots[:, [0, -1]]), atol=0.051)
+
+
+def test_a_terminal_shows_the_place_where_it_is() -> None:
+    lines = view_lines(pad_view(Morphology.straight(2), "hand") | VIEW)
+    assert lines[0] == "PRESS X 5, Y 5 MM"
+    assert lines[1].count("#") == lines[1].count(".") == 15
+    rows = lines[3 : 3 + ROWS]
+    assert {len(row) for row in rows} == {COLUMNS + 2}
+    assert (rows[0][COLUMNS], rows[0][1]) == ("O", ".")  # up is up, right is right
+    assert "".join(rows).count("O") == 1
+    assert rows[ROWS // 2][1 + COLUMNS // 2] == "."
+    assert "2 of 7 presses" in lines[-2]
+    assert "q: end" in lines[-1]
