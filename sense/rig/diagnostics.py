@@ -7,8 +7,10 @@ from typing import Any, Literal
 import numpy as np
 
 from sense.recordings.processing.limits import Array
+from sense.settings import RigSettings
 
 from .devices.protocols import Arm, Converter, RigFault
+from .safety import require_tool
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -32,7 +34,7 @@ class Diagnosis:
 
 
 def examine_converter(
-    converter: Converter, supply_v: float, clock: Callable[[], float], sleep: Callable[[float], None]
+    converter: Converter, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> list[Diagnosis]:
     """Whether a converter answers, at its rate, without a gap, and each of its channels."""
     try:
@@ -46,16 +48,21 @@ def examine_converter(
     rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
     wanted = float(info.get("rate_hz", rate))
     return [
-        Diagnosis("board", "ok", _said(info)),
+        Diagnosis("board", "warn" if "warning" in info else "ok", _said(info)),
         Diagnosis("rate", "ok" if abs(rate / wanted - 1) < 0.01 else "fail", f"{rate:.1f} Hz of {wanted:g}"),
         Diagnosis("samples", "fail" if missing else "ok", f"{missing} of {len(times) + missing} lost"),
         Diagnosis("latency", "ok" if delay < _LATE_S else "warn", f"{1e3 * delay:.1f} ms from sample to program"),
-        *(_channel(number, column, supply_v) for number, column in enumerate(volts.T, start=1)),
+        *(_channel(k + 1, info["inputs"][k], column, info["supply_v"]) for k, column in enumerate(volts.T)),
     ]
 
 
-def examine_arm(arm: Arm, clock: Callable[[], float], sleep: Callable[[float], None]) -> list[Diagnosis]:
-    """Whether an arm answers, how often it tells its state, and whether anything has stopped it. It is not moved."""
+def examine_arm(
+    arm: Arm, rig: RigSettings, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> list[Diagnosis]:
+    """Whether an arm answers, how often it tells its state, and whether anything has stopped it. It is not moved.
+
+    What of `[rig]` would keep `record` from moving it fails here, too: its tool, and a force that nobody can watch.
+    """
     try:
         info = arm.connect()
         arm.drain()
@@ -77,7 +84,28 @@ def examine_arm(arm: Arm, clock: Callable[[], float], sleep: Callable[[float], N
         Diagnosis("states", "ok" if worst < _LATE_S else "warn", f"{rate:.0f} Hz, longest gap {1e3 * worst:.0f} ms"),
         Diagnosis("age", "ok" if now - state.time_s < _LATE_S else "warn", f"{1e3 * (now - state.time_s):.1f} ms"),
         Diagnosis("tool", "ok", f"at {pose} mm"),
+        *_tip(info, rig),
+        _force(state.force_n, rig.max_force_n),
     ]
+
+
+def _tip(info: Mapping[str, Any], rig: RigSettings) -> list[Diagnosis]:
+    """Whether the arm and `[rig]` agree where the tip is; nothing of an arm that keeps no such place."""
+    try:
+        require_tool(rig.tcp_mm, info)
+    except RigFault as fault:
+        return [Diagnosis("tcp", "fail", str(fault))]
+    return [Diagnosis("tcp", "ok", f"{list(rig.tcp_mm or ())} mm, as the controller says")] if "tcp" in info else []
+
+
+def _force(force_n: float | None, max_force_n: float | None) -> Diagnosis:
+    """Whether the force is watched."""
+    told = "the arm tells no force" if force_n is None else f"{force_n:.1f} N"
+    if max_force_n is None:
+        return Diagnosis("force", "warn", f'{told}; [rig] max_force_n is "unwatched": no force stops the arm')
+    if force_n is None:
+        return Diagnosis("force", "fail", f'{told}; [rig] max_force_n is {max_force_n:g}, allowed is "unwatched"')
+    return Diagnosis("force", "ok", f"{told}, stopped beyond {max_force_n:g} N")
 
 
 def _samples(
@@ -92,10 +120,10 @@ def _samples(
     return times, volts, int(sum(piece.missing.sum() for piece in pieces))
 
 
-def _channel(number: int, volts: Array, supply_v: float) -> Diagnosis:
+def _channel(number: int, board_input: int, volts: Array, supply_v: float) -> Diagnosis:
     """Whether a channel looks like one with a fibre on it."""
     rest, noise = float(np.median(volts)), float(volts.std())
-    text = f"rests at {rest:.3f} V, noise {1e3 * noise:.2f} mV"
+    text = f"input {board_input} rests at {rest:.3f} V, noise {1e3 * noise:.2f} mV"
     if rest < _DEAD_V:
         return Diagnosis(f"channel {number}", "fail", f"{text}: dead, open or shorted to ground")
     if rest > supply_v - _DEAD_V:

@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +17,22 @@ from design.pad.morphology import Morphology
 from design.pad.twin import Twin
 from design.settings import Contact, PadSettings
 from sense.localizer.localizer import Localizer
-from sense.recordings.recorder import refuse_existing
+from sense.recordings.press_plan import PressPlan
+from sense.recordings.recorder import refuse_begun, refuse_existing
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate
 from sense.settings import RigSettings
 
-from .devices.protocols import Arm, Converter
+from .devices.plugins import device
+from .devices.protocols import Arm, Converter, RigFault
+from .devices.serial_port import host_ports
 from .diagnostics import Diagnosis, examine_arm, examine_converter
 from .planning.adaptive_plan import Steering
-from .planning.press_plan import PressPlan
-from .planning.setup import Setup, plan_of, recorder_of
+from .planning.pad_on_bed import on_bed
+from .planning.setup import Setup, kept_plan, plan_of, recorder_of
+from .safety import Limits, require_ready, require_tool
+from .session.interrupts import Interrupts
 from .session.press_loop import Report, Session, require_safe_plan
-
-SUPPLY_V = 3.3
-"""Of the board's converter."""
 
 
 def record_simulated(
@@ -55,30 +57,61 @@ def record_simulated(
     sensed_mm = spec.section(PadSettings, grid=plan.grid, pitch_mm=plan.pitch_mm).sensed_mm
     with stage("simulate"):
         recording = simulate(pad, options, spec.section(Contact), sensed_mm, like)
+    inputs = [*inputs, *([options.plan_file] if options.plan_file else [])]
     recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
     return recording
 
 
 @contextmanager
-def opened_rig(kind: str, setup: Setup) -> Iterator[tuple[Arm, Converter, RigSettings]]:
-    """Arm and converter of a rig, "simulated" or the name of an arm, not yet connected, and the settings for them."""
-    if kind == "simulated":
-        from .emulators.whole_rig import emulated, emulated_rig
+def opened_rig(
+    kind: str, setup: Setup, inputs: Sequence[int], through_drivers: bool = False
+) -> Iterator[tuple[Arm, Converter, RigSettings]]:
+    """Arm and converter of a rig, "simulated" or the name of an arm, not yet connected, and the settings for them.
 
-        chosen = emulated_rig(setup.rig, setup.pad)
+    Args:
+        inputs: of the board, fibre by fibre; all of them where empty. The settings then name these.
+        through_drivers: emulated devices behind the drivers of the rig, as the simulated one always has them.
+    """
+    rig = setup.rig.model_copy(update={"channels": tuple(inputs)})
+    if kind == "simulated" or through_drivers:
+        from .emulators.whole_rig import RIGS
+
+        if kind not in RIGS:
+            raise InputError(f"--through-drivers: got --rig {kind}, allowed are {', '.join(RIGS)}")
+        settle, emulated = RIGS[kind]
+        chosen = settle(rig, setup.pad)
         with emulated(setup.pad, setup.contact, chosen) as (arm, converter, _, _):
             yield arm, converter, chosen
         return
-    from .arms.ur5.driver import UR5
-    from .boards.due.driver import Arduino
-    from .boards.due.serial_link import port_of
+    arm, rig = _arm(kind, setup, rig)
+    with closing(_board(rig, inputs)) as converter, closing(arm):
+        yield arm, converter, rig
 
-    arm, converter = UR5(setup.rig.host), Arduino(port_of(setup.rig), setup.rig.converter_rate_hz, setup.rig.channels)
-    try:
-        yield arm, converter, setup.rig
-    finally:
-        converter.close()
-        arm.close()
+
+def _arm(kind: str, setup: Setup, rig: RigSettings) -> tuple[Arm, RigSettings]:
+    """An arm by its name, and the settings for it."""
+    make = device("padforge.arms", kind)
+    rig = on_bed(rig, setup.folder) if kind == "printer" else rig
+    return make(rig), rig
+
+
+def _board(rig: RigSettings, inputs: Sequence[int]) -> Converter:
+    return device("padforge.boards", rig.board)(rig, inputs)
+
+
+@contextmanager
+def opened_board(setup: Setup, inputs: Sequence[int]) -> Iterator[Converter]:
+    """The board alone, not yet connected: the pad is pressed by hand. `inputs` as of `opened_rig`."""
+    with closing(_board(setup.rig, inputs)) as converter:
+        yield converter
+
+
+@contextmanager
+def _emulated_board(setup: Setup) -> Iterator[Converter]:
+    from .emulators.finger import pressed_by_finger
+
+    with pressed_by_finger(setup.pad, setup.contact, setup.rig) as (converter, _):
+        yield converter
 
 
 def record(
@@ -88,14 +121,17 @@ def record(
     *,
     dry: bool = False,
     resume: bool = False,
+    through_drivers: bool = False,
     report: Report = lambda done, of: None,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Recording | None:
     """Record with the drivers of a rig, see `opened_rig`; what is done is on the disk whatever happens.
 
     Args:
         model: folder of the localizer that an adaptive plan is steered by.
         dry: go through the plan without touching the pad; nothing is kept. resume: go on with what is in `setup.out`.
-        report: told of presses done, and in all.
+        through_drivers: see `opened_rig`.
+        report: told of presses done, and in all. say: told what a person should know before the arm moves.
 
     Returns:
         The recording, None of a dry run.
@@ -104,18 +140,25 @@ def record(
         InputError: settings, a plan or a run directory that cannot be.
         RigFault: the rig failed, or the plan is not safe.
     """
-    with opened_rig(kind, setup) as (arm, converter, rig):
+    inputs = setup.rig.inputs(len(setup.pad.knots))
+    with Interrupts() as interrupts, opened_rig(kind, setup, inputs, through_drivers) as (arm, converter, rig):
         plan = plan_of(setup, rig, resume)
         steer = _steering(setup, rig, model)
         require_safe_plan(plan, rig)
+        if resume and (told := kept_plan(setup)):
+            say(told)
         if not (resume or dry):
-            refuse_existing(setup.out)
-        converter.connect()  # a board in use is refused before the arm's program is ended
-        arm.connect()
+            refuse_begun(setup.out)
+        devices = {"board": converter.connect(), "arm": arm.connect()}
+        require_tool(rig.tcp_mm, devices["arm"])
+        require_ready(arm.state(), Limits.of(rig))  # before there is a folder that would be in the way
+        if rig.max_force_n is None:
+            say('[rig] max_force_n is "unwatched": no force stops the arm')
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch) / "dry" if dry else setup.out
-            with recorder_of(setup, rig, plan, folder, resume) as recorder:
+            with recorder_of(setup, rig, plan, folder, resume, devices) as recorder:
                 report(len(recorder.done), len(plan))
+                interrupts.check()
                 Session(arm, converter, recorder, rig, dry=dry).run(plan, report, steer)
             return None if dry else Recording.open(folder)
 
@@ -128,13 +171,27 @@ def _steering(setup: Setup, rig: RigSettings, model: Path | None) -> Callable[[P
     return Steering(Localizer.load(model), setup.out, np.random.default_rng(rig.seed))
 
 
-def look_over(kind: str, setup: Setup) -> list[Diagnosis]:
-    """What to know of a rig, see `opened_rig`, before a long run; nothing moves."""
-    from .boards.due.serial_link import find_ports
-
-    ports = [f"{port.device} ({port.kind})" for port in find_ports()]
+def look_over(kind: str, setup: Setup, inputs: Sequence[int], through_drivers: bool = False) -> list[Diagnosis]:
+    """What to know of a rig, see `opened_rig`, or of the board alone for "hand", before a long run; nothing moves."""
+    ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     found = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
-    with opened_rig(kind, setup) as (arm, converter, _):
-        found += examine_converter(converter, SUPPLY_V, time.monotonic, time.sleep)
-        found += examine_arm(arm, time.monotonic, time.sleep)
+    if kind == "hand":
+        with _emulated_board(setup) if through_drivers else opened_board(setup, inputs) as converter:
+            return found + examine_converter(converter, time.monotonic, time.sleep)
+    if kind == "simulated" or through_drivers:
+        with opened_rig(kind, setup, inputs, through_drivers) as (arm, converter, rig):
+            found += examine_converter(converter, time.monotonic, time.sleep)
+            return found + examine_arm(arm, rig, time.monotonic, time.sleep)
+
+    def board() -> list[Diagnosis]:
+        return examine_converter(_board(setup.rig, inputs), time.monotonic, time.sleep)
+
+    def arm_alone() -> list[Diagnosis]:
+        return examine_arm(*_arm(kind, setup, setup.rig), time.monotonic, time.sleep)
+
+    for name, examined in (("board", board), ("arm", arm_alone)):  # one is looked at where the other is not there
+        try:
+            found += examined()
+        except RigFault as fault:
+            found.append(Diagnosis(name, "fail", str(fault)))
     return found

@@ -2,10 +2,10 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from sense.settings import RigSettings
 
@@ -16,6 +16,7 @@ DOWN: Vector = (0.0, math.pi, 0.0)
 """Rotation vector of a tool that points straight down."""
 MAX_LEAN_DEG = 10.0
 """Largest angle between the expected tool axis and straight down: depths are measured along the base's z axis."""
+TCP_SLACK_MM = 0.1
 STILL_MM_S = 1.0
 DEPTH_SLACK_MM = 0.3
 """How much deeper than allowed a moving tip may read: noise and overshoot, not a wrong target."""
@@ -30,8 +31,9 @@ class Limits:
         box_mm: lowest and highest x, y and z of the tip. contact_mm: z of the pad's surface; None while it is unknown,
             and then no target is safe. max_depth_mm: below it. max_speed_mm_s, max_acceleration_mm_s2: of the tip.
         tool: rotation vector of the tool as it should be held. max_tilt_deg: between its axis and a target's.
-        max_force_n: on the tool, either way; only watched where the arm has a sensor. max_state_age_s: of the latest
-            state. deadline_s: longest duration of a move.
+        max_turn_deg: about its axis, from how the arm holds it before the first move.
+        max_force_n: on the tool, either way; None where nobody watches it. max_state_age_s: of the latest state.
+        deadline_s: longest duration of a move.
     """
 
     box_mm: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -41,7 +43,8 @@ class Limits:
     max_acceleration_mm_s2: float = 1200.0
     tool: Vector = DOWN
     max_tilt_deg: float = 2.0
-    max_force_n: float = 50.0
+    max_turn_deg: float = 45.0
+    max_force_n: float | None = 50.0
     max_state_age_s: float = 0.5
     deadline_s: float = 30.0
 
@@ -74,11 +77,13 @@ class Limits:
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise ValueError(f"box_mm: {axis} from {low} to {high}; expected two finite numbers, ascending")
         speeds = ("max_speed_mm_s", "max_acceleration_mm_s2")
-        for name in ("max_depth_mm", *speeds, "max_force_n", "max_state_age_s", "deadline_s"):
+        force = () if self.max_force_n is None else ("max_force_n",)
+        for name in ("max_depth_mm", *speeds, *force, "max_state_age_s", "deadline_s"):
             if not (math.isfinite(value := getattr(self, name)) and value > 0):
                 raise ValueError(f"{name} is {value}; expected a finite number above 0")
-        if not 0 <= self.max_tilt_deg <= 90:
-            raise ValueError(f"max_tilt_deg is {self.max_tilt_deg}; allowed 0 to 90")
+        for name, most in (("max_tilt_deg", 90), ("max_turn_deg", 180)):
+            if not 0 <= (value := getattr(self, name)) <= most:
+                raise ValueError(f"{name} is {value}; allowed 0 to {most}")
         if self.contact_mm is not None and not math.isfinite(self.contact_mm):
             raise ValueError(f"contact_mm is {self.contact_mm}; expected a finite number or None")
         if not tilt_deg(self.tool, DOWN) <= MAX_LEAN_DEG:
@@ -90,6 +95,13 @@ def tilt_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
     a, b = _axis(tool), _axis(expected)
     cross = math.hypot(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     return math.degrees(math.atan2(cross, sum(p * q for p, q in zip(a, b, strict=True))))
+
+
+def turn_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
+    """Angle in degrees, 0 to 180, by which two tools given by their rotation vectors differ about their axis."""
+    (w, x, y, z), (p, q, r, s) = _quaternion(tool), _quaternion(expected)
+    about, along = w * s - z * p - x * r + y * q, w * p + x * q + y * r + z * s
+    return math.degrees(2 * math.atan2(abs(about), abs(along)))
 
 
 def require_numbers(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
@@ -129,6 +141,34 @@ def require_safe(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
         _refuse(f"the tool tilted by {tilt:.1f} degrees", f"at most {limits.max_tilt_deg:g}")
 
 
+def require_ready(state: ArmState, limits: Limits) -> None:
+    """Check how the arm stands before it moves for the first time.
+
+    Raises:
+        RigFault: "refused" where the first move would turn the tool too far, and with it its cable, or where the force
+            is to be watched and the arm tells none.
+    """
+    if not (turn := turn_deg(state.pose[3:], limits.tool)) <= limits.max_turn_deg:
+        _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {limits.max_turn_deg:g}")
+    if state.force_n is None and limits.max_force_n is not None:
+        _refuse(f"[rig] max_force_n is {limits.max_force_n:g}, but this arm tells no force", '"unwatched"')
+
+
+def require_tool(tcp_mm: Vector | None, about: Mapping[str, Any]) -> None:
+    """Check `[rig]` tcp_mm against what an arm said of itself on connecting; some, such as printers, have no tcp.
+
+    Raises:
+        RigFault: "refused" where it is unknown, or another than the arm's.
+    """
+    if "tcp" not in about:
+        return
+    told = tuple(round(float(value), 3) for value in about["tcp"][:3])
+    if tcp_mm is None:
+        _refuse("[rig] tcp_mm is unknown", f"x, y and z of the tip as measured; the controller says {list(told)}")
+    if not all(abs(a - b) <= TCP_SLACK_MM for a, b in zip(tcp_mm, told, strict=True)):
+        _refuse(f"[rig] tcp_mm is {list(tcp_mm)}", f"what the controller says, {list(told)}, to {TCP_SLACK_MM} mm")
+
+
 def watch(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
     """Check a state during a move.
 
@@ -145,8 +185,9 @@ def watch(state: ArmState, limits: Limits, now_s: float, until_s: float = math.i
         raise RigFault("protective_stop", "the arm is in a protective stop", look)
     if not (age := now_s - state.time_s) <= limits.max_state_age_s:
         raise RigFault("stale", f"the arm's last state is {age:.2f} s old; allowed {limits.max_state_age_s:g} s")
-    if state.force_n is not None and not abs(state.force_n) <= limits.max_force_n:
-        raise RigFault("force", f"the force is {state.force_n:.1f} N; allowed {limits.max_force_n:g} N")
+    force_n, most_n = state.force_n, limits.max_force_n
+    if force_n is not None and most_n is not None and not abs(force_n) <= most_n:
+        raise RigFault("force", f"the force is {force_n:.1f} N; allowed {most_n:g} N")
     depth = -math.inf if limits.contact_mm is None else limits.contact_mm - state.pose[2]
     if not depth <= limits.max_depth_mm + DEPTH_SLACK_MM:
         raise RigFault("refused", f"the tip is {depth:.2f} mm deep; allowed {limits.max_depth_mm:g} mm")
@@ -196,6 +237,14 @@ def _axis(rotation: Sequence[float]) -> Vector:
     x, y, z = (value / angle for value in rotation)
     sine, rest = math.sin(angle), 1 - math.cos(angle)
     return y * sine + x * z * rest, -x * sine + y * z * rest, math.cos(angle) + z * z * rest
+
+
+def _quaternion(rotation: Sequence[float]) -> tuple[float, float, float, float]:
+    """A rotation vector as a unit quaternion, its scalar first."""
+    angle = math.hypot(*rotation)
+    share = math.sin(angle / 2) / angle if angle else 0.0
+    x, y, z = (share * value for value in rotation)
+    return math.cos(angle / 2), x, y, z
 
 
 def _refuse(what: str, allowed: str) -> NoReturn:

@@ -11,12 +11,12 @@ ROOT = Path(__file__).parents[3]
 def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
     """Run `python -m module` with pipes to its stdin and stdout.
 
-    It finds this package wherever it is started from, and an interrupt from the keyboard does not reach it: its parent
-    decides what is to end first.
+    It finds this package wherever it is started from, and no code of the folder it is started in, which may be
+    anybody's. An interrupt from the keyboard does not reach it: its parent decides what is to end first.
     """
-    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    path = os.pathsep.join((str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))))
     return subprocess.Popen(
-        [sys.executable, "-m", module, *arguments],
+        [sys.executable, "-P", "-m", module, *arguments],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr,

@@ -36,7 +36,7 @@ class ArmState:
 
     Attributes:
         time_s: when it arrived. pose: of the tool. speed_mm_s: of the tool, >= 0.
-        force_n: at the tool, along z, None without a sensor.
+        force_n: at the tool, along z, None without a sensor; then `[rig]` has to say that nobody watches it.
         protective_stop, emergency_stop: whether the controller has stopped the arm.
         moving: whether the last move that was begun is still under way.
     """
@@ -54,7 +54,11 @@ class Arm(Protocol):
     """A robot arm. Methods raise `RigFault` within 5 s rather than wait for ever."""
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the link; returns what the arm says of itself (model, versions, rates) as JSON."""
+        """Open the link; returns what the arm says of itself (model, versions, rates) as JSON.
+
+        `serial` and, where the tool is something the arm is told of, `tcp` (the tip from the flange, mm and rad) are
+        compared where a recording is gone on with. An arm that others use is refused, not taken from them.
+        """
         ...
 
     def state(self) -> ArmState:
@@ -96,7 +100,13 @@ class Converter(Protocol):
     """An analogue-to-digital converter with C channels. Methods raise `RigFault` within 5 s."""
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the link and start sampling; returns name, firmware version, channels, bits, rate_hz as JSON."""
+        """Open the link and start sampling.
+
+        Returns:
+            What the board says of itself (name, versions, bits ...) as JSON; of it `rate_hz`, samples a second,
+            `channels`, the number C, `inputs`, which of the board they are, and `supply_v`, the reading at full scale,
+            are used. A `warning` is shown to whoever looks the rig over.
+        """
         ...
 
     def read(self) -> ConverterSamples:

@@ -9,8 +9,9 @@ import numpy as np
 
 from design import Contact, Morphology, signals
 from design.settings import Sensed
+from sense.recordings.press_plan import planned
 from sense.recordings.processing.limits import Array
-from sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
+from sense.recordings.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
 from sense.recordings.simulation.published_protocol import random_places
 from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.settings import RigSettings
@@ -20,7 +21,7 @@ class SimulatedConverter:
     """The converter of the simulated rig, `rate_hz` of which is its own; implements `Converter`.
 
     The pad is the one that `simulate` records with the same arguments, down to the rests of its fibres. Presses come
-    as often and are held as long as there, at other places.
+    as often and are held as long as there, at other places, and as deep as `[rig]` says, its depths in turn.
     """
 
     def __init__(
@@ -32,9 +33,11 @@ class SimulatedConverter:
         sensed_mm: Sensed = "beyond",
     ) -> None:
         rng = np.random.default_rng(rig.seed)
-        random_places(pad, rig.presses, rng)  # those of the recording, drawn before the pad is
+        if rig.plan_file is None:
+            planned(pad, rig, rng)  # the presses of the recording, drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig, self._clock = pad, contact, rig, clock
+        self._depths_mm = rig.depths_mm or (rig.depth_mm,)
         self._sensed_mm: Sensed = sensed_mm
         self._finger = rng.spawn(1)[0]
         self._started_s: float | None = None
@@ -45,7 +48,9 @@ class SimulatedConverter:
         """Begin; see `Converter`."""
         signals(self._pad, self._pad.to_grid([[0.0, 0.0]]), self._contact)  # compiled before it has to keep up
         self._started_s, self._count = self._clock(), 0
-        return {"name": "simulated", "channels": 2 * self._pad.grid, "rate_hz": self._rig.rate_hz}
+        fibres = 2 * self._pad.grid
+        named = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
+        return {**named, "rate_hz": self._rig.rate_hz, "supply_v": SUPPLY_V}
 
     def read(self) -> ConverterSamples:
         """All samples since the last call; see `Converter`. Raises RigFault("refused") before `connect`."""
@@ -69,4 +74,4 @@ class SimulatedConverter:
         if press > self._press:
             self._press, self._place_mm = press, random_places(self._pad, 1, self._finger, self._sensed_mm)[0]
         down = min((within_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - within_s) / TRAVEL_S)
-        return self._place_mm, self._rig.depth_mm * max(down, 0.0)
+        return self._place_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(down, 0.0)

@@ -7,10 +7,9 @@ from scipy.spatial import KDTree
 
 from sense.localizer.localizer import Localizer
 from sense.localizer.locating import locate
+from sense.recordings.press_plan import PressPlan
 from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
-
-from .press_plan import PressPlan
 
 EVERY = 20
 """Presses between two looks at how well the localizer finds them."""

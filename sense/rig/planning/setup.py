@@ -1,5 +1,6 @@
 """What is to be recorded, and the run directory it goes to: a new one, or one to go on with."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,9 @@ from design.common.files import provenance, read_json
 if TYPE_CHECKING:
     from design.pad.morphology import Morphology
     from design.settings import Contact, Sensed
+    from sense.recordings.press_plan import PressPlan
     from sense.recordings.recorder import Recorder
     from sense.settings import RigSettings
-
-    from .press_plan import PressPlan
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class Setup:
 
     Attributes:
         sensed_mm: which part of the pad is pressed (`PadSettings`), unless a file says where.
+        folder: of the pad, with what fabricate has written.
     """
 
     pad: "Morphology"
@@ -32,60 +33,126 @@ class Setup:
     command: str
     inputs: Sequence[Path] = ()
     sensed_mm: "Sensed" = "beyond"
+    folder: Path = Path()
 
 
 def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
     """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
 
-    from sense.recordings.recorder import FORMAT, START
-
-    from .press_plan import PressPlan, planned, read_plan
+    from sense.recordings.press_plan import PressPlan, planned
+    from sense.recordings.recorder import START
 
     if resume and (setup.out / START).exists():
-        source = read_json(setup.out / START, FORMAT).get("source")
-        source = source if isinstance(source, dict) else {}
-        kept = source.get("plan")
-        if not isinstance(kept, dict) or "presses" not in kept:
-            raise InputError(f"{setup.out}: has no plan, so that it cannot be resumed")
-        _require_same(setup, rig, source)
-        return PressPlan.of(kept["presses"])
-    if (file := rig.plan_file) is not None:
-        return read_plan(file, rig.depth_mm)
+        return PressPlan.of(begun_source(setup, rig, KIND)["plan"]["presses"])
     return planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.sensed_mm)
 
 
-_LASTING = ("channels", "rate_hz", "converter_rate_hz", "readings_per_press", "pad_mm", "pad_angle_deg", "contact_mm")
-"""Settings that all of a recording has to share."""
+KIND = "rig"
+"""Of the source of a recording that an arm pressed."""
+_PLANNED = ("presses", "plan", "seed")
+_FREE = {
+    *_PLANNED,  # the plan is kept
+    *("host", "port", "baud", "printer_port", "printer_baud"),  # serial numbers are compared
+    *("box_mm", "max_depth_mm", "max_force_n"),
+    *("noise_mv", "drift_mv", "creep", "hysteresis", "hysteresis_s"),
+}
+"""Settings that may change within a recording; any other changes what a press is."""
+_IDENTITY = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "firmware")}
+"""What devices say of themselves that all of a recording has to share."""
 
 
-def _require_same(setup: Setup, rig: "RigSettings", source: Mapping[str, Any]) -> None:
-    """Refuse to go on with a recording under other settings, or of another pad."""
-    was, now = source.get("rig"), rig.model_dump(mode="json")
-    for key in _LASTING:
-        before = was.get(key) if isinstance(was, dict) else None
-        if before != now[key]:
-            raise InputError(f"[rig] {key}: got {now[key]}, the recording in {setup.out} was begun with {before}")
-    if source.get("morphology") != _morphology(setup):
+def begun_source(setup: Setup, rig: "RigSettings", kind: str) -> dict[str, Any]:
+    """The source of the recording in `setup.out`, which is to be gone on with.
+
+    Raises:
+        InputError: it is of another kind, has no plan, or was begun with other settings or another pad.
+    """
+    from sense.recordings.recorder import FORMAT, START
+
+    source = read_json(setup.out / START, FORMAT).get("source")
+    source = source if isinstance(source, dict) else {}
+    if not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
+        raise InputError(f"{setup.out}: has no plan, so that it cannot be resumed")
+    if source.get("kind") != kind:
+        raise InputError(f"{setup.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
+    was, now = source.get("rig"), _told(setup, rig)
+    if source.get("morphology") != now["morphology"]:
         raise InputError(f"{setup.out}: was begun with another pad than the one given")
+    for key in sorted(now["rig"].keys() - _FREE):
+        before = was.get(key) if isinstance(was, dict) else None
+        if before != (got := now["rig"][key]):
+            raise InputError(f"[rig] {key}: got {got}, the recording in {setup.out} was begun with {before}")
+    return source
 
 
-def _morphology(setup: Setup) -> dict[str, Any]:
-    return {"pitch_mm": setup.pad.pitch_mm, "knots": setup.pad.knots.tolist()}
+def kept_plan(setup: Setup) -> str:
+    """What to tell where other presses are asked for than the recording was begun with, whose plan is kept; else ""."""
+    from sense.recordings.recorder import FORMAT, START
+
+    if not (setup.out / START).exists():
+        return ""
+    source, now = read_json(setup.out / START, FORMAT)["source"], setup.rig.model_dump(mode="json")
+    other = [f"{key} = {source['rig'].get(key)}" for key in _PLANNED if source["rig"].get(key) != now[key]]
+    return f"{setup.out}: goes on by the plan it was begun with, [rig] {', '.join(other)}" if other else ""
 
 
-def recorder_of(setup: Setup, rig: "RigSettings", plan: "PressPlan", folder: Path, resume: bool) -> "Recorder":
-    """The recorder of a new recording, or of the one in `folder` that is gone on with."""
-    from sense.recordings.recorder import START, Recorder
+def require_same_devices(out: Path, source: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise InputError where a recording would be gone on with with another arm, tool or board; see `source_of`."""
+    kept = source.get("devices")
+    for device, about in devices.items():
+        was = kept.get(device) if isinstance(kept, dict) else None
+        for key in _IDENTITY[device]:
+            before = was.get(key) if isinstance(was, dict) else None
+            if before != (now := _plain(about).get(key)):
+                raise InputError(f"{device}: {key} is {now}, the recording in {out} was begun with {before}")
 
-    from .press_plan import COLUMNS
+
+def source_of(
+    setup: Setup, rig: "RigSettings", kind: str, plan: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """What a new recording says of where it came from.
+
+    Args:
+        plan: its presses, and the names of their columns. devices: what "arm" and "board" said of themselves.
+    """
+    said = {name: _plain(about) for name, about in devices.items()}
+    return {"kind": kind, "devices": said, **_told(setup, rig), "plan": dict(plan)}
+
+
+def _told(setup: Setup, rig: "RigSettings") -> dict[str, Any]:
+    """Settings, with the inputs of the board as they are wired, and the pad."""
+    wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots))})
+    pad = {"pitch_mm": setup.pad.pitch_mm, "knots": setup.pad.knots.tolist()}
+    return {"rig": wired.model_dump(mode="json"), "morphology": pad}
+
+
+def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
+    """What a device said, as it is read from JSON again."""
+    return json.loads(json.dumps(dict(about)))
+
+
+def recorder_of(
+    setup: Setup,
+    rig: "RigSettings",
+    plan: "PressPlan",
+    folder: Path,
+    resume: bool,
+    devices: Mapping[str, Mapping[str, Any]],
+) -> "Recorder":
+    """The recorder of a new recording, or of the one in `folder` that is gone on with.
+
+    Args:
+        devices: what "arm" and "board" said of themselves on connecting.
+
+    Raises:
+        InputError: the recording cannot be gone on with, or was begun with other devices.
+    """
+    from sense.recordings.press_plan import COLUMNS
+    from sense.recordings.recorder import FORMAT, START, Recorder
 
     if resume and (folder / START).exists():
+        require_same_devices(folder, read_json(folder / START, FORMAT).get("source", {}), devices)
         return Recorder.resume(folder)
-    source = {
-        "kind": "rig",
-        "rig": rig.model_dump(mode="json"),
-        "morphology": _morphology(setup),
-        "plan": {"columns": list(COLUMNS), "presses": plan.document()},
-    }
-    return Recorder(folder, rig.channels, source, provenance(setup.command, rig.seed, setup.inputs))
+    source = source_of(setup, rig, KIND, {"columns": list(COLUMNS), "presses": plan.document()}, devices)
+    return Recorder(folder, len(setup.pad.knots), source, provenance(setup.command, rig.seed, setup.inputs))

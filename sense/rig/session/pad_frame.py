@@ -26,12 +26,18 @@ class Frame:
 
     @classmethod
     def of(cls, rig: RigSettings) -> "Frame":
-        """The frame that `[rig]` says; raises RigFault where the contact height is unknown."""
+        """The frame that `[rig]` says; raises RigFault where the contact height or the pad's place is unknown."""
         if rig.contact_mm is None:
             raise RigFault(
                 "refused",
                 "[rig] contact_mm is unknown, allowed is the height of the pad's surface in the base frame",
                 "touch the pad with the tool by hand and note its z",
+            )
+        if rig.pad_mm is None:
+            raise RigFault(
+                "refused",
+                "[rig] pad_mm is unknown, allowed are x and y of the pad's centre in the base frame",
+                "jog the tool to the middle of the pad and note its x and y",
             )
         return cls(rig.pad_mm, math.radians(rig.pad_angle_deg), rig.contact_mm, rig.tool_rad)
 

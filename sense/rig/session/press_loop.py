@@ -1,7 +1,8 @@
 """The press loop: an arm presses as planned while a converter reads, and a run directory keeps all of it.
 
-Nothing moves before the whole plan is found safe. Every wait reads, records and watches. On a fault the arm is
-stopped first, then what came so far is brought to the disk, then the fault is told.
+Nothing moves before the whole plan is found safe. Every wait reads, records and watches, and none is for the disk:
+a thread of its own puts the recording there, and no press begins before the one before it lies there. On a fault the
+arm is stopped first, then lifted off, then what came so far is brought to the disk, then the fault is told.
 """
 
 import contextlib
@@ -11,24 +12,29 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from sense.recordings.press_plan import PressPlan
 from sense.recordings.processing.limits import Array
-from sense.recordings.recorder import Recorder
+from sense.recordings.recorder import STATE_COLUMNS, Recorder
 from sense.rig.devices.protocols import Arm, Converter, Pose, RigFault
-from sense.rig.planning.press_plan import PressPlan
-from sense.rig.safety import POLL_S, Limits, require_safe, wait_until_still, watch
+from sense.rig.safety import POLL_S, Limits, require_ready, require_safe, wait_until_still, watch
 from sense.settings import RigSettings
 
 from .averaging import Averager
+from .disk_thread import DiskThread
+from .interrupts import Interrupts
 from .pad_frame import Frame
+from .retreat import retreat
 
 _SPARE_S = 3.0
 """A reading that is waited for may take this long."""
+_DISK_S = 30.0
+"""What was recorded of a press is on the disk by then."""
 _SETTLE_S = 0.1
 _KEPT = 4096
 """Readings whose times are remembered, to tell which came after a command."""
 
 Report = Callable[[int, int], None]
-"""Told after every press: how many are done, and how many there are."""
+"""Told after every press, once it is on the disk: how many are done, and how many there are."""
 
 
 class Session:
@@ -56,10 +62,12 @@ class Session:
         self._frame, self._limits = Frame.of(rig), Limits.of(rig)
         ratio = max(1, round(rig.converter_rate_hz / rig.rate_hz))
         self._half_s = rig.readings_per_press / 2 * ratio / rig.converter_rate_hz
-        self._averager = Averager(ratio, rig.channels)
+        self._averager = Averager(ratio, recorder.fibres)
         self._recent: deque[float] = deque(maxlen=_KEPT)
-        # Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
-        self._zero_s = clock() - (recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0)
+        self._disk, self._readings = DiskThread(), recorder.readings
+        self._interrupts = Interrupts()
+        self._zero_s = 0.0
+        self._forces_n: list[float] = []  # since the probe last came to rest
 
     def run(
         self,
@@ -76,7 +84,9 @@ class Session:
             RigFault: the plan is not safe, or the rig failed; the arm stands still and what is done is on the disk.
         """
         require_safe_plan(plan, self._rig)
-        with self._safely():
+        require_ready(self._arm.state(), self._limits)
+        self._begin()
+        with self._interrupts, self._disk, self._safely():
             self._lift()  # the tool may stand anywhere in the box, even on the pad
             for press in range(len(plan)):
                 if press not in self._recorder.done:
@@ -84,9 +94,21 @@ class Session:
                         require_safe_plan(steered, self._rig)
                         plan = steered
                     self._press(press, plan.places_mm[press], float(plan.depths_mm[press]))
+                    self._await_disk()
                     report(len(self._recorder.done), len(plan))
             self._go_on_until(self._clock() + self._half_s)  # the release after the last press
-            self._recorder.sync()
+            self._disk.do(self._recorder.sync)
+            self._await_disk()
+
+    def _begin(self) -> None:
+        """Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
+
+        What came while the devices were connected, which may take longer, is none of it.
+        """
+        self._converter.read()
+        self._arm.drain()
+        last_s = self._recorder.last_s
+        self._zero_s = self._clock() - (last_s + 1 if np.isfinite(last_s) else 0.0)
 
     def _press(self, press: int, place_mm: Array, depth_mm: float) -> None:
         above = self._above(place_mm)
@@ -98,17 +120,19 @@ class Session:
         target = self._frame.pose(place_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
         self._move(target, self._rig.press_mm_s)
         self._await_reading(down_s)
-        self._recorder.begin(place_mm, self._reading(down_s), press, depth_mm=depth_mm)
-        self._recorder.sync()
+        self._disk.do(self._recorder.begin, place_mm, self._reading(down_s), press, depth_mm=depth_mm)
+        self._disk.do(self._recorder.sync)
         self._still()
+        self._forces_n.clear()
         self._go_on_until(down_s + self._half_s)
+        held = {"force_n": float(np.median(np.abs(self._forces_n)))} if self._forces_n else {}
         tip, depths = self._frame.tip(np.array([self._arm.state().pose]))
         up_s = self._clock()
         self._move(above, self._rig.press_mm_s)
         self._await_reading(up_s)
-        reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.lost}
-        self._recorder.finish(self._reading(up_s), **reached)
-        self._recorder.sync()
+        reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.lost} | held
+        self._disk.do(self._recorder.finish, self._reading(up_s), **reached)
+        self._disk.do(self._recorder.sync)
         self._still()
 
     def _above(self, place_mm: Array) -> Pose:
@@ -143,16 +167,29 @@ class Session:
             self._sleep(POLL_S)
             self._pump()
 
+    def _await_disk(self) -> None:
+        """Read, record and watch until all that was to be synced is on the disk."""
+        deadline = self._clock() + _DISK_S
+        while not self._disk.idle(POLL_S):
+            if self._clock() >= deadline:
+                raise RigFault("disk", f"the disk took more than {_DISK_S:.0f} s for a press", "look at the disk")
+            self._pump()
+
     def _pump(self) -> None:
-        """Take what the devices have, keep it, and see that all is well."""
+        """See that all is well, before anything else; then take what the devices have, and have it kept."""
+        self._interrupts.check()
+        watch(self._arm.state(), self._limits, self._clock())
+        self._disk.idle()
         times_s, volts = self._averager.feed(self._converter.read())
         if len(times_s):
-            self._recorder.append(times_s - self._zero_s, volts)
+            self._disk.do(self._recorder.append, times_s - self._zero_s, volts)
+            self._readings += len(times_s)
             self._recent.extend(times_s.tolist())
         states = self._arm.drain()
+        forces_n = states[:, STATE_COLUMNS.index("force_n")]
+        self._forces_n += forces_n[~np.isnan(forces_n)].tolist()
         if len(states):
-            self._recorder.append_states(states - np.eye(1, states.shape[1]) * self._zero_s)
-        watch(self._arm.state(), self._limits, self._clock())
+            self._disk.do(self._recorder.append_states, states - np.eye(1, states.shape[1]) * self._zero_s)
 
     def _after(self, moment_s: float) -> int | None:
         """How many of the recent readings came after a moment; None before the first."""
@@ -165,24 +202,36 @@ class Session:
 
     def _reading(self, moment_s: float) -> int:
         """Index of the first reading after a moment."""
-        return self._recorder.readings - (self._after(moment_s) or 0)
+        return self._readings - (self._after(moment_s) or 0)
 
     @contextlib.contextmanager
     def _safely(self) -> Iterator[None]:
-        """On any failure: stop the arm, retract it where that is safe, keep the data, then tell."""
+        """On any failure: stop the arm, lift it off where that is safe, keep the data, then tell."""
         try:
             yield
         except BaseException as error:
-            with contextlib.suppress(Exception):
-                self._arm.stop()
+            with self._interrupts.held():
+                with contextlib.suppress(Exception):
+                    self._arm.stop()
+                stuck = self._retreat()
+            self._disk.end()
             with contextlib.suppress(Exception):
                 self._recorder.abort(str(error) or type(error).__name__)
                 self._recorder.sync()
-            with contextlib.suppress(Exception):
-                self._lift()
             if isinstance(error, OSError):
                 raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
+            if isinstance(error, RigFault) and error.cause == "force":
+                how = f"and it cannot be lifted off: {stuck}" if stuck else "the tool was lifted off"
+                raise RigFault("force", str(error), how) from error
             raise
+
+    def _retreat(self) -> str | None:
+        """Lift the tool off the pad after a fault; why that cannot be, if so."""
+        try:
+            retreat(self._arm, self._limits, self._rig.acceleration_mm_s2, self._clock, self._sleep)
+        except Exception as error:
+            return str(error)
+        return None
 
     def _lift(self) -> None:
         """Lift the tool straight up to its travelling height, unless the controller or a person stopped the arm.

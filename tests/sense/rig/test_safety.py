@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sense.rig import safety
 from sense.rig.devices.protocols import ArmState, Pose, RigFault
-from sense.rig.safety import Limits, require_safe, tilt_deg, wait_until_still, watch
+from sense.rig.safety import Limits, Vector, require_safe, tilt_deg, wait_until_still, watch
 from sense.settings import RigSettings
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
@@ -89,6 +90,7 @@ def test_tilt_is_an_angle_that_does_not_depend_on_the_order(a: tuple[float, ...]
         {"max_force_n": -1.0},
         {"deadline_s": math.nan},
         {"max_tilt_deg": 91.0},
+        {"max_turn_deg": 181.0},
         {"contact_mm": math.nan},
         {"tool": (0.0, 0.0, 0.0)},
     ],
@@ -184,6 +186,49 @@ def test_states_that_end_a_move(change: dict[str, object], cause: str) -> None:
         watch(replace(REST, **change), LIMITS, 10.0)  # pyright: ignore[reportArgumentType]
     assert caught.value.cause == cause
     assert "\n" not in str(caught.value)
+
+
+def test_a_force_that_nobody_watches_stops_nothing() -> None:
+    watch(replace(REST, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
+    safety.require_ready(REST, replace(LIMITS, max_force_n=None))
+    with pytest.raises(RigFault, match='allowed "unwatched"'):
+        safety.require_ready(REST, LIMITS)
+
+
+def down(turn: float) -> tuple[float, float, float]:
+    """A tool that points down, turned about its axis."""
+    return -math.pi * math.sin(turn / 2), math.pi * math.cos(turn / 2), 0.0
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-3.1, 3.1))
+def test_a_turn_is_the_angle_about_the_axis(a: float, b: float) -> None:
+    apart = abs(math.remainder(a - b, 2 * math.pi))
+    assert safety.turn_deg(down(a), down(b)) == pytest.approx(math.degrees(apart), abs=1e-4)
+    assert safety.turn_deg((0.0, math.pi - 0.03, 0.0), LIMITS.tool) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("degrees", "refuses"), [(44.9, False), (45.1, True), (-44.9, False), (-170.0, True)])
+def test_the_first_move_turns_the_wrist_by_so_much_at_most(degrees: float, refuses: bool) -> None:
+    state = replace(REST, force_n=0.0, pose=(*SAFE[:3], *down(math.radians(degrees))))
+    with pytest.raises(RigFault, match="at most 45") if refuses else contextlib.nullcontext():
+        safety.require_ready(state, LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("tcp_mm", "told", "refusal"),
+    [
+        ((0.0, 0.0, 150.0), [0.0, 0.05, 150.09], None),
+        ((0.0, 0.0, 0.0), [0.0, 0.0, 0.0], None),
+        (None, [0.0, 0.0, 0.0], r"tcp_mm is unknown; allowed .* says \[0\.0, 0\.0, 0\.0\]"),
+        ((0.0, 0.0, 150.0), [0.0, 0.0, 0.0], r"tcp_mm is \[0\.0, 0\.0, 150\.0\]; allowed what the controller says"),
+        ((0.0, 0.0, 150.0), [0.0, 0.0, 150.11], "to 0.1 mm"),
+        ((0.0, 0.0, 150.0), [math.nan] * 3, "tcp_mm"),
+    ],
+)
+def test_the_tip_is_where_the_controller_thinks(tcp_mm: Vector | None, told: list[float], refusal: str | None) -> None:
+    safety.require_tool(tcp_mm, {"model": "a printer, which has no such thing"})
+    with pytest.raises(RigFault, match=refusal) if refusal else contextlib.nullcontext():
+        safety.require_tool(tcp_mm, {"tcp": [*told, 0.0, 0.0, 0.0]})
 
 
 def test_a_move_may_take_as_long_as_it_may() -> None:

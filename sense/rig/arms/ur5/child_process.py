@@ -6,13 +6,18 @@ the parent ends, or gives no sign of life during a move. Nothing here unlocks, p
 """
 
 import contextlib
+import fcntl
 import json
 import os
 import queue
 import select
+import socket
 import sys
+import tempfile
 import threading
+import time
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NoReturn
 
 from . import rtde_frames as frames
@@ -33,6 +38,8 @@ HALT_S = 0.15
 """Longest wait for the arm's and then for the parent's ear when this process has to end."""
 ANSWER_S = 1.0
 """Longest wait for an answer of the arm while connecting."""
+PATIENCE_S = 1.0
+"""Longest wait for a session that is at its end: its watchdog ends its program a quarter of a second later."""
 OPERATION, UNDER_WAY = 0x7F << 24, 1 << 15
 LOOK = "look at the arm, unlock it at the pendant, then connect again"
 
@@ -50,6 +57,38 @@ def _require_ready(reading: Reading) -> None:
         raise Refused("refused", f"the arm is not ready: robot mode {reading.mode}, expected {frames.RUNNING}", LOOK)
 
 
+def _require_idle(reader: RtdeReader, reading: Reading) -> Reading:
+    """The first state with no program on the arm; its program is another's, who may be in mid-press."""
+    until = time.monotonic() + PATIENCE_S
+    while reading.runtime > frames.STOPPED:
+        if time.monotonic() > until:
+            advice = "end the other recording, or stop the program at the pendant"
+            raise Refused("refused", "a program runs on the arm, or is paused there", advice)
+        reading = reader.read(ANSWER_S)
+    return reading
+
+
+def _claim(host: str) -> int:
+    """Keep other programs on this computer off an arm until the descriptor is closed or this process has ended."""
+    address = socket.getaddrinfo(host, None)[0][4][0]
+    path = Path(tempfile.gettempdir(), f"padforge-arm-{address}.lock")
+    try:
+        claim = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644)
+    except FileExistsError:  # it may be another user's, who cannot keep one from reading it
+        claim = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > until:
+                what = f"another program on this computer uses the arm {host}"
+                raise Refused("refused", what, "wait for its end, or end it") from None
+            time.sleep(KICK_S)
+        else:
+            return claim
+
+
 class Child:
     """The arm as ur-rtde and an RTDE reader know it."""
 
@@ -58,6 +97,7 @@ class Child:
         self._writing = threading.Lock()
         self._orders: queue.Queue[dict[str, Any]] = queue.Queue()
         self._control: Any = None
+        self._claim: int | None = None
         self._latest: Reading | None = None
         self._before: int | None = None
         """Number of the operation before the move that is under way."""
@@ -109,9 +149,11 @@ class Child:
         import rtde_control
 
         try:
+            self._claim = _claim(self._host)
             reader = RtdeReader(self._host, ANSWER_S)
             first = reader.read(ANSWER_S)
             _require_ready(first)
+            first = _require_idle(reader, first)
             about = self._ask_about()
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
@@ -130,7 +172,7 @@ class Child:
             "rate_hz": reader.rate_hz,
             "controller": ".".join(map(str, reader.version)),
             "ur_rtde": version("ur-rtde"),
-            "tcp": [*(1e3 * value for value in tcp[:3]), *tcp[3:]],
+            "tcp": [*(round(1e3 * value, 3) for value in tcp[:3]), *(round(value, 6) for value in tcp[3:])],
         }
 
     def _ask_about(self) -> dict[str, str]:

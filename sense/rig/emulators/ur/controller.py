@@ -46,8 +46,17 @@ class Controller:
         remote: whether the arm is in remote control. asked: every line the dashboard was sent.
     """
 
-    def __init__(self, series: Series, pose: Array, surface: SpringySurface | None = None, now: float = 0.0) -> None:
+    def __init__(
+        self,
+        series: Series,
+        pose: Array,
+        surface: SpringySurface | None = None,
+        now: float = 0.0,
+        tcp: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Switch it on with its tool where `pose` says; `tcp` is that of its installation, m."""
         self.series: Series = series
+        self._installed = tcp
         self.motion = Motion(pose)
         self.surface = surface
         self.remote = True
@@ -59,7 +68,7 @@ class Controller:
         self.motion = Motion(self.motion.pose)
         self.inputs: defaultdict[str, float] = defaultdict(float)
         self.outputs: dict[str, float] = {}
-        self.tcp: Array = np.zeros(6)
+        self.tcp: Array = np.array([*self._installed, 0.0, 0.0, 0.0])
         self._boot = self._now = now
         self._safety, self._runtime, self._mode = NORMAL, STOPPED, RUNNING
         self._threads: list[Iterator[None]] = []

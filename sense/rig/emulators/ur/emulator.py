@@ -38,16 +38,17 @@ class UrEmulator:
         surface_mm: float | None = None,
         stiffness_n_mm: float = 2.0,
         host: str = HOST,
+        tcp_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Describe the controller.
 
         Args:
             series: "cb3" (PolyScope 3, 125 Hz) or "e" (PolyScope 5, 500 Hz). pose: where the arm stands.
             surface_mm: height of a springy plane the tool can press on; None for none. stiffness_n_mm: of it.
-            host: address of this machine at which it listens.
+            host: address of this machine at which it listens. tcp_mm: the tip from the flange, as installed.
         """
         self._settings = {"series": series, "pose_mm": pose, "surface_mm": surface_mm}
-        self._settings |= {"stiffness_n_mm": stiffness_n_mm, "host": host}
+        self._settings |= {"stiffness_n_mm": stiffness_n_mm, "host": host, "tcp_mm": tcp_mm}
 
     def __enter__(self) -> Self:
         handle, name = tempfile.mkstemp(prefix="padforge-ur-")

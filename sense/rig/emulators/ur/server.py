@@ -254,11 +254,18 @@ def _say(what: Any) -> None:
 
 
 def main(
-    series: Series, pose_mm: list[float], surface_mm: float | None, stiffness_n_mm: float, host: str, truth: str
+    series: Series,
+    pose_mm: list[float],
+    surface_mm: float | None,
+    stiffness_n_mm: float,
+    host: str,
+    tcp_mm: tuple[float, float, float],
+    truth: str,
 ) -> None:
     """Open the ports and serve; the first line on stdout is null, or why it cannot be."""
     surface = None if surface_mm is None else SpringySurface(surface_mm / 1e3, stiffness_n_mm * 1e3)
-    controller = Controller(series, np.array(pose_mm) / TO_MM, surface, time.monotonic())
+    x, y, z = (value / 1e3 for value in tcp_mm)
+    controller = Controller(series, np.array(pose_mm) / TO_MM, surface, time.monotonic(), (x, y, z))
     server = Server(controller, TruthWriter(Path(truth)), host)
     try:
         server.listen()

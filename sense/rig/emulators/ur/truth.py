@@ -13,6 +13,8 @@ ROWS = 1 << 16
 """Length of the ring: 131 s at 500 Hz, 524 s at 125 Hz."""
 _MARGIN = 16
 """Rows that the writer may overwrite while a reader copies."""
+LOOKS = (256, 8192, ROWS)
+"""So many rows are looked at in turn: who asks in real time, as a board does, asks of the newest."""
 
 
 class TruthWriter:
@@ -36,12 +38,13 @@ class Truth:
         self.path = path
         self._count, self._rows = _map(path, "r")
 
-    def rows(self) -> Array:
-        """(n, 8) rows from the oldest to the newest: time, pose in mm and rad, force."""
+    def rows(self, most: int = ROWS) -> Array:
+        """(n, 8) rows from older ones to the newest, the last `most` of them: time, pose in mm and rad, force."""
         count = int(self._count[0])
-        copy = np.array(self._rows)
-        oldest = max(0, int(self._count[0]) - ROWS + _MARGIN)
-        return copy[np.arange(min(oldest, count), count) % ROWS]
+        first = max(0, count - min(most, ROWS - _MARGIN))
+        copy = self._rows[np.arange(first, count) % ROWS]
+        overwritten = int(self._count[0]) - ROWS + _MARGIN
+        return copy[max(0, overwritten - first) :]
 
     def pose_at(self, times_s: ArrayLike) -> Array:
         """(n, 6) poses in mm and rad at monotonic times, the newest one for later times.
@@ -49,10 +52,13 @@ class Truth:
         Raises:
             ValueError: for a time before the oldest row.
         """
-        rows, times = self.rows(), np.atleast_1d(np.asarray(times_s, dtype=np.float64))
-        if not len(rows) or np.min(times, initial=np.inf) < rows[0, 0]:
-            raise ValueError("a time before the oldest pose that is kept")
-        return np.column_stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:7]])
+        times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
+        first_s, rows = np.min(times, initial=np.inf), np.empty((0, COLUMNS))
+        for most in LOOKS:
+            rows = self.rows(most)
+            if len(rows) and rows[0, 0] <= first_s:
+                return np.column_stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:7]])
+        raise ValueError("a time before the oldest pose that is kept")
 
 
 def create(path: Path) -> None:

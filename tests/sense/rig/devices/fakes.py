@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,13 @@ from sense.rig.session.pad_frame import Frame
 from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
+FIBRES = 4
 RIG = RigSettings(
     presses=6,
     rate_hz=100,
     converter_rate_hz=1000,
     readings_per_press=40,
-    channels=4,
+    pad_mm=(0.0, -400.0),
     contact_mm=50.0,
     box_mm=(-100, 100, -500, -300, 40, 120),
     travel_mm_s=400,
@@ -52,7 +54,7 @@ class FakeArm:
     protective_stop: bool = False
     emergency_stop: bool = False
     lost: bool = False
-    force_n: float | None = None
+    force_n: float | None = 0.0
     stops: int = 0
     moves: list[Pose] = field(default_factory=list)
     hook: Callable[["FakeArm"], None] = lambda arm: None
@@ -76,7 +78,8 @@ class FakeArm:
         if self.lost:
             raise RigFault("lost", "the arm is gone")
         self._advance()
-        row = [self.time(), *self.pose, 0.0, np.nan, float(not self.protective_stop)]
+        force_n = np.nan if self.force_n is None else self.force_n
+        row = [self.time(), *self.pose, 0.0, force_n, float(not self.protective_stop)]
         return np.array([row]).reshape(1, len(STATE_COLUMNS))
 
     def move(self, pose: Pose, speed_mm_s: float, acceleration_mm_s2: float) -> None:
@@ -120,8 +123,8 @@ class FakeConverter:
         self.lose = 0
         self.lost = self.stalled = False
 
-    def connect(self) -> dict[str, float]:
-        return {"rate_hz": self.rate_hz}
+    def connect(self) -> dict[str, Any]:
+        return {"rate_hz": self.rate_hz, "inputs": list(range(FIBRES)), "supply_v": 3.3}
 
     def read(self) -> ConverterSamples:
         if self.lost:

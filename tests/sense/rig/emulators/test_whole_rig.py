@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from design import Morphology
 from design.settings import PUBLISHED_CONTACT
 from sense.recordings.press_journal import read_journal
+from sense.recordings.press_plan import PressPlan, planned
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
-from sense.rig.boards.due import driver as arduino
+from sense.rig.boards import block_reader
 from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators.whole_rig import emulated, emulated_rig
-from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
 from sense.settings import RigSettings
@@ -52,7 +52,7 @@ class Rig:
 
     def record(self, run: Path, plan: PressPlan, report: Report = lambda done, of: None) -> float:
         """Record into `run` or go on with it; when that began."""
-        with Recorder.resume(run) if run.exists() else Recorder(run, RIG.channels, {}, {}) as recorder:
+        with Recorder.resume(run) if run.exists() else Recorder(run, 2 * PAD.grid, {}, {}) as recorder:
             self.arm.connect()
             self.converter.connect()
             began = time.monotonic()
@@ -88,7 +88,7 @@ def rig(own_address: None) -> Iterator[Rig]:
 @pytest.fixture
 def soon_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where times need not be exact, connecting need not take long."""
-    monkeypatch.setattr(arduino, "_SETTLE_S", 0.15)
+    monkeypatch.setattr(block_reader, "SETTLE_S", 0.15)
 
 
 class Made(NamedTuple):

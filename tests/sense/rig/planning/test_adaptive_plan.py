@@ -1,13 +1,13 @@
 import numpy as np
 
 from sense.localizer.calibration.calibration import calibrate
+from sense.recordings.press_plan import PressPlan, planned
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
 from sense.rig.planning.adaptive_plan import EVERY, Steering, uncertainty
-from sense.rig.planning.press_plan import PressPlan, planned
 from sense.rig.session.press_loop import Session
 from sense.settings import LocalizerSettings
-from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.devices.fakes import FIBRES, PAD, RIG, FakeArm, FakeConverter, Time
 
 
 def test_presses_go_where_errors_are_large_and_nothing_was_pressed():
@@ -47,11 +47,11 @@ def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
     learnt = planned(PAD, options, np.random.default_rng(4))
     known = PressPlan(np.column_stack([-np.abs(learnt.places_mm[:, 0]), learnt.places_mm[:, 1]]), learnt.depths_mm)
     converter = FakeConverter(arm)
-    with Recorder(tmp_path / "known", RIG.channels, {}, {}) as recorder:
+    with Recorder(tmp_path / "known", FIBRES, {}, {}) as recorder:
         Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(known)
     small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=60, lost=0)
     localizer, _ = calibrate(Recording.open(tmp_path / "known"), small)
-    with Recorder(tmp_path / "run", RIG.channels, {}, {}) as recorder:
+    with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
         steering = Steering(localizer, tmp_path / "run", np.random.default_rng(5))
         Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(plan, steer=steering)
     made = Recording.open(tmp_path / "run").presses_mm

@@ -1,26 +1,35 @@
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
 from design.settings import PUBLISHED_CONTACT
-from sense.rig.planning.press_plan import planned
-from sense.rig.planning.setup import Setup, plan_of, recorder_of
+from sense.recordings.press_plan import planned
+from sense.recordings.recorder import START
+from sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
 from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
-RIG = RigSettings(presses=5, channels=4)
+RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))
 
 
 def setup(out: Path, pad: Morphology = PAD) -> Setup:
     return Setup(pad, PUBLISHED_CONTACT, RIG, out, "test")
 
 
-def begun(out: Path) -> None:
-    import numpy as np
+ARM = {"model": "UR5", "serial": "2018", "controller": "5.12.2", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
+BOARD = {"name": "padforge-due", "serial": "ab12", "firmware": "1.0.0", "port": "/dev/ttyACM0"}
+DEVICES = {"arm": ARM, "board": BOARD}
 
-    with recorder_of(setup(out), RIG, planned(PAD, RIG, np.random.default_rng(0)), out, resume=False):
+
+def begun(out: Path) -> None:
+    with recorder_of(setup(out), RIG, planned(PAD, RIG, np.random.default_rng(0)), out, False, DEVICES):
         pass
 
 
@@ -31,17 +40,73 @@ def test_a_resumed_recording_keeps_its_plan(tmp_path):
     assert plan_of(setup(tmp_path / "run"), other, resume=True).document() == first.document()
 
 
-@pytest.mark.parametrize(("key", "value"), [("channels", 6), ("rate_hz", 5.0), ("contact_mm", 12.0)])
+def test_it_is_told_where_other_presses_are_asked_for_than_the_plan_has(tmp_path):
+    begun(tmp_path / "run")
+    other = replace(setup(tmp_path / "run"), rig=RIG.model_copy(update={"seed": 9, "presses": 30}))
+    assert kept_plan(other).endswith("the plan it was begun with, [rig] presses = 5, seed = 0")
+    assert kept_plan(setup(tmp_path / "run")) == kept_plan(replace(other, out=tmp_path / "new")) == ""
+
+
+CHANGES = {
+    **{
+        "channels": [0, 1, 3, 2],
+        "rate_hz": 5.0,
+        "contact_mm": 12.0,
+        "readings_per_press": 50,
+        "converter_rate_hz": 500.0,
+    },
+    **{"clearance_mm": 12.0, "travel_mm_s": 90.0, "press_mm_s": 30.0, "acceleration_mm_s2": 400.0},
+    **{"depth_mm": 4.0, "depths_mm": [1.0, 2.0], "pad_mm": [1.0, 2.0], "pad_angle_deg": 5.0},
+    **{"tool_rad": [0.1, 3.1, 0.0], "tcp_mm": [0.0, 0.0, 150.0]},
+}
+"""Settings that change what a press is."""
+
+
+@pytest.mark.parametrize(("key", "value"), CHANGES.items())
 def test_other_settings_are_refused(tmp_path, key, value):
     begun(tmp_path / "run")
-    with pytest.raises(InputError, match=rf"\[rig\] {key}: got {value}"):
-        plan_of(setup(tmp_path / "run"), RIG.model_copy(update={key: value}), resume=True)
+    with pytest.raises(InputError, match=re.escape(f"[rig] {key}: got {value}, the recording")):
+        plan_of(setup(tmp_path / "run"), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
+
+
+def test_limits_and_addresses_may_change(tmp_path):
+    begun(tmp_path / "run")
+    other = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1), "host": "arm", "port": "COM3"}
+    plan_of(setup(tmp_path / "run"), RIG.model_copy(update=other), resume=True)
+
+
+def resumed(out: Path, devices: dict[str, Any]) -> None:
+    with recorder_of(setup(out), RIG, plan_of(setup(out), RIG, resume=True), out, True, devices):
+        pass
+
+
+def test_start_json_keeps_what_arm_and_board_said(tmp_path):
+    begun(tmp_path / "run")
+    assert json.loads((tmp_path / "run" / START).read_text())["source"]["devices"] == DEVICES
+    resumed(tmp_path / "run", {"arm": ARM | {"controller": "5.13.0"}, "board": BOARD | {"port": "/dev/ttyACM1"}})
+
+
+@pytest.mark.parametrize(
+    ("device", "key", "value"),
+    [
+        ("arm", "serial", "2019"),
+        ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0]),
+        ("board", "serial", "cd34"),
+        ("board", "firmware", "1.1.0"),
+    ],
+)
+def test_another_arm_tool_or_board_is_refused(tmp_path, device, key, value):
+    begun(tmp_path / "run")
+    with pytest.raises(InputError, match=re.escape(f"{device}: {key} is {value}, the recording in")):
+        resumed(tmp_path / "run", DEVICES | {device: DEVICES[device] | {key: value}})
 
 
 def test_another_pad_is_refused(tmp_path):
     begun(tmp_path / "run")
     with pytest.raises(InputError, match="another pad"):
         plan_of(setup(tmp_path / "run", Morphology.random(2, 3, 1)), RIG, resume=True)
+    with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
+        plan_of(setup(tmp_path / "run", Morphology.straight(3)), RIG.model_copy(update={"channels": ()}), resume=True)
 
 
 @pytest.mark.parametrize("source", ["[]", "5", '{"plan": 5}', "{}"])

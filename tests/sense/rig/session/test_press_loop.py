@@ -1,15 +1,16 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped first."""
 
 import json
+import time
 
 import numpy as np
 import pytest
 
 from sense.recordings.press_journal import read_journal
+from sense.recordings.press_plan import PressPlan
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
 from sense.rig.devices.protocols import RigFault
-from sense.rig.planning.press_plan import PressPlan
 from sense.rig.session.press_loop import Session, require_safe_plan
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
@@ -18,8 +19,7 @@ FOUR = PressPlan(PLAN.places_mm[:4], PLAN.depths_mm[:4])
 
 
 def rig(tmp_path, **settings):
-    time = Time()
-    arm = FakeArm(time)
+    arm = FakeArm(Time())
     options = RIG.model_copy(update=settings)
     return arm, FakeConverter(arm), options
 
@@ -65,6 +65,7 @@ def test_a_dry_run_never_touches_the_pad(tmp_path):
         ({"plan": PressPlan(np.zeros((1, 2)), np.array([6.5]))}, "depth 6.5 mm"),
         ({"contact_mm": None}, "contact_mm"),
         ({"box_mm": None}, "box_mm"),
+        ({"pad_mm": None}, "pad_mm"),
     ],
 )
 def test_nothing_moves_before_all_of_the_plan_is_safe(tmp_path, change, cause):
@@ -74,6 +75,30 @@ def test_nothing_moves_before_all_of_the_plan_is_safe(tmp_path, change, cause):
         run(tmp_path, arm, converter, options, plan)
     assert fault.value.cause == "refused"
     assert arm.moves == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"force_n": None}, 'max_force_n is 60, but this arm tells no force; allowed "unwatched"'),
+        ({"pose": (0.0, -400.0, 100.0, np.pi * np.cos(0.5), np.pi * np.sin(0.5), 0.0)}, "held 123 degrees away"),
+    ],
+)
+def test_an_arm_that_is_not_ready_is_not_moved(tmp_path, change, said):
+    arm, converter, options = rig(tmp_path)
+    for name, value in change.items():
+        setattr(arm, name, value)
+    with pytest.raises(RigFault, match=said) as fault:
+        run(tmp_path, arm, converter, options)
+    assert fault.value.cause == "refused"
+    assert arm.moves == []
+
+
+def test_an_arm_without_a_force_moves_once_it_is_said_that_nobody_watches(tmp_path):
+    arm, converter, options = rig(tmp_path, max_force_n=None)
+    arm.force_n = None
+    run(tmp_path, arm, converter, options, FOUR)
+    assert len(arm.moves) == 3 * len(FOUR)
 
 
 def test_a_pose_above_the_pad_is_as_safe_as_the_press_below_it():
@@ -137,9 +162,18 @@ def test_a_fault_of_the_board_stops_and_lifts_the_arm(tmp_path, what, cause):
 def test_too_much_force_stops_the_arm(tmp_path):
     arm, converter, options = rig(tmp_path)
     arm.hook = lambda arm: setattr(arm, "force_n", 80.0 if arm.pose[2] < 48 else 0.0)
-    with pytest.raises(RigFault, match=r"force is 80\.0 N"):
+    with pytest.raises(RigFault, match=r"force is 80\.0 N; allowed 60 N; the tool was lifted off"):
         run(tmp_path, arm, converter, options)
     assert arm.stops >= 1
+    assert arm.pose[2] == 60
+
+
+def test_a_force_that_stays_is_told_as_well(tmp_path):
+    arm, converter, options = rig(tmp_path)
+    arm.hook = lambda arm: setattr(arm, "force_n", 80.0 if arm.pose[2] < 48 or arm.force_n else 0.0)
+    with pytest.raises(RigFault, match=r"80\.0 N; allowed 60 N; and it cannot be lifted off: the force does not fall"):
+        run(tmp_path, arm, converter, options)
+    assert arm.pose[2] < 52
 
 
 def test_lost_samples_leave_a_gap_and_shift_nothing(tmp_path):
@@ -177,6 +211,26 @@ def test_a_full_disk_is_told_and_loses_nothing(tmp_path, monkeypatch):
     assert len(read_journal(tmp_path / "run" / "journal.ndjson")) >= 2
 
 
+def test_a_press_is_told_to_be_done_once_it_is_on_the_disk(tmp_path):
+    """However long that takes; and no press begins before."""
+    arm, converter, options = rig(tmp_path)
+    told = []
+
+    def report(done, of):
+        told.append((done, len(read_journal(tmp_path / "run" / "journal.ndjson"))))
+
+    with recorder(tmp_path) as keep:
+        sync = keep.sync
+
+        def slow():
+            time.sleep(0.02)
+            sync()
+
+        keep.sync = slow
+        Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep).run(FOUR, report)
+    assert told == [(done, done) for done in range(1, 5)]
+
+
 def test_times_of_a_resumed_recording_go_on(tmp_path):
     arm, converter, options = rig(tmp_path)
     arm.hook = broken_at(1.5, "lost")
@@ -188,9 +242,35 @@ def test_times_of_a_resumed_recording_go_on(tmp_path):
     assert np.diff(times).max() == pytest.approx(1, abs=0.2)
 
 
+def test_what_came_before_a_recording_goes_on_is_none_of_it(tmp_path):
+    """To connect an arm may take longer than the second between the last reading and the next."""
+    for presses in (1, 2):
+        arm, converter, options = rig(tmp_path)
+        arm.time.sleep(3.0)
+        run(tmp_path, arm, converter, options, PressPlan(PLAN.places_mm[:presses], PLAN.depths_mm[:presses]))
+    recording = Recording.open(tmp_path / "run")
+    assert recording.times_s[0] < 0.05
+    assert np.sort(np.diff(recording.times_s))[-2:] == pytest.approx([0.01, 1.01], abs=0.02)
+
+
 def test_a_reading_of_the_very_moment_came_before_the_command(tmp_path):
     arm, converter, options = rig(tmp_path)
     with recorder(tmp_path) as keep:
         session = Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep)
         session._recent.extend([0.25, 0.5, 0.75])
         assert [session._after(moment_s) for moment_s in (0.0, 0.25, 0.5, 0.74, 0.75)] == [3, 2, 1, 1, None]
+
+
+def test_depth_and_force_of_a_held_press_are_kept(tmp_path):
+    arm, converter, options = rig(tmp_path)
+    arm.hook = lambda arm: setattr(arm, "force_n", -7.5 if arm.pose[2] <= 46.001 else 0.0)
+    plan = PressPlan(PLAN.places_mm[:2], np.array([4.0, 5.0]))
+    run(tmp_path, arm, converter, options, plan)
+    recording = Recording.open(tmp_path / "run")
+    assert recording.depths_mm.tolist() == [4.0, 5.0]
+    assert recording.reached_mm == pytest.approx([4.0, 5.0], abs=0.1)
+    assert recording.forces_n == pytest.approx(7.5)
+    blind, converter, options = rig(tmp_path, max_force_n=None)
+    blind.force_n = None
+    run(tmp_path / "without", blind, converter, options, plan)
+    assert np.isnan(Recording.open(tmp_path / "without" / "run").forces_n).all()

@@ -2,6 +2,7 @@
 
 import importlib.util
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from sense.recordings.recorder import STATE_COLUMNS
 from sense.rig.arms.ur5 import driver as ur5
 from sense.rig.arms.ur5.driver import UR5
 from sense.rig.devices.protocols import RigFault
+from sense.rig.diagnostics import examine_arm
 from sense.rig.emulators.ur.emulator import HOME, UrEmulator
 from sense.rig.safety import wait_until_still
+from sense.settings import RigSettings
 from tests.sense.rig.arms.ur5.arms import (
     LIMITS,
     LONGEST_CALL_S,
@@ -115,6 +118,31 @@ def test_arms_that_cannot_be_had(robots: Robots, host: str, monkeypatch: pytest.
     robot.slow(0)
     arm.connect()
     arm.close()
+
+
+def test_the_tip_is_told_as_it_is_installed(robots: Robots, host: str) -> None:
+    robots.get("cb3", tcp_mm=(0.0, 1.5, 150.0))
+    assert robots.connected(host).connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
+    robots.free()
+
+
+def test_an_arm_at_work_is_taken_over_by_nobody(
+    robot: UrEmulator, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither on this computer nor from another one, nor by `doctor`; the move that is under way goes on."""
+    go(arm, HOME)
+    arm.move(LOW, 50, 500)
+    second = UR5(address)
+    (found,) = examine_arm(second, RigSettings(), time.monotonic, time.sleep)
+    assert found.status == "fail"
+    assert "another program on this computer uses the arm" in found.found
+    assert arm.state().moving
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where the child locks: as if it ran on another computer
+    with pytest.raises(RigFault, match="a program runs on the arm"):
+        second.connect()
+    assert arm.state().moving
+    assert wait_until_still(arm, LIMITS).pose == pytest.approx(LOW, abs=0.1)
+    go(arm, HOME)
 
 
 def test_without_ur_rtde(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
