@@ -13,9 +13,11 @@ from .localizer.evaluation import evaluate as evaluate
 from .localizer.localizer import Found as Found
 from .localizer.localizer import Localizer as Localizer
 from .localizer.locating import locate as locate
-from .recordings.import_export import export_csv as export_csv
-from .recordings.import_export import import_csv as import_csv
-from .recordings.import_export import import_mat as import_mat
+from .recordings.formats.csv_recording import export_csv as export_csv
+from .recordings.formats.csv_recording import import_csv as import_csv
+from .recordings.formats.hdf5 import export_hdf5 as export_hdf5
+from .recordings.formats.hdf5 import import_hdf5 as import_hdf5
+from .recordings.formats.published_mat import import_mat as import_mat
 from .recordings.import_export import open_recording as open_recording
 from .recordings.processing.filters import running_median as running_median
 from .recordings.processing.filters import stretches as stretches

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
 from pydantic_core import PydanticCustomError
 
+from design.common.errors import InputError
 from design.common.settings import Settings
 
 Features = Literal["full", "causal", "early", "published"]
@@ -19,6 +20,10 @@ def _unknown(value: object) -> object:
     return None if value == "unknown" else value
 
 
+def _unwatched(value: object) -> object:
+    return None if value == "unwatched" else value
+
+
 def _tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
@@ -30,19 +35,25 @@ def _plan(value: str) -> str:
 
 
 Unknown = PlainSerializer(lambda value: "unknown" if value is None else value)
+Unwatched = PlainSerializer(lambda value: "unwatched" if value is None else value)
 Millimetres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Depth = Annotated[float, Field(gt=0, le=50)]
+Force = Annotated[float, Field(gt=0, le=250)]
+Input = Annotated[int, Field(ge=0, le=511)]
 
 
 class RigSettings(Settings):
     """`[rig]`: how presses are recorded, where a real arm may go, and how the simulated pad answers.
 
     Attributes:
+        channels: inputs as they are printed on the board, from A0 or C0 on, in the order of the fibres of the pad.
         depths_mm: depths that presses take in turn; `depth_mm` for all where empty.
         box_mm: x, y and z from and to, in the arm's base frame, which the tool never leaves; no arm moves without.
         contact_mm: height of the pad's surface in the base frame; no arm moves while it is unknown.
-        pad_mm, pad_angle_deg: where the pad's centre lies in the base frame, and how far its x axis is turned.
+        pad_mm, pad_angle_deg: where the pad's centre lies in the base frame, and how far its x axis is turned; no arm
+            moves while the place is unknown.
+        tcp_mm: the tip as seen from the flange; an arm whose controller keeps it does not move unless they agree.
         tool_rad: rotation vector of the tool while it points down.
     """
 
@@ -69,10 +80,19 @@ class RigSettings(Settings):
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
     board: str = Field(default="due", min_length=1, max_length=100, description="what reads the fibres, by its name")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
+    baud: int = Field(default=921_600, ge=9600, le=20_000_000, description="of a line board; USB boards take any")
+    printer_port: Annotated[
+        Annotated[str, Field(min_length=1, max_length=4096)] | None, BeforeValidator(_unknown), Unknown
+    ] = Field(default=None, description='serial port of the 3D printer, or "unknown"')
+    printer_baud: int = Field(
+        default=115_200, ge=9600, le=2_000_000, description="speed of the 3D printer's port, baud"
+    )
     converter_rate_hz: float = Field(
         default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz"
     )
-    channels: int = Field(default=8, ge=1, le=8, description="channels of the board with a fibre, from the first on")
+    channels: Annotated[tuple[Input, ...], BeforeValidator(_tuple)] = Field(
+        default=(), max_length=512, description="input of the board that each fibre is on, from 0; [] in order"
+    )
     box_mm: Annotated[
         tuple[Millimetres, Millimetres, Millimetres, Millimetres, Millimetres, Millimetres] | None,
         BeforeValidator(lambda value: _tuple(_unknown(value))),
@@ -81,24 +101,47 @@ class RigSettings(Settings):
     contact_mm: Annotated[Millimetres | None, BeforeValidator(_unknown), Unknown] = Field(
         default=None, description='height of the pad\'s surface in the base frame, or "unknown"'
     )
-    pad_mm: Annotated[tuple[Millimetres, Millimetres], BeforeValidator(_tuple)] = Field(
-        default=(0.0, -400.0), description="the pad's centre in the base frame, mm"
-    )
+    pad_mm: Annotated[
+        tuple[Millimetres, Millimetres] | None, BeforeValidator(lambda value: _tuple(_unknown(value))), Unknown
+    ] = Field(default=None, description='the pad\'s centre [x, y] in the base frame, mm, or "unknown"')
     pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="from the base's x axis to the pad's")
     tool_rad: Annotated[tuple[Angle, Angle, Angle], BeforeValidator(_tuple)] = Field(
         default=(0.0, 3.141592653589793, 0.0), description="rotation vector of the tool, pointing down, radians"
     )
+    tcp_mm: Annotated[
+        tuple[Millimetres, Millimetres, Millimetres] | None,
+        BeforeValidator(lambda value: _tuple(_unknown(value))),
+        Unknown,
+    ] = Field(default=None, description='the tip [x, y, z] from the flange, as set on the controller, or "unknown"')
     max_depth_mm: float = Field(default=6.0, gt=0, le=50, description="no press is deeper, mm")
     clearance_mm: float = Field(default=10.0, ge=1, le=500, description="height above the surface between presses, mm")
     travel_mm_s: float = Field(default=100.0, gt=0, le=500, description="speed between presses, mm/s")
     press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
     acceleration_mm_s2: float = Field(default=500.0, gt=0, le=3000, description="acceleration, mm/s^2")
-    max_force_n: float = Field(default=60.0, gt=0, le=250, description="force at which the arm is stopped, N")
+    max_force_n: Annotated[Force | None, BeforeValidator(_unwatched), Unwatched] = Field(
+        default=60.0, description='force at which the arm is stopped, N; "unwatched" for an arm that tells none (CB3)'
+    )
 
     @property
     def plan_file(self) -> Path | None:
         """The file of places that `plan` names, None where it is a kind of plan."""
         return None if self.plan in PLANS else Path(self.plan)
+
+    def inputs(self, fibres: int) -> tuple[int, ...]:
+        """(fibres,) input of the board that each fibre of a pad is on.
+
+        Raises:
+            InputError: `channels` names more or fewer inputs than the pad has fibres, or one twice.
+        """
+        named = self.channels or tuple(range(fibres))
+        if len(named) != fibres:
+            raise InputError(
+                f"[rig] channels: got {len(named)} inputs, the pad has {fibres} fibres: name one for each, "
+                "or none where they are in order"
+            )
+        if twice := [number for number in named if named.count(number) > 1]:
+            raise InputError(f"[rig] channels: got input {twice[0]} for more than one fibre, expected one for each")
+        return named
 
 
 class LocalizerSettings(Settings):

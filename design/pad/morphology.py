@@ -130,7 +130,7 @@ class Morphology:
         """
         path = as_path("path", path)
         if path.suffix.lower() == ".mat":
-            from .published_files import PITCH_MM, read_knots
+            from .published_files.published_pads import PITCH_MM, read_knots
 
             try:
                 return cls(read_knots(path), PITCH_MM)

@@ -11,6 +11,7 @@ import click
 
 from design.common.command_line import json_option, load_spec, spec_option
 
+from .options import drawn_anew
 from .rig import rig_option
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 PORT = 8321
 BAR = 12
 """Characters of a fibre's bar on a terminal, to either side."""
-SHOWN_HZ = 15
-"""How often a terminal is drawn anew."""
 
 
 @click.command()
@@ -108,7 +107,7 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
     from sense.settings import RigSettings
 
     options = load_spec(spec).section(RigSettings)
-    return device("padforge.boards", options.board)(options, range(localizer.fibres))
+    return device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
 
 
 def _health(model: Path) -> "HealthModel | None":
@@ -123,9 +122,11 @@ def _health(model: Path) -> "HealthModel | None":
 
 
 def _json(view: dict[str, Any], events: "Sequence[Event]") -> None:
+    from sense.live.pipeline import Estimate
+
     for event in events:
         kind = {"event": type(event).__name__.lower()}
-        click.echo(json.dumps(kind | asdict(event)))
+        click.echo(json.dumps(kind | (event.document if isinstance(event, Estimate) else asdict(event))))
 
 
 def _plain(view: dict[str, Any], events: "Sequence[Event]") -> None:
@@ -136,16 +137,8 @@ def _plain(view: dict[str, Any], events: "Sequence[Event]") -> None:
 @contextmanager
 def _terminal() -> "Iterator[Show]":
     """What shows on stdout: all there is, drawn anew and again; or a line an event, where it is no terminal."""
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
-    console = Console()
-    if not console.is_terminal:
-        yield _plain
-        return
-    with Live(console=console, refresh_per_second=SHOWN_HZ) as drawn:
-        yield lambda view, events: drawn.update(Text("\n".join(view_lines(view))))
+    with drawn_anew() as draw:
+        yield _plain if draw is None else lambda view, events: draw(view_lines(view))
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:

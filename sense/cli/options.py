@@ -1,5 +1,7 @@
-"""Options and arguments that commands of sense share, how far their work is, and a recording in one line."""
+"""What commands of sense share: options and arguments, what a terminal shows and is typed, a recording in one line."""
 
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
     from sense.recordings.recording import Recording
 
 METHODS, FEATURES = ("masked", "published"), ("full", "causal", "early", "published")
+SHOWN_HZ = 15
+"""How often a terminal is drawn anew."""
 FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -47,13 +51,21 @@ def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:
 
 
 def read_recording(path: Path) -> "Recording":
-    """The recording in a folder or file, with a line on stderr where its end is torn off."""
+    """The recording in a folder or file, with a line on stderr where its end is torn off or cut off."""
     from sense.recordings.import_export import open_recording
 
     recording = open_recording(path)
     if recording.torn_presses:
         click.echo(f"{path}: the end is torn off, its last {recording.torn_presses} presses are left out", err=True)
+    if path.is_file():
+        say_note(recording, path)
     return recording
+
+
+def say_note(recording: "Recording", file: Path) -> None:
+    """Say on stderr what of a file did not become part of its recording."""
+    if note := recording.source.get("note"):
+        click.echo(f"{file}: {note}", err=True)
 
 
 def recording_line(recording: "Recording", out: Path) -> str:
@@ -65,8 +77,13 @@ def recording_line(recording: "Recording", out: Path) -> str:
     return (
         f"{len(recording.presses_mm)} presses{f' ({unknown} of unknown place)' * (unknown > 0)}, "
         f"{len(recording.readings)} readings of {recording.fibres} fibres"
-        f"{f', {missing} values missing,' * (missing > 0)} at {recording.rate_hz:.1f} Hz -> {out}"
+        f"{f', {missing} values missing,' * (missing > 0)} at {_rate(recording.rate_hz)} Hz -> {out}"
     )
+
+
+def _rate(hz: float) -> str:
+    """A rate as people say it; one that a wrong unit of time made small is seen to be."""
+    return f"{hz:.1f}" if hz >= 1 else f"{hz:.2g}"
 
 
 @contextmanager
@@ -79,3 +96,42 @@ def reported(name: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total or None, note=f"{done} of {total}" if total else "")
 
         yield report
+
+
+@contextmanager
+def drawn_anew() -> Iterator[Callable[[Sequence[str]], None] | None]:
+    """Yield what shows lines on stdout in place of those before; None where that is no terminal."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    console = Console()
+    if not console.is_terminal:
+        yield None
+        return
+    with Live(console=console, refresh_per_second=SHOWN_HZ) as drawn:
+        yield lambda lines: drawn.update(Text("\n".join(lines)))
+
+
+@contextmanager
+def typed_keys() -> Iterator[Callable[[], str]]:
+    """Yield what gives the keys typed since it was called last, unseen; none where stdin is no POSIX terminal."""
+    if os.name != "posix" or not sys.stdin.isatty():
+        yield lambda: ""
+        return
+    import select
+    import termios
+    import tty
+
+    stdin = sys.stdin.fileno()
+
+    def typed() -> str:
+        waiting = bool(select.select([stdin], [], [], 0)[0])
+        return os.read(stdin, 64).decode(errors="ignore") if waiting else ""
+
+    before = termios.tcgetattr(stdin)
+    tty.setcbreak(stdin)
+    try:
+        yield typed
+    finally:
+        termios.tcsetattr(stdin, termios.TCSADRAIN, before)

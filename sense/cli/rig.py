@@ -1,31 +1,43 @@
 """`padforge sense record` and `doctor`: the edge where rigs come in."""
 
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from design.common import command_line as common
 from design.common.errors import InputError
 
-from .options import FILE, FOLDER, recording_line, reported
+from .options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
 
 if TYPE_CHECKING:
     from design.pad.morphology import Morphology
+    from design.pad.twin import Twin
     from design.settings import PadSettings
+    from sense.recordings.recording import Recording
+    from sense.rig.planning.setup import Setup
 
 rig_option = click.option(
-    "--rig", metavar="NAME", default="simulated", show_default=True, help="simulated, ur5, or an arm that is installed."
+    "--rig",
+    metavar="NAME",
+    default="simulated",
+    show_default=True,
+    help="simulated, ur5, printer, hand, or an arm that is installed.",
 )
+_warn = partial(click.echo, err=True)
 drivers_option = click.option(
-    "--through-drivers", is_flag=True, help="The simulated rig in real time, through the drivers of the real one."
+    "--through-drivers", is_flag=True, help="Emulated devices in real time, behind the drivers of the real ones."
 )
 
 
 @click.command()
 @rig_option
 @click.option(
-    "--morphology", type=FILE, help="morphology.json or published .mat (default: the twin's, or straight fibres)."
+    "--morphology",
+    type=FILE,
+    help="morphology.json or published .mat (default: the twin's, or straight fibres; of a real rig, beside --out).",
 )
 @click.option("--twin", type=FILE, help="twin.json of a measured pad, which the simulated pad answers like.")
 @click.option("--presses", type=int, help="Presses to record.")
@@ -59,8 +71,9 @@ def record(
 
     \b
     --rig simulated                     a simulated pad, at once
-    --rig simulated --through-drivers   the same in real time, through emulated devices
-    --rig ur5                           a UR robot and the board, as [rig] says
+    --through-drivers                   any of them in real time, through emulated devices
+    --rig ur5, --rig printer            a UR robot or a 3D printer, and the board, as [rig] says
+    --rig hand                          you and the board: a page and the terminal show where to press
 
     --twin twin.json, that identify wrote, makes the simulated pad the one that was measured: laid, wired, turned and
     noisy as that was. With --morphology as well it is that pad as planned, with the reach, gain and noise of the twin.
@@ -68,23 +81,23 @@ def record(
     A recording that broke off keeps every finished press; --resume makes the others.
     Software is not the emergency stop: keep the robot's own one within reach.
     """
-    from design.pad.twin import Twin
     from design.settings import Contact, PadSettings
-    from sense.recordings.recorder import START
     from sense.rig import operation
     from sense.rig.planning.setup import Setup
     from sense.settings import RigSettings
 
-    settings, target = common.load_spec(spec), out or common.pad_folder(morphology or twin) / "recording"
-    if twin and (rig != "simulated" or through_drivers):
-        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --through-drivers")
-    like = Twin.load(twin) if twin else None
+    settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
+    target = out or folder / "recording"
+    like = _twin(twin, at_once=rig == "simulated" and not through_drivers)
+    if not (rig == "simulated" or through_drivers or morphology):
+        morphology = _beside(target)
+        folder = common.pad_folder(morphology)
     pad = _pad(morphology, settings.section(PadSettings))
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
     if rig == "simulated" and not through_drivers:
-        if resume or dry_run or plan or model:
-            raise InputError("--resume, --dry-run, --plan and --model need --through-drivers or --rig ur5")
+        if resume or dry_run or model:
+            raise InputError("--resume, --dry-run and --model need --through-drivers or a real rig")
         shown = like if like and not morphology else pad
         recording = operation.record_simulated(settings, shown, target, overrides, inputs, like)
     else:
@@ -92,12 +105,87 @@ def record(
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
         sensed_mm = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm).sensed_mm
-        setup = Setup(pad, settings.section(Contact), options, target, command, inputs, sensed_mm)
-        if resume and not (target / START).exists():
-            click.echo(f"{target}: nothing to resume, a new recording begins", err=True)
-        with reported("presses") as report:
-            recording = operation.record(rig, setup, model, dry=dry_run, resume=resume, report=report)
+        setup = Setup(pad, settings.section(Contact), options, target, command, inputs, sensed_mm, folder)
+        recording = _record_with(rig, setup, model, dry_run, resume, through_drivers)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
+
+
+def _twin(path: Path | None, at_once: bool) -> "Twin | None":
+    from design.pad.twin import Twin
+
+    if path and not at_once:
+        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --through-drivers")
+    return Twin.load(path) if path else None
+
+
+def _beside(recording: Path) -> Path:
+    """The morphology.json in the folder that a recording goes to: a real pad is known, never guessed."""
+    path = recording.parent / "morphology.json"
+    if not path.is_file():
+        raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {path}")
+    return path
+
+
+def _record_with(
+    rig: str, setup: "Setup", model: Path | None, dry_run: bool, resume: bool, through_drivers: bool
+) -> "Recording | None":
+    """Record with an arm, or by hand."""
+    from sense.recordings.recorder import START
+    from sense.rig import operation
+
+    if resume and not (setup.out / START).exists():
+        _warn(f"{setup.out}: nothing to resume, a new recording begins")
+    if rig == "hand":
+        if dry_run or model:
+            raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
+        return _record_by_hand(setup, resume, through_drivers)
+    with reported("presses") as report:
+        how = {"dry": dry_run, "resume": resume, "through_drivers": through_drivers, "report": report, "say": _warn}
+        return operation.record(rig, setup, model, **how)
+
+
+def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording":
+    """Show a person where to press, on a page and in the terminal, and take what is said on both."""
+    from sense.live.by_hand.session import WORDS, record_by_hand
+    from sense.live.by_hand.view import pad_view, view_lines
+    from sense.live.page_server import LivePage
+    from sense.rig.emulators.finger import pressed_by_finger
+    from sense.rig.operation import opened_board
+
+    words = {each["key"]: each["word"] for each in WORDS}
+    with ExitStack() as stack:
+        if emulated:
+            converter, finger = stack.enter_context(pressed_by_finger(setup.pad, setup.contact, setup.rig))
+            look, answer = finger.look, finger.said
+        else:
+            converter = stack.enter_context(opened_board(setup, setup.rig.inputs(len(setup.pad.knots))))
+            look, answer = (lambda view: None), list
+        page = stack.enter_context(LivePage(0, "hand.html", words.values()))
+        _warn(f"page: {page.url} (q ends)")
+        draw, typed = stack.enter_context(drawn_anew()), stack.enter_context(typed_keys())
+        latest = pad = pad_view(setup.pad, str(setup.out))
+
+        @stack.push
+        def tell_the_end(kind: object, error: BaseException | None, trace: object) -> None:
+            if latest is not pad:
+                page.show(latest | {"ended": str(error or "") or "ended"})
+
+        def show(view: dict[str, Any]) -> None:
+            nonlocal latest
+            if draw is None and view["told"] != latest.get("told", ""):
+                click.echo(view["told"])
+            if draw is not None and view["phase"] == "lift" != latest.get("phase"):
+                click.echo("\a", nl=False)  # eyes are on the pad
+            latest = pad | view
+            page.show(latest)
+            look(latest)
+            if draw is not None:
+                draw(view_lines(latest))
+
+        def said() -> list[str]:
+            return [*page.said(), *(words[key] for key in typed() if key in words), *answer()]
+
+        return record_by_hand(setup, converter, show, said, resume)
 
 
 def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
@@ -108,17 +196,21 @@ def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
 
 @click.command()
 @rig_option
+@click.option("--morphology", type=FILE, help="Pad whose fibres are looked at (default: all inputs that are named).")
 @drivers_option
 @common.spec_option
 @common.json_option
 @click.pass_context
-def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | None, as_json: bool) -> None:
+def doctor(
+    ctx: click.Context, rig: str, morphology: Path | None, through_drivers: bool, spec: Path | None, as_json: bool
+) -> None:
     """Look the rig over before a long run; nothing moves. Exit 1 where something fails.
 
     \b
     padforge sense doctor --rig ur5
 
-    Ports, versions, rates, latency, and every channel's rest and noise; channels count from 1, as fibres do.
+    Ports, versions, rates, latency, and every channel's rest and noise; channels count from 1, as fibres do, inputs as
+    they are printed on the board. Without --morphology the inputs that [rig] channels names, or all, are looked at.
     """
     from dataclasses import asdict
 
@@ -128,8 +220,13 @@ def doctor(ctx: click.Context, rig: str, through_drivers: bool, spec: Path | Non
     from sense.settings import RigSettings
 
     settings = common.load_spec(spec)
-    pad, options = _pad(None, settings.section(PadSettings)), settings.section(RigSettings)
-    found = look_over(rig, Setup(pad, settings.section(Contact), options, Path(), "padforge sense doctor"))
+    pad, options = _pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
+    known = morphology is not None or rig == "simulated" or through_drivers
+    inputs = options.inputs(len(pad.knots)) if known else options.channels
+    setup = Setup(
+        pad, settings.section(Contact), options, Path(), "padforge sense doctor", folder=common.pad_folder(morphology)
+    )
+    found = look_over(rig, setup, inputs, through_drivers)
     passed = all(diagnosis.status != "fail" for diagnosis in found)
     lines = [f"{d.status:<4} {d.name}: {d.found}" for d in found]
     common.show_result({"passed": passed, "found": [asdict(d) for d in found]}, lines, as_json)

@@ -1,7 +1,9 @@
 """A simulated recording and a quickly trained localizer, shared by the tests of sense."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from design import Morphology
@@ -34,6 +36,26 @@ def calibrated(recording: Recording) -> tuple[Localizer, dict]:
 @pytest.fixture(scope="session")
 def localizer(calibrated: tuple[Localizer, dict]) -> Localizer:
     return calibrated[0]
+
+
+@pytest.fixture(scope="session")
+def deep_recording() -> Recording:
+    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it."""
+    depths = tuple(np.random.default_rng(4).uniform(0.5, 5, 400).tolist())
+    rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths)
+    recording = simulate(Morphology.random(2, knots=3, seed=5), rig)
+    return replace(recording, forces_n=3.0 * recording.depths_mm)
+
+
+@pytest.fixture(scope="session")
+def deeply_calibrated(deep_recording: Recording) -> tuple[Localizer, dict]:
+    return calibrate(deep_recording, QUICK.model_copy(update={"members": 1, "epochs": 40}))
+
+
+@pytest.fixture(scope="session")
+def deep_localizer(deeply_calibrated: tuple[Localizer, dict]) -> Localizer:
+    """It has learnt depth and force."""
+    return deeply_calibrated[0]
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import pytest
 
+from design.common.errors import InputError
 from sense.settings import LocalizerSettings, RigSettings
 from tests.helpers.limits import require_ends
 
@@ -20,7 +21,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "creep": 0.1,
         "hysteresis": 0.2,
         "converter_rate_hz": 1000.0,
-        "channels": 8,
+        "channels": (),
         "box_mm": "unknown",
         "contact_mm": "unknown",
         "pad_angle_deg": 0.0,
@@ -30,6 +31,8 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "press_mm_s": 40.0,
         "acceleration_mm_s2": 500.0,
         "max_force_n": 60.0,
+        "pad_mm": "unknown",
+        "tcp_mm": "unknown",
     }
     assert {key: rig[key] for key in expected} == expected
     assert LocalizerSettings().model_dump() == {
@@ -56,7 +59,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         (RigSettings, "press_mm_s", (0.1, 250.0), (0.0, 250.1)),
         (RigSettings, "travel_mm_s", (0.1, 500.0), (0.0, 500.1)),
         (RigSettings, "clearance_mm", (1.0, 500.0), (0.9, 500.1)),
-        (RigSettings, "channels", (1, 8), (0, 9)),
+        (RigSettings, "baud", (9600, 20_000_000), (9599, 20_000_001)),
         (LocalizerSettings, "test_share", (0.01, 0.99), (0.0, 1.0)),
         (LocalizerSettings, "lost", (0, 8), (-1, 9)),
         (LocalizerSettings, "rate", (1e-6, 1.0), (0.0, 1.1)),
@@ -64,3 +67,34 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
 )
 def test_values_at_the_ends_of_what_is_allowed(model: type, key: str, kept: tuple, refused: tuple) -> None:
     require_ends(model, key, kept, refused)
+
+
+def test_a_force_that_nobody_watches_is_said_in_words() -> None:
+    assert RigSettings.model_validate({"max_force_n": "unwatched"}).max_force_n is None
+    assert RigSettings(max_force_n=None).model_dump()["max_force_n"] == "unwatched"
+    with pytest.raises(ValueError, match="max_force_n"):
+        RigSettings.model_validate({"max_force_n": "unknown"})
+
+
+def test_inputs_are_in_order_or_as_they_are_named() -> None:
+    assert RigSettings().inputs(16) == tuple(range(16))
+    assert RigSettings(channels=(3, 0, 11, 2)).inputs(4) == (3, 0, 11, 2)
+
+
+@pytest.mark.parametrize(
+    ("channels", "said"),
+    [
+        ((3, 0, 2), r"^\[rig\] channels: got 3 inputs, the pad has 4 fibres: name one for each"),
+        ((3, 0, 2, 1, 4), r"^\[rig\] channels: got 5 inputs, the pad has 4 fibres"),
+        ((3, 0, 2, 3), r"^\[rig\] channels: got input 3 for more than one fibre"),
+    ],
+)
+def test_inputs_that_do_not_fit_the_pad_are_one_line(channels: tuple[int, ...], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        RigSettings(channels=channels).inputs(4)
+
+
+@pytest.mark.parametrize("channels", [8, [-1], [512], ["A0"]])
+def test_channels_are_numbers_of_inputs(channels: object) -> None:
+    with pytest.raises(InputError, match=r"^\[rig\] channels"):
+        RigSettings(channels=channels)  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 import scipy.io
 
@@ -30,7 +31,12 @@ def folder(tmp_path_factory) -> Path:
     scipy.io.savemat(folder / "pad.mat", published(4))
     scipy.io.savemat(folder / "packed.mat", published(4), do_compression=True)
     with h5py.File(folder / "new.mat", "w", userblock_size=512) as file:
-        file["para"] = published(4)["para"]
+        for name, values in published(4).items():
+            if isinstance(values, dict):
+                for field, value in values.items():
+                    file[f"{name}/{field}"] = np.full((1, 1), value)
+            else:
+                file[name] = values.T
     with (folder / "new.mat").open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + b"\x00\x02IM")
     terms = {"ambiguity_lost_0": 0.1, "information": 3.0}

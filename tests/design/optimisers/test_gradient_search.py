@@ -6,6 +6,7 @@ import pytest
 from design import Contact, Morphology
 from design.criteria.rules import check_rules
 from design.criteria.score import score
+from design.evaluation import expected_error
 from design.optimisers import gradient_search
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import search
@@ -54,14 +55,14 @@ def test_steps_look_at_what_is_pressed_in_parts_of_it_that_are_not_too_large():
     rng = np.random.default_rng(0)
     for rectangle in (((1.0, 1.0), (4.0, 4.0)), ((0.5, 1.5), (4.5, 3.5)), ((0.5, 0.5), (12.5, 3.5))):
         low, high = np.array(rectangle)
-        size = np.minimum(high - low, gradient_search.WINDOW)
+        size = np.minimum(high - low, expected_error.WINDOW)
         corners = []
         for _ in range(30):
             places = gradient_search.stratified(rectangle, rng)
             assert (places >= low).all()
             assert (places <= high).all()
             corners.append(places.min(axis=0))
-            cells = np.floor((places - corners[-1]) / size * gradient_search.SIDE + 0.5)
+            cells = np.floor((places - corners[-1]) / size * expected_error.SIDE + 0.5)
             assert len(np.unique(cells, axis=0)) > 0.4 * len(places)
             assert (np.ptp(places, axis=0) > 0.9 * size).all()
             assert (np.ptp(places, axis=0) <= size).all()

@@ -4,9 +4,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 import sense.cli.calibration
 import sense.report.calibration_figures
+from sense import Localizer, Recording
+from sense.cli.main import sense as command
 
 
 def test_a_recording_is_learnt_from_and_evaluated(few) -> None:
@@ -71,3 +74,19 @@ def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkey
     assert few("calibrate", "rec", "--seed", "5", "--out", "model")[0] == 0
     assert {path.name for path in Path("model").iterdir()} == set(before)
     assert Path("model/localizer.json").read_bytes() != before["localizer.json"]
+
+
+def test_errors_of_depth_and_force_are_listed_where_they_were_learnt(
+    deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path
+) -> None:
+    deep_localizer.save(tmp_path)
+    deep_recording.save(tmp_path / "recording", {})
+    arguments = ["evaluate", "--model", str(tmp_path), str(tmp_path / "recording"), "--lost", "1"]
+    lines = CliRunner().invoke(command, arguments).output.splitlines()
+    depth, force = lines.index("error of depth in mm"), lines.index("error of force in N")
+    rows = json.loads(CliRunner().invoke(command, [*arguments, "--json"]).output)["errors"]
+    assert [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]] == [
+        round(row["depth_mean_mm"], 2) for row in rows
+    ]
+    assert force == depth + 4
+    assert len(lines) == force + 4

@@ -8,7 +8,7 @@ import pytest
 import padforge
 import sense.live.sources
 from design import Morphology
-from sense import Recording
+from sense import Localizer, Recording
 from sense.cli.live import view_lines
 from sense.live.page_server import LivePage
 from sense.recordings.simulation.published_protocol import simulate
@@ -41,6 +41,7 @@ def test_a_recording_is_shown(live, brief: Recording, tmp_path: Path) -> None:
     assert "http://127.0.0.1:" in err
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
+    assert not [key for key in told[0] if key.startswith(("depth", "force"))]
     assert [each["press"] for each in told] == list(range(len(told)))
     assert 38 <= len(told) <= 40
     code, plain, _ = live(*replay)
@@ -56,6 +57,8 @@ def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, mon
     monkeypatch.setattr(sense.rig.boards.due.serial_link, "find_ports", list)
     other = simulate(Morphology.straight(3), RigSettings(presses=3))
     other.save(tmp_path / "other", {})
+    wired = tmp_path / "wired.toml"
+    wired.write_text("[rig]\nchannels = [3, 0]\n")
     with LivePage(0) as page:
         port = page.url.rstrip("/").rsplit(":", 1)[1]
         for arguments, message in (
@@ -64,6 +67,7 @@ def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, mon
             (("--replay", str(tmp_path / "absent")), "no recording"),
             (("--replay", str(tmp_path / "other")), "readings are of 6 fibres, the localizer was learnt from 4"),
             (("--rig", "ur5"), "no board is found"),
+            (("--rig", "ur5", "--spec", str(wired)), "[rig] channels: got 2 inputs, the pad has 4 fibres"),
             (("--speed", "0"), "--speed"),
         ):
             code, out, err = live(*arguments)
@@ -106,3 +110,27 @@ def test_a_terminal_shows_fibres_by_their_numbers() -> None:
     assert lines[:2] == ["waiting for a press", "no press yet"]
     assert [line.split()[:2] for line in lines[2:4]] == [["fibre", "1"], ["fibre", "2"]]
     assert lines[4] == "fibre 2 was dead"
+
+
+def test_depth_and_force_are_told_where_they_were_learnt(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    deep_localizer: Localizer,
+    deep_recording: Recording,
+    tmp_path: Path,
+) -> None:
+    deep_localizer.save(tmp_path)
+    deep_recording.save(tmp_path / "recording", {})
+    replay = ["--replay", str(tmp_path / "recording"), "--speed", "1e6", "--port", "0", "--model", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["padforge", "sense", "live", *replay, "--json"])
+    with pytest.raises(SystemExit):
+        padforge.main()
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    deep = [each["depth_mm"] for each in told]
+    assert 0 < min(deep) < 2 < 4 < max(deep) < 6
+    assert all(each["force_r90_n"] > 0 and each["depth_r90_mm"] > 0 for each in told)
+    monkeypatch.setattr(sys, "argv", ["padforge", "sense", "live", *replay])
+    with pytest.raises(SystemExit):
+        padforge.main()
+    first = capsys.readouterr().out.splitlines()[0]
+    assert f"{deep[0]:.1f} ± {told[0]['depth_r90_mm']:.1f} mm deep, {told[0]['force_n']:.1f} ± " in first

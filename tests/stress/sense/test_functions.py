@@ -10,7 +10,7 @@ from hypothesis import given
 import sense
 from design import Morphology
 from sense import settings as sense_settings
-from sense.rig.planning.press_plan import PressPlan
+from sense.recordings.press_plan import PressPlan
 from tests.helpers.effort import few
 from tests.stress.sense.cases import (
     EXTREMES,

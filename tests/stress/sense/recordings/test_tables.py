@@ -10,8 +10,8 @@ import scipy.io
 from hypothesis import given
 
 import sense
-from sense.recordings.hdf5 import export_hdf5, import_hdf5
-from sense.rig.planning.press_plan import read_plan
+from sense.recordings.formats.hdf5 import export_hdf5, import_hdf5
+from sense.recordings.press_plan import read_plan
 from tests.helpers.effort import few
 from tests.stress.sense.cases import made, right_or_refused, seeds
 from tests.stress.sense.children import in_child
@@ -46,6 +46,16 @@ def test_csv_of_any_kind(tmp_path_factory: pytest.TempPathFactory, seed: int) ->
 
 @few(150)
 @given(seed=seeds)
+def test_csv_of_other_programs_of_any_kind(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    rng, path = np.random.default_rng(seed), tmp_path_factory.getbasetemp() / "lab.txt"
+    rows = [f"{100 * i},1.{i % 9},2,{i // 9},{i % 5},{int(i % 9 > 4)}" for i in range(40)]
+    path.write_bytes(_table(rng, "\n".join(["# bench", "t_ms,ch1,ch2,px,py,down", *rows])))
+    mapping = ["time=t_ms:ms,fibres=ch*,x=px,y=py,press=down", "time=t_ms:ms,fibres=*,x=p?,y=py:cm"][rng.integers(2)]
+    sound(right_or_refused(lambda: sense.import_csv(path, mapping)))
+
+
+@few(150)
+@given(seed=seeds)
 def test_plans_of_any_kind(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng, path = np.random.default_rng(seed), tmp_path_factory.getbasetemp() / "plan.csv"
     path.write_bytes(_table(rng, "x_mm,y_mm,depth_mm\n1,2,3\n-4,5.5,1e-3\n0,0,5\n"))
@@ -73,9 +83,12 @@ def test_hdf5_with_bytes_changed(tmp_path_factory: pytest.TempPathFactory, seed:
     for path in paths:
         path.write_bytes(flipped(rng, exported(tmp, "whole.h5")))
 
+    named = "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"
+
     def read() -> None:
         for path in paths:
-            sound(right_or_refused(lambda path=path: import_hdf5(path)))
+            for mapping in ("", named):
+                sound(right_or_refused(lambda path=path, mapping=mapping: import_hdf5(path, mapping)))
 
     status, said = in_child(read)
     assert status == 0, said
