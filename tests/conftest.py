@@ -27,6 +27,12 @@ RIG = Path(__file__).parent / "sense" / "rig"
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker more than cores: rigs wait for clocks most of their time."""
+    return 1 + (len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Rigs first: they wait for clocks and need few compiled kernels, which another process compiles meanwhile."""
     items.sort(key=lambda item: RIG not in item.path.parents or item.path.parent.name == "planning")
