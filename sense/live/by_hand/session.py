@@ -14,7 +14,7 @@ from sense.live.sources import connected
 from sense.localizer.features import REST, bridged
 from sense.recordings.processing.limits import Array
 from sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
-from sense.recordings.recorder import Recorder, refuse_existing
+from sense.recordings.recorder import Recorder, refuse_begun
 from sense.recordings.recording import Recording
 from sense.rig.devices.protocols import Converter, RigFault
 from sense.rig.planning.setup import Setup
@@ -253,7 +253,7 @@ def record_by_hand(
         RigFault: the board failed, or the disk.
     """
     if not resume:
-        refuse_existing(setup.out)
+        refuse_begun(setup.out)
     rig = setup.rig
     source = connected(converter, rig.rate_hz)
     recorder, targets, left = opened(setup, source.converter, resume)

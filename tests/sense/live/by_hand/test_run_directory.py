@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from design import Contact, Morphology
 from design.common.errors import InputError
 from sense.live.by_hand.run_directory import opened
+from sense.live.by_hand.session import record_by_hand
+from sense.rig.devices.protocols import RigFault
 from sense.rig.planning.setup import Setup
 from sense.settings import RigSettings
 
@@ -73,3 +76,15 @@ def test_other_settings_are_refused(setup: Setup) -> None:
     other = replace(setup, rig=setup.rig.model_copy(update={"rate_hz": 20.0}))
     with pytest.raises(InputError, match=r"\[rig\] rate_hz: got 20.0, the recording in .* was begun with 13.3"):
         opened(other, BOARD, resume=True)
+
+
+def test_a_recording_killed_while_it_was_being_born_is_not_in_the_way(tmp_path: Path) -> None:
+    board = Mock(connect=Mock(side_effect=RigFault("lost", "the board is gone")))
+    setup = Setup(Morphology.straight(2), Contact(), RigSettings(), tmp_path / "run", "test", [])
+    setup.out.mkdir()
+    (setup.out / "journal.ndjson").touch()
+    with pytest.raises(RigFault, match="the board is gone"):
+        record_by_hand(setup, board, lambda view: None)
+    (setup.out / "notes.txt").touch()
+    with pytest.raises(InputError, match="never written over"):
+        record_by_hand(setup, board, lambda view: None)
