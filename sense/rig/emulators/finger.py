@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from design import Contact, Morphology, signals
 from sense.recordings.processing.limits import Array
 from sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
-from sense.rig.devices.plugins import device
+from sense.rig.boards.due.driver import Arduino
 from sense.rig.devices.protocols import Converter
 from sense.settings import RigSettings
 
@@ -133,9 +133,6 @@ def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> It
     finger = Finger(pad, contact, rig, rig.converter_rate_hz)
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     with EmulatedBoard(finger.volts) as board:
-        emulated = rig.model_copy(update={"board": "due", "port": board.port})
-        converter = device("padforge.boards", "due")(emulated, range(2 * pad.grid))
-        try:
+        emulated = rig.model_copy(update={"port": board.port})
+        with closing(Arduino.of(emulated, range(2 * pad.grid))) as converter:
             yield converter, finger
-        finally:
-            converter.close()
