@@ -32,7 +32,7 @@ from fabricate.mould.assembly import (
 )
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body
-from fabricate.report import laying_guide
+from fabricate.report.laying import guide
 from fabricate.report.pictures import draw_mould, draw_tracks
 from fabricate.report.track_drawings import tracks_dxf, tracks_svg
 
@@ -108,7 +108,7 @@ def build(
     for name, write in writes:
         with profiling.stage(f"write {name}"), atomic(out / name) as temporary:
             write(temporary)
-    write_text(out / "laying.md", laying_guide.laying_page(document))
+    write_text(out / "laying.md", guide.laying_page(document))
     write_json(out / "fabrication.json", document)
     return document
 
@@ -177,7 +177,7 @@ def _document(
     size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
     rim = settings.mould.floor_mm + plan.silicone_mm
     pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
-    bench = laying_guide.document(plan, printed[0].mesh.volume() - pins)
+    bench = guide.document(plan, printed[0].mesh.volume() - pins)
     return {
         "format": FORMAT,
         "files": list(files),

@@ -6,7 +6,7 @@ from typing import Any
 
 from design.common.page.elements import PageSection, figures, folded, heading, html_pieces, paragraph, table
 
-from .laying_guide import laying_page
+from .laying.guide import laying_page
 from .mould_view import packed, script, view
 
 _SHOWN_PLACES = 3

@@ -9,8 +9,7 @@ from typing import Any
 
 from design.pad.courses.curves import lengths
 from fabricate.mould.plan import Plan, overlap
-
-from .fibre_layers import fibre_name, layers
+from fabricate.report.fibre_layers import fibre_name, layers
 
 SILICONE = "EcoFlex 00-20"
 DENSITY_G_PER_ML = 1.07

@@ -10,7 +10,7 @@ from design.pad.morphology import Morphology
 from fabricate.mould.assembly import mould_body, plan_mesh
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
-from fabricate.report import laying_guide
+from fabricate.report.laying import guide
 from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 
@@ -26,7 +26,7 @@ def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
             "mould": plan.settings.mould.model_dump(),
             "printer": plan.settings.printer.model_dump(),
         },
-        **laying_guide.document(plan, volume),
+        **guide.document(plan, volume),
     }
 
 
@@ -47,7 +47,7 @@ def straight_volume_mm3(draft_deg: float) -> float:
 @pytest.mark.parametrize("draft_deg", [0.0, 2.0, 10.0])
 def test_silicone_of_a_straight_pad(draft_deg):
     plan = Plan(Morphology.straight(4), with_settings({"wall_draft_deg": draft_deg, "number_mm": 0.0}))
-    silicone = laying_guide.document(plan, plan_mesh(plan).volume())["silicone"]
+    silicone = guide.document(plan, plan_mesh(plan).volume())["silicone"]
     expected = straight_volume_mm3(draft_deg) / 1000
     assert silicone["volume_ml"] == pytest.approx(expected, abs=1e-3)
     assert silicone["mass_g"] == pytest.approx(expected * 1.07 * 1.1, abs=0.02)
@@ -56,7 +56,7 @@ def test_silicone_of_a_straight_pad(draft_deg):
 
 def test_a_thicker_pad_takes_more_silicone(published):
     plan = Plan(Morphology.load(published / "20para.mat"))
-    silicone = laying_guide.document(plan, plan_mesh(plan).volume())["silicone"]
+    silicone = guide.document(plan, plan_mesh(plan).volume())["silicone"]
     assert silicone["thickness_mm"] == plan.silicone_mm == 7.0
     empty = plan.silicone.area * 7
     tracks = sum(area.area * height for area, height in zip(plan.ridges, plan.heights_mm, strict=True))
@@ -70,7 +70,7 @@ def test_pins_take_no_silicone():
     inner = mesh(mould_body(with_pins)).trim_by_plane((0, 0, -1), -height)
     plain = Plan(pad)
     volumes = [
-        laying_guide.document(p, v)["silicone"]["volume_ml"]
+        guide.document(p, v)["silicone"]["volume_ml"]
         for p, v in ((with_pins, inner.volume()), (plain, plan_mesh(plain).volume()))
     ]
     assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
@@ -80,7 +80,7 @@ def test_pins_take_no_silicone():
 def test_lengths_are_those_of_the_curves(mould):
     plan = Plan(Morphology.random(3, 4, seed=3), with_settings(mould))
     tongue = plan.settings.mould.border_mm + plan.settings.mould.exit_mm
-    for fibre, entry in enumerate(laying_guide.document(plan, 1.0)["fibres"]):
+    for fibre, entry in enumerate(guide.document(plan, 1.0)["fibres"]):
         axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
         slope = PchipInterpolator(knots[:, axis], knots[:, 1 - axis]).derivative()
         stretches = zip(knots[:-1, axis], knots[1:, axis], strict=True)
@@ -91,7 +91,7 @@ def test_lengths_are_those_of_the_curves(mould):
 
 def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    document = laying_guide.document(plan, 1.0)
+    document = guide.document(plan, 1.0)
     assert [fibre["number"] for fibre in document["fibres"]] == list(range(1, 9))
     assert [fibre["fibre"] for fibre in document["fibres"]][::7] == ["horizontal 1", "vertical 4"]
     depths = [{document["fibres"][n - 1]["depth_mm"] for n in step} for step in document["laying_order"]]
@@ -102,7 +102,7 @@ def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
 
 def test_silicone_between_fibres_at_every_crossing(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    crossings = laying_guide.document(plan, 1.0)["crossings"]
+    crossings = guide.document(plan, 1.0)["crossings"]
     assert crossings["total"] == len(crossings["table"]) == 30
     assert crossings["same_family"] == 6
     assert all(len(row) == len(crossings["columns"]) for row in crossings["table"])
@@ -120,7 +120,7 @@ def test_silicone_between_fibres_at_every_crossing(published):
     ],
 )
 def test_fibres_that_touch_are_told(settings: FabricationSettings, gap: float):
-    crossings = laying_guide.document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
+    crossings = guide.document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
     assert crossings["gap_mm"] == pytest.approx(gap)
     assert crossings["same_family"] == 2
 
@@ -128,7 +128,7 @@ def test_fibres_that_touch_are_told(settings: FabricationSettings, gap: float):
 @pytest.mark.parametrize("draft_deg", [0.0, 5.0])
 def test_adhesive_fills_the_tracks(draft_deg):
     plan = Plan(Morphology.straight(4), with_settings({"ridge_draft_deg": draft_deg}))
-    steps = laying_guide.document(plan, 1.0)["adhesive"]["steps_ml"]
+    steps = guide.document(plan, 1.0)["adhesive"]["steps_ml"]
     for step, height in zip(steps, (1.2, 0.4), strict=True):
         width = 0.4 + height * math.tan(math.radians(draft_deg))
         assert 1000 * step == pytest.approx(4 * 60.25 * width * height, abs=0.06)
@@ -146,7 +146,7 @@ def rows(page: str, head: str) -> list[list[str]]:
 def test_the_page_has_what_to_mix_and_to_cut():
     plan = Plan(level_pad(1.8, 1.2))
     document = whole(plan)
-    page = laying_guide.laying_page(document)
+    page = guide.laying_page(document)
     ((_, a, b, _),) = rows(page, "EcoFlex 00-20")
     assert a == b == f"{document['silicone']['part_a_g']:.1f} g"
     table = rows(page, "step")
@@ -160,20 +160,20 @@ def test_the_page_has_what_to_mix_and_to_cut():
 
 
 def test_the_page_tells_how_the_pad_lies_in_its_holder():
-    page = laying_guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
+    page = guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
     assert "tracks down; fibres 1 and 5 start at the cut corner" in page
-    assert "holder" not in laying_guide.laying_page(whole(Plan(Morphology.straight(4))))
+    assert "holder" not in guide.laying_page(whole(Plan(Morphology.straight(4))))
 
 
 def test_the_page_has_places_as_on_the_pad_turned_over():
     plan = Plan(Morphology.straight(2))
-    table = rows(laying_guide.laying_page(whole(plan)), "fibres")
+    table = rows(guide.laying_page(whole(plan)), "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
 
 
 def test_many_crossings_are_counted_by_depth(published):
-    page = laying_guide.laying_page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
+    page = guide.laying_page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
     table = rows(page, "depths")
     assert sum(int(count) for *_, count in table) == 30
     assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
@@ -186,12 +186,12 @@ def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
         {"name": "wall", "status": "fail", "message": "no wall", "places_mm": []},
     )
     lid = with_settings({"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True})
-    page = laying_guide.laying_page(whole(Plan(Morphology.straight(2), lid), findings))
+    page = guide.laying_page(whole(Plan(Morphology.straight(2), lid), findings))
     assert "1 of 3 checks pass" in page
     assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 place,")
     assert "pour through its spout" in page
     assert "of resin" in page
     assert "read the right way" not in page
-    plain = laying_guide.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
+    plain = guide.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
     assert "the lid" not in plain

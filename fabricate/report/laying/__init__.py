@@ -1,0 +1,1 @@
+"""The page for the bench: what to print, mix, cast and lay."""
