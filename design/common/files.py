@@ -5,10 +5,10 @@ import json
 import os
 import platform
 import secrets
+import shutil
 import stat
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
@@ -125,6 +125,19 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
+    """Names of the files in a folder, and of no other one, whose content still has the digest noted for the name."""
+
+    def same(name: str) -> bool:
+        try:
+            require_file(folder / name)
+            return Path(name).name == name and sha256(folder / name) == digests[name]
+        except (InputError, OSError):
+            return False
+
+    return set(filter(same, digests))
+
+
 def provenance(
     command: str, seed: int | None = None, inputs: Sequence[Path] = (), packages: Sequence[str] = ()
 ) -> dict[str, Any]:
@@ -148,6 +161,7 @@ except ImportError:  # not a POSIX system
 
 UNFINISHED = ".unfinished-"
 """Names of files and folders begin with this until they are whole."""
+_STAGE = f"{UNFINISHED}set-"
 
 
 @contextmanager
@@ -185,22 +199,58 @@ def refuse_unwritable(folder: Path) -> None:
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def staged(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Yield an empty folder in `folder`; on success its files move to `folder`, on failure they vanish.
+
+    Where they cannot all be moved, or an interrupt comes meanwhile, `folder` is put back as it was. Such folders that
+    killed runs have left go first.
+
+    Args:
+        without: names of files in `folder` that go as the others come.
 
     Raises:
         InputError: `folder` cannot be written.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=UNFINISHED) as name:
-            yield Path(name)
-            files = sorted(Path(name).iterdir())
-            in_the_way = [file.name for file in files if (folder / file.name).is_dir()]
-            if in_the_way:
-                raise InputError(f"{folder / in_the_way[0]}: is a folder, expected a file or nothing")
-            for file in files:
-                file.replace(folder / file.name)
+        for left in folder.glob(f"{_STAGE}*") if fcntl else ():
+            with suppress(InputError), _held(left, f"{left}: is at work"):
+                shutil.rmtree(left, ignore_errors=True)
+        stage = folder / f"{_STAGE}{secrets.token_hex(8)}"
+        with ExitStack() as end:
+            for _ in range(2):  # the second time where a Ctrl-C meets the first
+                end.callback(shutil.rmtree, stage, ignore_errors=True)
+            stage.mkdir()
+            end.enter_context(_held(stage, f"{stage}: another run clears it up"))
+            yield stage
+            _exchange(stage, folder, without)
+
+
+def _exchange(stage: Path, folder: Path, without: Collection[str]) -> None:
+    """Move the files of a stage to `folder` and take others out of it: all, or none where that fails."""
+    names = sorted(file.name for file in stage.iterdir())
+    for path in (folder / name for name in names):
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'no file'}, expected a file or nothing")
+    kept = stage / UNFINISHED
+    kept.mkdir()
+    for name in filter(lambda name: os.path.lexists(folder / name), (*names, *without)):
+        try:
+            (kept / name).hardlink_to(folder / name)
+        except OSError:  # a disk without such
+            shutil.copy2(folder / name, kept / name, follow_symlinks=False)
+    try:
+        for name in without:
+            (folder / name).unlink(missing_ok=True)
+        for name in names:
+            (stage / name).replace(folder / name)
+    except BaseException:
+        for name in names:
+            if not (stage / name).exists() and not os.path.lexists(kept / name):
+                (folder / name).unlink(missing_ok=True)
+        for file in list(kept.iterdir()):
+            file.replace(folder / file.name)
+        raise
 
 
 @contextmanager
@@ -214,26 +264,35 @@ def claimed(folder: Path) -> Iterator[None]:
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        claim = os.open(folder, os.O_RDONLY) if fcntl else None
     try:
-        if claim is not None:
-            lock(claim, f"{folder}: another run is writing there; wait for its end, or choose another folder")
-        yield
+        with _held(folder, f"{folder}: another run is writing there; wait for its end, or choose another folder"):
+            yield
     finally:
-        if claim is not None:
-            os.close(claim)
         with suppress(OSError):  # where something is in it
             for each in missing:
                 each.rmdir()
 
 
-def lock(file: IO[Any] | int, busy: str) -> None:
+@contextmanager
+def _held(folder: Path, busy: str) -> Iterator[None]:
+    """Keep others off a folder to the end or the death of this run, as `lock` does."""
+    with writing(folder):
+        handle = os.open(folder, os.O_RDONLY) if fcntl else None
+    try:
+        lock(handle, busy)
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
+
+
+def lock(file: IO[Any] | int | None, busy: str) -> None:
     """Keep others off until `file`, or what this descriptor is of, is closed, where the system has such locks.
 
     Raises:
         InputError: saying `busy`, where somebody has locked it.
     """
-    if fcntl is None:
+    if fcntl is None or file is None:
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,7 @@ from design.common.files import (
     refuse_unwritable,
     sha256,
     staged,
+    unchanged,
     write_json,
 )
 
@@ -168,3 +170,59 @@ def test_a_folder_in_the_way_of_a_staged_file_moves_none(tmp_path):
     (tmp_path / "two").rmdir()
     work()
     assert [(tmp_path / name).read_text() for name in ("one", "two")] == ["new", "new"]
+
+
+def replaced(folder, *names, without=()):
+    with staged(folder, without) as stage:
+        for name in names:
+            (stage / name).write_text("new")
+
+
+def test_files_go_as_others_come(tmp_path):
+    for name in ("one", "two", "mine"):
+        (tmp_path / name).write_text("old")
+    replaced(tmp_path, "one", without=["two", "three"])
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"one": "new", "mine": "old"}
+
+
+@pytest.mark.parametrize("linked", [True, False])
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError])
+def test_what_was_there_is_put_back_where_not_all_can_be_moved(tmp_path, monkeypatch, stop, linked):
+    for name in ("b", "d", "mine"):
+        (tmp_path / name).write_text("old")
+    replace = Path.replace
+
+    def stopped(self, target):
+        if self.name == "d" and self.read_text() == "new":
+            raise stop
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", stopped)
+    if not linked:  # as on disks that know no such
+        monkeypatch.setattr(Path, "hardlink_to", lambda path, target: Path(target).rmdir())
+    with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError):
+        replaced(tmp_path, "a", "b", "c", "d", without=["mine"])
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(("b", "d", "mine"), "old")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="nobody else can tell that a run is no more")
+def test_what_a_killed_run_has_left_goes_with_the_next_and_nothing_else(tmp_path):
+    code = "import os, sys\nfrom pathlib import Path\nfrom design.common.files import staged\n"
+    code += "with staged(Path(sys.argv[1])) as stage: (stage / 'half').touch(); os._exit(9)"
+    assert subprocess.run([sys.executable, "-c", code, tmp_path], check=False).returncode == 9
+    (tmp_path / ".unfinished-mine").mkdir()
+    assert len(list(tmp_path.iterdir())) == 2
+    with staged(tmp_path) as stage:
+        (stage / "slow").touch()
+        replaced(tmp_path, "one")
+    assert {path.name for path in tmp_path.iterdir()} == {".unfinished-mine", "one", "slow"}
+
+
+def test_files_are_known_by_their_digests_in_one_folder_only(tmp_path):
+    for path in (tmp_path / "a", tmp_path / "b", tmp_path / "in" / "c"):
+        write_json(path, {})
+    digest = sha256(tmp_path / "a")
+    (tmp_path / "b").write_text("changed")
+    names = ["a", "b", "c", "../a", "/", "", "..", "in", "in/c", str(tmp_path / "a"), "a\0", "a" * 1000, "\ud800"]
+    assert unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
+    assert unchanged(tmp_path, {"a": None, "c": [1]}) == set()
