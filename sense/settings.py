@@ -51,8 +51,10 @@ class RigSettings(Settings):
         depths_mm: depths that presses take in turn; `depth_mm` for all where empty.
         box_mm: x, y and z from and to, in the arm's base frame, which the tool never leaves; no arm moves without.
         contact_mm: height of the pad's surface in the base frame; no arm moves while it is unknown.
-        pad_mm, pad_angle_deg: where the pad's centre lies in the base frame, and how far its x axis is turned; no arm
-            moves while the place is unknown.
+        pad_mm, pad_angle_deg: where the pad's centre lies in the base frame, and how far its y axis is turned from the
+            base's; no arm moves while the place is unknown.
+        mirrored: whether the pad lies with its tracks up, so that its x axis runs the other way than on its plan; while
+            it is unknown a holder says so, and without one the pad counts as it lies, x to the right of y.
         tcp_mm: the tip as seen from the flange; an arm whose controller keeps it does not move unless they agree.
         tool_rad: rotation vector of the tool while it points down.
     """
@@ -104,7 +106,11 @@ class RigSettings(Settings):
     pad_mm: Annotated[
         tuple[Millimetres, Millimetres] | None, BeforeValidator(lambda value: _tuple(_unknown(value))), Unknown
     ] = Field(default=None, description='the pad\'s centre [x, y] in the base frame, mm, or "unknown"')
-    pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="from the base's x axis to the pad's")
+    pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="from the base's y axis to the pad's")
+    mirrored: Annotated[bool | None, BeforeValidator(_unknown), Unknown] = Field(
+        default=None,
+        description='tracks up, so that x runs the other way: true, false, or "unknown": a holder\'s, or false',
+    )
     tool_rad: Annotated[tuple[Angle, Angle, Angle], BeforeValidator(_tuple)] = Field(
         default=(0.0, 3.141592653589793, 0.0), description="rotation vector of the tool, pointing down, radians"
     )

@@ -65,12 +65,15 @@ def live(
     from sense.live.sources import connected, replayed
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
+    from sense.settings import RigSettings
 
     localizers = [Localizer.load(model) for model in models]
     with ExitStack() as stack:
         if replay is not None:
-            source = replayed(open_recording(replay), speed)
+            recording = open_recording(replay)
+            source, mirrored = replayed(recording, speed), recording.mirrored
         else:
+            mirrored = bool(load_spec(spec).section(RigSettings).mirrored)
             converter = _converter(rig, models[0], localizers[0], spec)
             stack.callback(converter.close)
             source = connected(converter, localizers[0].rate_hz)
@@ -83,6 +86,7 @@ def live(
             "title": f"{replay or f'{rig} rig'}, {models[0]}",
             "middle_mm": scaling.middle_mm.tolist(),
             "half_mm": scaling.span_mm,
+            "mirrored": mirrored,
         }
 
         @stack.push

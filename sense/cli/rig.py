@@ -163,7 +163,7 @@ def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording"
         page = stack.enter_context(LivePage(0, "hand.html", words.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(drawn_anew()), stack.enter_context(typed_keys())
-        latest = pad = pad_view(setup.pad, str(setup.out))
+        latest = pad = pad_view(setup.pad, str(setup.out), bool(setup.rig.mirrored))
 
         @stack.push
         def tell_the_end(kind: object, error: BaseException | None, trace: object) -> None:

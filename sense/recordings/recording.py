@@ -108,6 +108,12 @@ class Recording:
         return {"depth_mm": self.deep_mm, "force_n": self.forces_n}
 
     @property
+    def mirrored(self) -> bool:
+        """Whether `[rig]` said that the pad lay with its tracks up: seen from above, x ran to the left of y."""
+        rig = self.source.get("rig")
+        return isinstance(rig, Mapping) and rig.get("mirrored") is True
+
+    @property
     def rate_hz(self) -> float:
         """Readings per second, by the median interval."""
         return rate_of(self.times_s)

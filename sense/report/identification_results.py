@@ -47,7 +47,7 @@ def identify_into(
         found = identify(recording, pad, seed, report)
     origin = provenance(COMMAND, seed, inputs or [])
     twin = found.twin(origin)
-    document = identification_document(found, twin) | {"provenance": origin}
+    document = identification_document(found, twin) | {"rig_mirrored": recording.mirrored, "provenance": origin}
     with staged(out) as folder, stage("figures"):
         from .identification_figures import draw_laid_plan, draw_responses
 
@@ -118,7 +118,7 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
         ),
         f"explained {document['explained']:.3f} of what presses held out show; on the plan as it is"
         f" {document['explained_on_plan']:.3f}; noise {document['noise']:.1%} of full scale",
-        f"laid {_mirrored(frame)}, turned {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm,"
+        f"laid {_side(document)}, turned {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm,"
         f" scale {frame['scale']:.3f}",
         *doubt_lines(document),
     ]
@@ -176,7 +176,7 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
             "How the pad was laid",
             [
                 paragraph(
-                    f"Found from {document['presses']} presses: it lay {_mirrored(frame)}, turned"
+                    f"Found from {document['presses']} presses: it lay {_side(document)}, turned"
                     f" {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm, scale {frame['scale']:.3f}."
                     f" The twin explains {document['explained']:.0%} of what {document['held_out']} presses held out"
                     f" show, the plan as it is {document['explained_on_plan']:.0%}; noise is"
@@ -203,8 +203,12 @@ def _fibre(row: Mapping[str, Any]) -> str:
     return "none" if row["fibre"] is None else str(row["fibre"] + 1)
 
 
-def _mirrored(frame: Mapping[str, Any]) -> str:
-    return "turned over" if frame["mirrored"] else "as planned"
+def _side(document: Mapping[str, Any]) -> str:
+    """How the pad lay, and what `[rig] mirrored` had said of it: the frame of a twin is what is left to tell."""
+    over, told = document["frame"]["mirrored"], document.get("rig_mirrored", False)
+    if told:
+        return "as planned, which [rig] mirrored denies" if over else "turned over, as [rig] mirrored says"
+    return "turned over" if over else "as planned"
 
 
 def _shift(frame: Mapping[str, Any]) -> str:

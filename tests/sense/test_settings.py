@@ -25,6 +25,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "box_mm": "unknown",
         "contact_mm": "unknown",
         "pad_angle_deg": 0.0,
+        "mirrored": "unknown",
         "max_depth_mm": 6.0,
         "clearance_mm": 10.0,
         "travel_mm_s": 100.0,

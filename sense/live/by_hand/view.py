@@ -18,14 +18,18 @@ BAR = 30
 """Characters of the bar of a wait or a hold."""
 
 
-def pad_view(pad: Morphology, title: str) -> dict[str, Any]:
-    """The part of the view that stays, as JSON: frame, fibres' courses in mm, and what may be said."""
+def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, Any]:
+    """The part of the view that stays, as JSON: frame, fibres' courses in mm, and what may be said.
+
+    Places are those of the plan; of a pad that lies `mirrored`, with its tracks up, x runs to the left.
+    """
     courses = [np.round(pad.to_mm(course), 1).tolist() for course in flatten(pad, TOLERANCE)]
     half_mm = pad.size_mm / 2
     return {
         "title": title,
         "middle_mm": [0.0, 0.0],
         "half_mm": half_mm,
+        "mirrored": mirrored,
         "courses": courses,
         "words": WORDS,
         "ended": "",
@@ -50,7 +54,8 @@ def _map(view: Mapping[str, Any]) -> list[str]:
 
     def put(place: tuple[float, float], mark: str) -> None:
         x, y = (np.clip((value / view["half_mm"] + 1) / 2, 0, 1) for value in place)
-        rows[round((1 - y) * (ROWS - 1))][round(x * (COLUMNS - 1))] = mark
+        right = 1 - x if view["mirrored"] else x
+        rows[round((1 - y) * (ROWS - 1))][round(right * (COLUMNS - 1))] = mark
 
     for press in view["presses"]:
         put((press["x_mm"], press["y_mm"]), ".")

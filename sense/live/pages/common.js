@@ -17,11 +17,12 @@ function made(name, className, text) {
   return element
 }
 
+// Seen from above as the pad lies: with its tracks up, mirrored, x runs to the left.
 function frame(view) {
-  const scale = (SIDE - 2 * MARGIN) / (2 * view.half_mm)
+  const scale = (SIDE - 2 * MARGIN) / (2 * view.half_mm), right = view.mirrored ? -scale : scale
   return {
     scale,
-    x: mm => SIDE / 2 + (mm - view.middle_mm[0]) * scale,
+    x: mm => SIDE / 2 + (mm - view.middle_mm[0]) * right,
     y: mm => SIDE / 2 - (mm - view.middle_mm[1]) * scale,
   }
 }
@@ -38,7 +39,7 @@ function gridParts(view) {
     parts.push(drawn("text", {x: MARGIN - 5, y: y(at) + 4, "text-anchor": "end"}, +at.toFixed(3)))
   }
   parts.push(drawn("text", {x: SIDE - 8, y: SIDE - 14, "text-anchor": "end"}, "mm"))
-  parts.push(drawn("rect", {class: "grid edge", x: x(cx - half), y: y(cy + half), width: 2 * half * scale, height: 2 * half * scale}))
+  parts.push(drawn("rect", {class: "grid edge", x: x(cx) - half * scale, y: y(cy + half), width: 2 * half * scale, height: 2 * half * scale}))
   return parts
 }
 

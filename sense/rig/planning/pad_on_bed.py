@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError
+from design.common.errors import InputError, shown
 from design.common.files import read_json
 from sense.rig.devices.protocols import RigFault
 from sense.settings import RigSettings
@@ -15,7 +15,7 @@ _SLACK_MM = 1e-6
 
 
 def on_bed(rig: RigSettings, folder: Path) -> RigSettings:
-    """`rig` with the place of the pad, the height of its surface and the workspace above it, where it leaves them open.
+    """`rig` with the pad's place, side and height, and the workspace above it, where it leaves them open.
 
     The workspace is the pad seen from above, as far as the nozzle gets; down to `max_depth_mm`, but never below the top
     of the holder's walls.
@@ -42,12 +42,16 @@ def on_bed(rig: RigSettings, folder: Path) -> RigSettings:
         *(max(y - half, dy), min(y + half, depth + dy)),
         *(max(contact - rig.max_depth_mm, frame["walls_mm"]) - _SLACK_MM, height + dz),
     )
-    place = {"pad_mm": (x, y), "contact_mm": contact, "box_mm": rig.box_mm or box}
+    mirrored = frame["mirrored"] if rig.mirrored is None else rig.mirrored
+    place = {"pad_mm": (x, y), "mirrored": mirrored, "contact_mm": contact, "box_mm": rig.box_mm or box}
     return rig.model_copy(update=place | {"pad_angle_deg": rig.pad_angle_deg + frame["angle_deg"]})
 
 
 def _frame(folder: Path) -> Mapping[str, Any]:
-    """The frame in the folder's fabrication.json, checked: numbers, and rows of them as tuples."""
+    """The frame in the folder's fabrication.json, checked: numbers, rows of them as tuples, and whether it is mirrored.
+
+    Holders of before that was said took the pad with its tracks down.
+    """
     path = folder / FILE
     if not path.is_file():
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and there is no {path}"
@@ -59,7 +63,9 @@ def _frame(folder: Path) -> Mapping[str, Any]:
     read = {name: _numbers(frame.get(name), count) for name, count in _LENGTHS.items()}
     if wrong := [name for name, value in read.items() if value is None]:
         raise InputError(f"{path}: frame has no {wrong[0]}, expected {_LENGTHS[wrong[0]]} finite numbers")
-    return read
+    if type(mirrored := frame.get("mirrored", False)) is not bool:
+        raise InputError(f"{path}: mirrored of frame is {shown(mirrored)}, expected true or false")
+    return read | {"mirrored": mirrored}
 
 
 def _numbers(value: object, count: int) -> Any:

@@ -58,6 +58,8 @@ _FREE = {
     *("noise_mv", "drift_mv", "creep", "hysteresis", "hysteresis_s"),
 }
 """Settings that may change within a recording; any other changes what a press is."""
+_ONCE = {"mirrored": False}
+"""What held before there was a setting, for recordings of that time."""
 _IDENTITY = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "firmware")}
 """What devices say of themselves that all of a recording has to share."""
 
@@ -80,7 +82,7 @@ def begun_source(setup: Setup, rig: "RigSettings", kind: str) -> dict[str, Any]:
     if source.get("morphology") != now["morphology"]:
         raise InputError(f"{setup.out}: was begun with another pad than the one given")
     for key in sorted(now["rig"].keys() - _FREE):
-        before = was.get(key) if isinstance(was, dict) else None
+        before = was.get(key, _ONCE.get(key)) if isinstance(was, dict) else None
         if before != (got := now["rig"][key]):
             raise InputError(f"[rig] {key}: got {got}, the recording in {setup.out} was begun with {before}")
     return source
@@ -121,8 +123,8 @@ def source_of(
 
 
 def _told(setup: Setup, rig: "RigSettings") -> dict[str, Any]:
-    """Settings, with the inputs of the board as they are wired, and the pad."""
-    wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots))})
+    """Settings, with the inputs of the board as they are wired and the side of the pad as it counts, and the pad."""
+    wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots)), "mirrored": bool(rig.mirrored)})
     pad = {"pitch_mm": setup.pad.pitch_mm, "knots": setup.pad.knots.tolist()}
     return {"rig": wired.model_dump(mode="json"), "morphology": pad}
 

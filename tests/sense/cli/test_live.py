@@ -1,6 +1,7 @@
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,17 @@ def test_a_recording_is_shown(live, brief: Recording, tmp_path: Path) -> None:
     first = told[0]
     assert plain.splitlines()[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
     assert len(plain.splitlines()) == len(told)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_replay_shows_the_pad_as_it_lay(
+    live, brief: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mirrored: bool
+) -> None:
+    replace(brief, source={"rig": {"mirrored": mirrored}}).save(tmp_path / "short", {})
+    seen: list[dict] = []
+    monkeypatch.setattr(LivePage, "show", lambda page, view: seen.append(view))
+    assert live("--replay", str(tmp_path / "short"), "--speed", "1e6")[0] == 0
+    assert {view["mirrored"] for view in seen} == {mirrored}
 
 
 def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -254,6 +254,26 @@ def test_a_browser_shows_where_to_press_and_says_what_is_said(asking: LivePage, 
     assert heard == ["skip", "skip"]
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_browser_shows_the_pad_as_it_lies(asking: LivePage, browser: Chromium, mirrored: bool) -> None:
+    asking.show(HAND | {"target": [11.0, -2.0], "mirrored": mirrored})
+    browser.open(asking.url)
+    browser.wait_for("document.querySelector('.press .ring')")
+    centre = "(({x, y, width, height}) => [x + width / 2, y + height / 2])(document.querySelector('{}').getBBox())"
+    ring, edge = (browser.ask(centre.replace("{}", part)) for part in (".press .ring", "#pad .edge"))
+    width = browser.ask("document.querySelector('#pad .edge').getBBox().width")
+    assert (ring[0] - edge[0]) / width == pytest.approx(-0.25 if mirrored else 0.25)
+    assert ring[1] == pytest.approx(edge[1])
+    names = browser.ask(
+        "[...document.querySelectorAll('#pad text[y=\"466\"][text-anchor=middle]')].map(t => +t.textContent)"
+    )
+    places = browser.ask(
+        "[...document.querySelectorAll('#pad text[y=\"466\"][text-anchor=middle]')].map(t => +t.getAttribute('x'))"
+    )
+    assert names == sorted(names)
+    assert places == sorted(places, reverse=mirrored)
+
+
 def test_a_browser_comes_back_to_a_page_that_was_away(browser: Chromium) -> None:
     with LivePage(0) as page:
         port = port_of(page)

@@ -23,6 +23,14 @@ def test_a_run_directory_gives_back_the_recording(recording: Recording, folder: 
     assert sorted(path.name for path in folder.parent.iterdir()) == ["run"]
 
 
+@pytest.mark.parametrize(
+    ("source", "mirrored"),
+    [({}, False), ({"rig": {}}, False), ({"rig": {"mirrored": "unknown"}}, False), ({"rig": {"mirrored": True}}, True)],
+)
+def test_which_side_was_up_is_as_rig_said(recording: Recording, source: dict[str, Any], mirrored: bool) -> None:
+    assert replace(recording, source=source).mirrored is mirrored
+
+
 def test_a_torn_stream_loses_the_presses_it_had(recording: Recording, folder: Path) -> None:
     stream = folder / "readings.bin"
     stream.write_bytes(stream.read_bytes()[: -10 * 256 - 3])

@@ -1,6 +1,7 @@
 """Identification of pads whose truth is known, and of recordings that tell nothing."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from design import InputError, Morphology
 from design.pad.twin import Twin
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate
+from sense.report.identification_results import identification_lines
 from sense.settings import RigSettings
 from sense.twin.benchmark import printed_pad
 from sense.twin.identification import identify
@@ -109,3 +111,33 @@ def test_a_recording_that_answers_to_nothing_is_refused(recording: Recording) ->
 def test_a_pad_with_fewer_fibres_than_channels_answer_is_refused(recording: Recording) -> None:
     with pytest.raises(InputError, match="3 channels of the recording answer to presses, the pad has 2 fibres"):
         identify(recording, Morphology.straight(1, pitch_mm=20.0))
+
+
+TOLD = {
+    "presses": 10,
+    "channels": [],
+    "explained": 0.9,
+    "explained_on_plan": 0.8,
+    "noise": 0.01,
+    "doubts": 0,
+    "explained_by_straight": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("found", "told", "side"),
+    [
+        (False, None, "as planned"),
+        (True, None, "turned over"),
+        (True, False, "turned over"),
+        (False, True, "turned over, as [rig] mirrored says"),
+        (True, True, "as planned, which [rig] mirrored denies"),
+    ],
+)
+def test_how_the_pad_lay_counts_what_rig_had_said_of_it(found: bool, told: bool | None, side: str) -> None:
+    """A mirrored rig has taken places to the plan already: its twin is mirrored only where that was wrong."""
+    frame = {"mirrored": found, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
+    document = TOLD | {"frame": frame} | ({} if told is None else {"rig_mirrored": told})
+    assert f"laid {side}, turned 0.0 degrees, shifted 0.0, 0.0 mm, scale 1.000" in identification_lines(
+        document, Path()
+    )

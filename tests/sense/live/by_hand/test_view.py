@@ -38,3 +38,12 @@ def test_a_terminal_shows_the_place_where_it_is() -> None:
     assert rows[ROWS // 2][1 + COLUMNS // 2] == "."
     assert "2 of 7 presses" in lines[-2]
     assert "q: end" in lines[-1]
+
+
+def test_with_its_tracks_up_the_pad_is_shown_as_it_lies() -> None:
+    """Places stay those of the plan; what is to the right there is to the left of whoever looks at the pad."""
+    pad = Morphology.straight(2)
+    plain, lying = (view_lines(pad_view(pad, "hand", mirrored) | VIEW) for mirrored in (False, True))
+    assert [row[::-1] for row in lying[3 : 3 + ROWS]] == plain[3 : 3 + ROWS]
+    assert lying[0] == plain[0]
+    assert pad_view(pad, "hand", True)["courses"] == pad_view(pad, "hand")["courses"]

@@ -58,6 +58,19 @@ def test_what_rig_says_counts_more(folder):
     assert on_bed(everything, folder / "nowhere") is everything
 
 
+@pytest.mark.parametrize(
+    ("in_file", "said", "counts"),
+    [(True, None, True), (True, False, False), (False, None, False), (False, True, True), (None, None, False)],
+)
+def test_the_holder_says_which_side_is_up_unless_rig_does(folder, tmp_path, in_file, said, counts):
+    """A file of before that was written is of a holder that took the pad with its tracks down."""
+    document = json.loads((folder / "fabrication.json").read_text())
+    assert document["frame"].pop("mirrored") is True
+    document["frame"] |= {} if in_file is None else {"mirrored": in_file}
+    (tmp_path / "fabrication.json").write_text(json.dumps(document))
+    assert on_bed(RIG.model_copy(update={"mirrored": said}), tmp_path).mirrored is counts
+
+
 def test_a_pad_without_a_holder_lies_nobody_knows_where(folder, tmp_path):
     with pytest.raises(RigFault, match=r"there is no .*fabrication.json; .*holder = true") as fault:
         on_bed(RIG, tmp_path)
@@ -78,4 +91,12 @@ def test_a_damaged_frame_is_named(folder, tmp_path, key, value):
     document["frame"][key] = value
     (tmp_path / "fabrication.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=f"frame has no {key}"):
+        on_bed(RIG, tmp_path)
+
+
+def test_a_damaged_side_is_named(folder, tmp_path):
+    document = json.loads((folder / "fabrication.json").read_text())
+    document["frame"]["mirrored"] = "up"
+    (tmp_path / "fabrication.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="mirrored of frame is 'up', expected true or false"):
         on_bed(RIG, tmp_path)

@@ -57,7 +57,7 @@ CHANGES = {
     },
     **{"clearance_mm": 12.0, "travel_mm_s": 90.0, "press_mm_s": 30.0, "acceleration_mm_s2": 400.0},
     **{"depth_mm": 4.0, "depths_mm": [1.0, 2.0], "pad_mm": [1.0, 2.0], "pad_angle_deg": 5.0},
-    **{"tool_rad": [0.1, 3.1, 0.0], "tcp_mm": [0.0, 0.0, 150.0]},
+    **{"tool_rad": [0.1, 3.1, 0.0], "tcp_mm": [0.0, 0.0, 150.0], "mirrored": True},
 }
 """Settings that change what a press is."""
 
@@ -67,6 +67,18 @@ def test_other_settings_are_refused(tmp_path, key, value):
     begun(tmp_path / "run")
     with pytest.raises(InputError, match=re.escape(f"[rig] {key}: got {value}, the recording")):
         plan_of(setup(tmp_path / "run"), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
+
+
+def test_a_recording_of_before_there_was_a_side_to_name_counts_as_not_mirrored(tmp_path):
+    begun(tmp_path / "run")
+    start = tmp_path / "run" / START
+    document = json.loads(start.read_text())
+    assert document["source"]["rig"].pop("mirrored") is False
+    start.write_text(json.dumps(document))
+    for side in (None, False):
+        plan_of(setup(tmp_path / "run"), RIG.model_copy(update={"mirrored": side}), resume=True)
+    with pytest.raises(InputError, match=r"mirrored: got True, .* was begun with False"):
+        plan_of(setup(tmp_path / "run"), RIG.model_copy(update={"mirrored": True}), resume=True)
 
 
 def test_limits_and_addresses_may_change(tmp_path):

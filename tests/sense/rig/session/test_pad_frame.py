@@ -1,8 +1,13 @@
-"""The pad's frame in the arm's: closed forms of a turned and shifted pad."""
+"""The pad's frame in the arm's: closed forms of a pad that is turned, shifted and turned over."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from design.pad.twin import Frame as TwinFrame
 from sense.rig.devices.protocols import RigFault
 from sense.rig.session.pad_frame import Frame
 from tests.sense.rig.devices.fakes import RIG
@@ -16,14 +21,37 @@ def test_a_pad_turned_to_the_left_has_its_x_axis_along_the_arms_y_axis():
     assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 30.0, -135.0])
-def test_a_tip_is_where_its_pose_was_asked_for(angle_deg):
-    frame = Frame.of(TURNED.model_copy(update={"pad_angle_deg": angle_deg}))
-    places, depths = np.array([[3.0, 1.0], [-2.0, 5.0]]), [4.0, -8.0]
+def test_with_its_tracks_up_a_pad_keeps_its_y_axis_and_x_runs_the_other_way():
+    frame = Frame.of(TURNED.model_copy(update={"mirrored": True}))
+    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, -403, 46, 0.1, 3.1, 0.2))
+    assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
+
+
+NUMBERS = st.floats(-500, 500)
+PLACES = st.lists(st.tuples(NUMBERS, NUMBERS, st.floats(-20, 20)), min_size=1, max_size=5)
+
+
+@given(st.booleans(), st.floats(-360, 360), st.tuples(NUMBERS, NUMBERS), PLACES)
+def test_a_tip_is_where_its_pose_was_asked_for(mirrored, angle_deg, centre_mm, asked):
+    """From places to poses and back, and no length changes on the way, however the pad lies."""
+    said = {"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}
+    frame = Frame.of(RIG.model_copy(update=said))
+    places, depths = np.array(asked)[:, :2], np.array(asked)[:, 2]
     poses = np.array([frame.pose(place, depth) for place, depth in zip(places, depths, strict=True)])
+    np.testing.assert_allclose(np.hypot(*(poses[:, :2] - centre_mm).T), np.hypot(*places.T), atol=1e-9)
     found = frame.tip(poses)
-    np.testing.assert_allclose(found[0], places, atol=1e-12)
-    np.testing.assert_allclose(found[1], depths)
+    np.testing.assert_allclose(found[0], places, atol=1e-9)
+    np.testing.assert_allclose(found[1], depths, atol=1e-9)
+
+
+@given(st.booleans(), st.floats(-180, 180), st.tuples(NUMBERS, NUMBERS), PLACES)
+def test_the_frame_of_a_twin_says_the_same(mirrored, angle_deg, centre_mm, poses):
+    """It takes places of an arm that was told nothing of the pad to the plan, as `tip` does for one that was told."""
+    said = {"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}
+    found, _ = Frame.of(RIG.model_copy(update=said)).tip(np.array(poses))
+    twin = TwinFrame(mirrored, angle_deg if mirrored else -angle_deg)
+    moved = replace(twin, shift_mm=tuple(-twin.turned(np.array(centre_mm))))
+    np.testing.assert_allclose(moved.to_plan(np.array(poses)[:, :2]), found, atol=1e-9)
 
 
 def test_an_unknown_height_is_refused():
