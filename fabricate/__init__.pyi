@@ -2,8 +2,11 @@ from .checks.findings import Finding as Finding
 from .checks.mesh_checks import check_mesh as check_mesh
 from .checks.plan_checks import check as check
 from .export import build as build
-from .mould.assembly import build_mould as build_mould
+from .materials import FibreSettings as FibreSettings
+from .materials import SiliconeSettings as SiliconeSettings
+from .mould.cad.model import build_mould as build_mould
 from .mould.plan import Plan as Plan
+from .settings import DispenserSettings as DispenserSettings
 from .settings import FabricationSettings as FabricationSettings
 from .settings import MouldSettings as MouldSettings
 from .settings import PrinterSettings as PrinterSettings

@@ -1,4 +1,4 @@
-"""The bodies of a mould, put together from their parts, and the mould as a CAD solid.
+"""The bodies of a mould, put together from their parts.
 
 z = 0 is the underside of a body, which lies on the print bed; the tray's floor has its top at `floor_mm`. Lengths
 are mm.
@@ -13,15 +13,12 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError
-from design.pad.morphology import Morphology
-from fabricate.settings import DEFAULTS, FabricationSettings
 
 from . import parts
 from .plan import Plan, square
-from .prisms import Body
+from .prisms import Body, Prism
 
 if TYPE_CHECKING:
-    from build123d import Solid
     from manifold3d import Manifold
 
 WELL_MM = 3.0
@@ -36,34 +33,6 @@ HOLDER_WALL_MM = 1.0
 """Height of the holder's walls above its floor: far below the pad's surface, so that no probe meets them."""
 HOLDER_PLAY_MM = 0.2
 """Room on every side of the pad in its holder."""
-
-
-def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> "Solid":
-    """The mould as a build123d solid, ready for CAD and STEP.
-
-    Args:
-        pad: the fibres.
-        settings: tray, ridges and fibre.
-
-    Returns:
-        One closed solid, mm.
-
-    Raises:
-        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out.
-    """
-    plan = Plan(pad, settings)
-    plan.require_levels()
-    return valid_solid(plan_mesh(plan))
-
-
-def valid_solid(mesh: "Manifold", name: str = "mould") -> "Solid":
-    """The CAD solid of a mesh; raises InputError where the CAD kernel finds it invalid."""
-    from .cad_solid import faceted_solid
-
-    solid = faceted_solid(mesh)
-    if not solid.is_valid:
-        raise InputError(f"{name}: the CAD kernel finds the solid invalid; try another [mould] tolerance_mm")
-    return solid
 
 
 def plan_mesh(plan: Plan) -> "Manifold":
@@ -97,25 +66,36 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
     written = [outline for outline in plan.numbers if outline is not None]
     body = body.with_adds(parts.numeral_prisms(written, floor_mm=floor, height_mm=mould.shallow_ridge_height_mm))
     if mould.pins:
-        top = floor + plan.silicone_mm
-        body = body.with_adds(parts.pins(_pin_places(plan), top_mm=top, diameter_mm=_pin_mm(plan)))
+        body = body.with_adds(pins(plan))
     return body
 
 
+def pins(plan: Plan) -> list[Prism]:
+    """The registration pins, sunk into the walls by `parts.INTO_FLOOR_MM`.
+
+    Raises:
+        InputError: they find no room on the walls.
+    """
+    top = plan.settings.mould.floor_mm + plan.silicone_mm
+    return parts.pins(_pin_places(plan), top_mm=top, diameter_mm=_pin_mm(plan))
+
+
 def sizes(plan: Plan) -> dict[str, float]:
-    """What the parts came out as, mm: where the settings leave it open or the pad needs more than they say."""
-    mould = plan.settings.mould
-    _, _, edge, _ = plan.cavity.bounds
+    """What pad and mould came out as, mm: where the settings leave it open or the pad needs more than they say."""
+    printed = plan.enlarged
+    mould, edge = printed.settings.mould, printed.cavity.bounds[2]
     achieved = {
-        "pad_mm": 2 * edge,
-        "pad_thickness_mm": plan.silicone_mm,
-        "rim_mm": 2 * (edge + plan.flare_mm),
-        "tray_mm": 2 * plan.tray.bounds[2],
-        "tray_height_mm": mould.floor_mm + plan.silicone_mm,
-        "ridge_foot_mm": mould.ridge_width_mm + 2 * plan.heights_mm[-1] * plan.settings.ridge_slope,
+        "pad_mm": 2 * plan.cavity.bounds[2],
+        "pad_thickness_mm": plan.thickness_mm,
+        "cavity_mm": 2 * edge,
+        "cavity_depth_mm": printed.silicone_mm,
+        "rim_mm": 2 * (edge + printed.flare_mm),
+        "tray_mm": 2 * printed.tray.bounds[2],
+        "tray_height_mm": mould.floor_mm + printed.silicone_mm,
+        "ridge_foot_mm": mould.ridge_width_mm + 2 * printed.heights_mm[-1] * printed.settings.ridge_slope,
     }
     if mould.pins:
-        achieved["pin_mm"] = _pin_mm(plan)
+        achieved["pin_mm"] = _pin_mm(printed)
     if mould.lid:
         achieved["lid_mm"] = LID_MM
     if mould.conductive:
@@ -152,12 +132,14 @@ def lid_holes(plan: Plan) -> int:
 
 
 def holder_body(plan: Plan) -> Body:
-    """The tray in which the finished pad lies, tracks down as it was cast.
+    """The tray in which the finished pad lies as it was laid: tracks up, turned over left to right.
 
-    Slots let the leads out. The corner where the first horizontal and the first vertical fibre start is cut.
+    Slots let the leads out. The corner where the first horizontal and the first vertical fibre start is cut. Ends of
+    fibres are level with each other, so that the slots are the same seen from either side.
     """
-    mould, edge, out, cut = plan.settings.mould, plan.cavity.bounds[2], plan.tray.bounds[2], plan.corner_mm
-    half = mould.exit_width_mm / 2 + HOLDER_PLAY_MM
+    mould, out, cut = plan.settings.mould, plan.tray.bounds[2], plan.corner_mm
+    play = plan.flare_mm + HOLDER_PLAY_MM  # what lies below was the rim of the casting, wider than its tracks' side
+    half = mould.exit_width_mm / 2 + play
     slots = []
     for fibre, line in enumerate(plan.lines):
         across = line.coords[0][1 - plan.family(fibre)], line.coords[-1][1 - plan.family(fibre)]
@@ -165,26 +147,27 @@ def holder_body(plan: Plan) -> Body:
             along, beside = sorted((0.0, side * (out + 1))), (middle - half, middle + half)
             (x0, x1), (y0, y1) = (beside, along) if plan.family(fibre) else (along, beside)
             slots.append(shapely.box(x0, y0, x1, y1))
-    marked = plan.tray - shapely.Polygon([(-out, -out), (cut - out, -out), (-out, cut - out)])
-    hollow = shapely.union_all([square(edge + HOLDER_PLAY_MM), *slots])
+    marked = plan.tray - shapely.Polygon([(out, -out), (out - cut, -out), (out, cut - out)])
+    hollow = shapely.union_all([square(plan.cavity.bounds[2] + play), *slots])
     return parts.tray(marked, [hollow], floor_mm=mould.floor_mm, depth_mm=HOLDER_WALL_MM)
 
 
-def bed_frame(plan: Plan) -> dict[str, float | list[float]]:
+def bed_frame(plan: Plan) -> dict[str, bool | float | list[float]]:
     """Where the pad lies while its holder stands where a slicer puts it, in the middle of the bed; mm and degrees.
 
     Returns:
         "bed_mm": width, depth and height of the printer. "centre_mm": of the pad, x and y. "angle_deg": from the bed's
-        x axis to the pad's. "pad_mm": side of the pad. "surface_mm", "walls_mm": of the pad and of the holder's walls
-        above the bed.
+        y axis to the pad's. "mirrored": that the pad lies with its tracks up, its x axis against that of the bed.
+        "pad_mm": side of the pad. "surface_mm", "walls_mm": of the pad and of the holder's walls above the bed.
     """
     floor_mm, bed_mm = plan.settings.mould.floor_mm, plan.settings.printer.bed_mm
     return {
         "bed_mm": list(bed_mm),
         "centre_mm": [side / 2 for side in bed_mm[:2]],
         "angle_deg": 0.0,
+        "mirrored": True,
         "pad_mm": round(2 * plan.cavity.bounds[2], 6),
-        "surface_mm": round(floor_mm + plan.silicone_mm, 6),
+        "surface_mm": round(floor_mm + plan.thickness_mm, 6),
         "walls_mm": round(floor_mm + HOLDER_WALL_MM, 6),
     }
 
@@ -206,13 +189,18 @@ def conductive_body(plan: Plan) -> Body:
     Args:
         plan: of the second mould.
     """
+    return mould_body(plan, well_outlines(plan))
+
+
+def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
+    """The outlines of the wells at the ends of the ridges of every level, as polygons of so many sides, mm."""
     away = plan.cavity.bounds[2] + _WELL_RIM_MM + WELL_MM / 2
     places: list[list[tuple[float, float]]] = [[] for _ in plan.heights_mm]
     for fibre, line in enumerate(plan.lines):
         for end, side in ((0, -away), (-1, away)):
             across = line.coords[end][1 - plan.family(fibre)]
             places[plan.levels[fibre]].append((across, side) if plan.family(fibre) else (side, across))
-    return mould_body(plan, [parts.wells(own, diameter_mm=WELL_MM) for own in places])
+    return [parts.wells(own, diameter_mm=WELL_MM, sides=sides) for own in places]
 
 
 def _pin_mm(plan: Plan) -> float:

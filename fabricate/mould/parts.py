@@ -57,8 +57,12 @@ def ridge(
         terrace_mm: height of a terrace; infinite for upright sides.
     """
     bottom, top = floor_mm - INTO_FLOOR_MM, floor_mm + height_mm
-    below = [0.0, *np.arange(terrace_mm, height_mm - 1e-6, terrace_mm).tolist()] if terrace_mm < height_mm else [0.0]
-    return [Prism(outline(down), bottom, top - down) for down in below]
+    return [Prism(outline(down), bottom, top - down) for down in terraces(height_mm, terrace_mm)]
+
+
+def terraces(height_mm: float, terrace_mm: float) -> list[float]:
+    """How far below its top every terrace of a ridge lies, mm: 0, then one for every `terrace_mm` of its height."""
+    return [0.0, *np.arange(terrace_mm, height_mm - 1e-6, terrace_mm).tolist()] if terrace_mm < height_mm else [0.0]
 
 
 def numeral_prisms(strokes: Iterable[BaseGeometry], *, floor_mm: float = 2.0, height_mm: float = 0.4) -> list[Prism]:
@@ -66,9 +70,9 @@ def numeral_prisms(strokes: Iterable[BaseGeometry], *, floor_mm: float = 2.0, he
     return [Prism(number, floor_mm - INTO_FLOOR_MM, floor_mm + height_mm) for number in strokes]
 
 
-def wells(places: Iterable[tuple[float, float]], *, diameter_mm: float = 3.0) -> BaseGeometry:
+def wells(places: Iterable[tuple[float, float]], *, diameter_mm: float = 3.0, sides: int = 64) -> BaseGeometry:
     """The outline of discs at the ridge ends, that leave wells in the casting; they are as high as their ridges."""
-    return shapely.union_all([cylinder(x, y, diameter_mm) for x, y in places])
+    return shapely.union_all([cylinder(x, y, diameter_mm, sides) for x, y in places])
 
 
 def pins(places: Iterable[tuple[float, float]], *, top_mm: float = 8.0, diameter_mm: float = 2.0) -> list[Prism]:

@@ -1,7 +1,10 @@
 """The plan of a mould: centre lines, ridge outlines and tray in mm.
 
 The frame is the pad's own, x and y from its centre (`Morphology.to_mm`), as it lies in the tray with its tracks
-down. Turned over for laying, the tracks are the mirror image of the plan.
+down. Turned over for laying and use, the tracks are the mirror image of the plan.
+
+Lengths are those of the pad as it is used. Where the silicone shrinks, the mould has a plan of its own,
+`Plan.enlarged`.
 """
 
 import math
@@ -50,10 +53,35 @@ class Plan:
         instance("settings", self.settings, FabricationSettings).require_consistent(self.pad.pitch_mm)
 
     @cached_property
+    def enlarged(self) -> "Plan":
+        """The plan of what is printed: larger in every direction by what the silicone shrinks; this one if it does not.
+
+        Heights are whole layers, see `FabricationSettings.enlarged`. Its own pad is as large as its mould.
+        """
+        shrunk = self.settings.shrunk
+        if shrunk == 1:
+            return self
+        pad = Morphology(self.pad.knots, self.pad.pitch_mm / shrunk, self.pad.provenance)
+        return Plan(pad, self.settings.enlarged())
+
+    @cached_property
+    def depths_mm(self) -> tuple[float, ...]:
+        """How deep the tracks of every level lie in the pad, ascending, mm: their ridges, shrunk."""
+        return tuple(round(self.settings.shrunk * height, 9) for height in self.enlarged.heights_mm)
+
+    @property
+    def thickness_mm(self) -> float:
+        """How thick the pad comes out, mm: what the mould holds, shrunk."""
+        return round(self.settings.shrunk * self.enlarged.silicone_mm, 9)
+
+    @cached_property
     def lines(self) -> list[shapely.LineString]:
         """2M centre lines, mm: each within a fifth of the tolerance, continued straight through border and wall."""
+        return self._centre_lines(self.settings.mould.tolerance_mm)
+
+    def _centre_lines(self, tolerance_mm: float) -> list[shapely.LineString]:
         mould = self.settings.mould
-        tolerance = _CENTRE_SHARE * mould.tolerance_mm / self.pad.pitch_mm
+        tolerance = _CENTRE_SHARE * tolerance_mm / self.pad.pitch_mm
         reach = mould.border_mm + mould.exit_mm + INTO_WALL_MM
         lines = []
         for fibre, points in enumerate(flatten(self.pad, tolerance)):
@@ -114,14 +142,20 @@ class Plan:
         least = self.heights_mm[-1] + COVER_MM if len(self.heights_mm) > 2 else 0
         return max(self.settings.mould.silicone_mm, least)
 
-    def outline(self, level: int, below_mm: float = 0.0) -> BaseGeometry:
-        """Outline of the ridges of a level `below_mm` under their tops, mm, ends inside the walls."""
+    def outline(self, level: int, below_mm: float = 0.0, tolerance_mm: float | None = None) -> BaseGeometry:
+        """Outline of the ridges of a level `below_mm` under their tops, mm, ends inside the walls.
+
+        Args:
+            tolerance_mm: greatest deviation, where it is not to be that of the settings.
+        """
         mould = self.settings.mould
+        tolerance = mould.tolerance_mm if tolerance_mm is None else tolerance_mm
         half = mould.ridge_width_mm / 2 + below_mm * self.settings.ridge_slope
-        chord = 2 * math.acos(1 - _ARC_SHARE * mould.tolerance_mm / half)
-        lines = [line for line, own in zip(self.lines, self.levels, strict=True) if own == level]
+        chord = 2 * math.acos(1 - _ARC_SHARE * tolerance / half)
+        centres = self.lines if tolerance_mm is None else self._centre_lines(tolerance)
+        lines = [line for line, own in zip(centres, self.levels, strict=True) if own == level]
         bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
-        return shapely.union_all(bands).simplify(_OUTLINE_SHARE * mould.tolerance_mm)
+        return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
     @cached_property
     def ridges(self) -> tuple[BaseGeometry, ...]:

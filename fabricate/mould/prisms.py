@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+COLOURS = {"mould": "#8FA3B8", "lid": "#D9C27E", "conductive": "#6F8F72", "holder": "#B0886E"}
+"""The bodies that are printed, by the colour in which CAD programs and slicers show each."""
+
 
 @dataclass(frozen=True)
 class Prism:
@@ -38,6 +41,6 @@ class Body:
         return replace(self, adds=(*self.adds, *adds))
 
 
-def cylinder(x: float, y: float, diameter_mm: float) -> shapely.Polygon:
-    """The outline of an upright cylinder around (x, y), mm; 64 sides, within 0.13 % of the diameter."""
-    return shapely.Point(x, y).buffer(diameter_mm / 2, quad_segs=16)
+def cylinder(x: float, y: float, diameter_mm: float, sides: int = 64) -> shapely.Polygon:
+    """The outline of an upright cylinder around (x, y), mm; with 64 sides within 0.13 % of the diameter."""
+    return shapely.Point(x, y).buffer(diameter_mm / 2, quad_segs=sides // 4)

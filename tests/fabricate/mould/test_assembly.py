@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
+from shapely import affinity
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
@@ -11,7 +12,6 @@ from fabricate.checks.plan_checks import check_plan
 from fabricate.mould.assembly import (
     WELL_MM,
     bed_frame,
-    build_mould,
     conductive_body,
     conductive_plan,
     holder_body,
@@ -19,10 +19,8 @@ from fabricate.mould.assembly import (
     mould_body,
     plan_mesh,
     sizes,
-    valid_solid,
 )
-from fabricate.mould.benchmark import fused_solid
-from fabricate.mould.cad_solid import faceted_solid
+from fabricate.mould.cad.bodies import body_solid
 from fabricate.mould.mesh import arrays, mesh
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body, Prism
@@ -44,12 +42,11 @@ def assert_one_closed_body(read: trimesh.Trimesh, genus: int = 0) -> None:
     assert read.euler_number == 2 - 2 * genus
 
 
-def assert_all_ways_agree(body: Body) -> None:
-    """The CAD kernel's own Boolean operations are the oracle for the mesh and for the solid made of it."""
-    solid, oracle, volume = valid_solid(mesh(body)), fused_solid(body), mesh(body).volume()
-    assert oracle.volume == pytest.approx(volume, rel=1e-6)
-    assert solid.volume == pytest.approx(volume, rel=1e-9)
-    box = np.array([[*solid.bounding_box().min], [*solid.bounding_box().max]])
+def assert_both_ways_agree(body: Body) -> None:
+    """The CAD kernel's own Boolean operations on the same prisms are the oracle for the mesh."""
+    oracle = body_solid(body)
+    assert oracle.volume == pytest.approx(mesh(body).volume(), rel=1e-5)  # circles are polygons in the mesh
+    box = np.array([[*oracle.bounding_box().min], [*oracle.bounding_box().max]])
     assert box == pytest.approx(as_read(body).bounds, abs=1e-4)
 
 
@@ -75,7 +72,6 @@ def test_straight_pad_has_the_volume_that_arithmetic_gives():
     behind = 2 * ridge * math.tan(math.radians(2)) * 4 * (1.2**2 + 0.4**2) / 2  # where the wall leans off a ridge's end
     expected = (rim + 4) ** 2 * 8 - hollow + ridges + behind
     assert plan_mesh(plan).volume() == pytest.approx(expected, rel=1e-9)
-    assert build_mould(plan.pad, plain).volume == pytest.approx(expected, rel=1e-9)
     assert sizes(plan)["tray_mm"] == pytest.approx(rim + 4)
 
 
@@ -83,13 +79,11 @@ def test_straight_pad_has_the_volume_that_arithmetic_gives():
 def test_published_moulds_are_closed(published, name):
     plan = Plan(Morphology.load(published / f"{name}.mat"))
     assert_one_closed_body(as_read(mould_body(plan)))
-    if name == "1para":
-        assert valid_solid(plan_mesh(plan)).volume == pytest.approx(plan_mesh(plan).volume(), rel=1e-9)
 
 
 @LONG
 def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
-    assert_all_ways_agree(mould_body(Plan(Morphology.load(published / "1para.mat"))))
+    assert_both_ways_agree(mould_body(Plan(Morphology.load(published / "1para.mat"))))
 
 
 @pytest.mark.parametrize(
@@ -102,10 +96,6 @@ def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
 def test_random_moulds_are_closed(grid, knots, seed):
     plan = Plan(Morphology.random(grid, knots, seed))
     assert_one_closed_body(as_read(mould_body(plan)))
-    solid = (
-        valid_solid if knots < 5 and grid < 5 else faceted_solid
-    )  # the CAD kernel's check of dense pads takes seconds
-    assert solid(plan_mesh(plan)).volume == pytest.approx(plan_mesh(plan).volume(), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -113,17 +103,17 @@ def test_random_moulds_are_closed(grid, knots, seed):
     [
         with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
         with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
-        with_settings(EVERYTHING, printer={"layer_mm": 0.4}),
+        with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}),  # the oracle's pins are round
     ],
 )
-def test_all_ways_to_the_solid_agree(settings):
+def test_both_ways_to_the_mould_agree(settings):
     tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
     plan = Plan(Morphology.straight(1) if tapered else Morphology.random(1, 3, seed=5), settings)
     body = mould_body(plan)
-    assert_all_ways_agree(body)
+    assert_both_ways_agree(body)
     assert_one_closed_body(as_read(body))
     if settings.mould.conductive:
-        assert_all_ways_agree(conductive_body(conductive_plan(plan)))
+        assert_both_ways_agree(conductive_body(conductive_plan(plan)))
 
 
 @pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0, "border_mm": 1.5}, {"floor_mm": 1.2, "wall_mm": 0.8}])
@@ -133,8 +123,9 @@ def test_the_holder_takes_the_pad_with_its_leads(mould):
     assert_one_closed_body(read)
     floor, wall, out = plan.settings.mould.floor_mm, frame["walls_mm"], plan.tray.bounds[2]
     assert read.bounds == pytest.approx(np.array([[-out, -out, 0], [out, out, wall]]), abs=1e-4)
-    rim = shapely.segmentize(plan.silicone.buffer(0.1, join_style="mitre").exterior, 1.3)
-    leads = [end for line in plan.lines for end in (line.coords[0], line.coords[-1])]
+    over = affinity.scale(plan.silicone, xfact=-1, origin=(0, 0))  # its rim, the wider side, is below
+    rim = shapely.segmentize(over.buffer(plan.flare_mm + 0.1, join_style="mitre").exterior, 1.3)
+    leads = [(-end[0], end[1]) for line in plan.lines for end in (line.coords[0], line.coords[-1])]
     beyond = [(x * 50, y) if abs(x) > abs(y) else (x, y * 50) for x, y in leads]
     ways = [
         shapely.LineString([end, away]).intersection(plan.tray).coords[-1]
@@ -144,23 +135,18 @@ def test_the_holder_takes_the_pad_with_its_leads(mould):
         assert height_at(read, x, y) == pytest.approx(floor)
     inside = out - 0.2
     assert [
-        height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (inside, -inside))
+        height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (-inside, -inside))
     ] == pytest.approx([wall] * 3)
     with pytest.raises(ValueError, match="zero-size array"):
-        height_at(read, -inside, -inside)
+        height_at(read, inside, -inside)  # where fibres 1 and 4 start, as the pad lies
 
 
 def test_the_frame_on_the_bed_is_that_of_the_mould():
     plan = Plan(Morphology.straight(2), with_settings({"border_mm": 1.0}, printer={"bed_mm": [300.0, 200.0, 100.0]}))
     frame = bed_frame(plan)
-    assert (frame["centre_mm"], frame["angle_deg"]) == ([150.0, 100.0], 0.0)
+    assert (frame["centre_mm"], frame["angle_deg"], frame["mirrored"]) == ([150.0, 100.0], 0.0, True)
     assert frame["pad_mm"] == sizes(plan)["pad_mm"]
     assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
-
-
-@LONG
-def test_all_ways_to_the_solid_of_a_lid_agree():
-    assert_all_ways_agree(lid_body(Plan(Morphology.straight(1), with_settings(EVERYTHING))))
 
 
 def test_a_lid_with_pins_and_spout_has_the_volume_that_arithmetic_gives():
@@ -175,7 +161,6 @@ def test_a_lid_with_pins_and_spout_has_the_volume_that_arithmetic_gives():
     cup = cone(10 + flare * 0.2 / 6.2, 10 + flare, 6.0)
     lid = mesh(lid_body(plan))
     assert lid.volume() == pytest.approx(plate + cup - cone(6.0, 6 + flare, 6.0), rel=1e-6)
-    assert valid_solid(lid).volume == pytest.approx(lid.volume(), rel=1e-9)
 
 
 @pytest.mark.parametrize(("family", "heights"), [("horizontal", (1.2, 0.4)), ("vertical", (0.4, 1.2))])
@@ -240,11 +225,10 @@ def test_lid_has_the_holes_that_fit_the_pins():
     ("tapered", "knots", "layer_mm"),
     [(5.0, 1, 0.3), (17.0, 2, 0.3), *(pytest.param(draft, 4, 0.1, marks=LONG) for draft in (5.0, 17.0))],
 )
-def test_tapered_moulds_with_wells_are_valid_solids(tapered, knots, layer_mm):
+def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})
     plan = Plan(Morphology.random(1, knots, seed=3), tapers)
     for body in (mould_body(plan), conductive_body(conductive_plan(plan))):
-        assert valid_solid(mesh(body)).volume == pytest.approx(mesh(body).volume(), rel=1e-9)
         assert_one_closed_body(as_read(body))
 
 
@@ -286,7 +270,7 @@ def test_corners_that_meet_by_chance_are_drawn_apart():
 def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
     plan = Plan(Morphology.random(2, knots, seed))
-    read, fibre = as_read(mould_body(plan)), plan.settings.pad.fibre_diameter_mm
+    read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm
     floors = []
     for line in plan.lines:
         places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 60))

@@ -4,8 +4,11 @@ import shapely
 from shapely import affinity
 
 from design.pad.morphology import Morphology
+from fabricate.mould.assembly import mould_body
 from fabricate.mould.numerals import number_strokes
 from fabricate.mould.plan import Plan
+from sense.rig.session.pad_frame import Frame
+from sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 
 
@@ -91,3 +94,22 @@ def test_every_digit_reads_as_it_should(digit):
         for across, cell in enumerate(row):
             point = shapely.Point(place + height * np.array([across / 4, 1 - down / 4]))
             assert outline.covers(point) == (cell == "#")
+
+
+@pytest.mark.parametrize("pad", [Morphology.straight(5), Morphology.random(5, 3, seed=2)])
+def test_numbers_in_the_mould_read_right_on_the_pad_as_it_is_used(pad):
+    """The heights of the mould's floor, which the tracks' side of the pad is cast from, seen as an arm sees the pad."""
+    plan, mould = Plan(pad), with_settings({}).mould
+    floor = shapely.union_all([prism.area for prism in mould_body(plan).adds if prism.top_mm > mould.floor_mm])
+    lying = Frame.of(RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, mirrored=True))
+    rows = [row.split() for row in DIGITS.split("\n") if row]
+    for number, outline in enumerate(plan.numbers, 1):
+        assert outline is not None
+        x, y, *_ = lying.pose(np.array(shapely.box(*outline.bounds).centroid.coords[0]), 0.0)
+        half, height = (outline.bounds[2] - outline.bounds[0] - mould.ridge_width_mm) / 2, mould.number_mm
+        digit = number % 10  # the last one, on the right of who reads
+        for down, row in enumerate(rows):
+            for across, cell in enumerate(row[digit]):
+                seen = x + half + (across / 4 - 0.5) * height, y + height * (0.5 - down / 4), 0.0
+                (place,), _ = lying.tip(np.array([seen]))
+                assert floor.covers(shapely.Point(place)) == (cell == "#"), (number, down, across)

@@ -54,6 +54,28 @@ def test_ridges_run_into_the_walls_at_both_ends(border_mm):
         assert shapely.within(line, plan.tray)
 
 
+def test_a_mould_shrunk_is_the_pad():
+    plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": 1.0}, silicone={"shrinkage": 0.03}))
+    mould = plan.enlarged
+    assert mould.cavity.bounds[2] * 0.97 == pytest.approx(plan.cavity.bounds[2], rel=1e-12)
+    for larger, slot in zip(mould.exits, plan.exits, strict=True):
+        assert np.array(larger.bounds) * 0.97 == pytest.approx(slot.bounds, rel=1e-12)
+    for larger, curve in zip(mould.lines, exact_lines(plan.pad), strict=True):
+        shrunk = shapely.transform(larger, lambda places: 0.97 * places)
+        assert shapely.distance(shapely.points(curve.coords), shrunk).max() < 0.0025
+    assert mould.heights_mm[:2] == (0.4, 1.2)  # 0.412 and 1.237 mm in whole layers
+    assert plan.depths_mm == pytest.approx([0.97 * height for height in mould.heights_mm], rel=1e-8)
+    assert plan.thickness_mm == pytest.approx(0.97 * mould.silicone_mm) == pytest.approx(0.97 * 6.2)
+    assert mould.enlarged is mould
+    assert (mould.depths_mm, mould.thickness_mm) == (mould.heights_mm, mould.silicone_mm)
+
+
+def test_a_pad_that_does_not_shrink_is_its_own_mould():
+    plan = Plan(Morphology.straight(2), with_settings(silicone={"name": "EcoFlex 00-20", "shrinkage": 0.0}))
+    assert plan.enlarged is plan
+    assert Plan(Morphology.straight(2)).enlarged.pad.pitch_mm == 11.25
+
+
 def test_polygon_rings_keep_the_area_on_their_left():
     area = shapely.box(0, 0, 3, 3).difference(shapely.box(1, 1, 2, 2))
     ((outer, hole),) = polygon_rings(area)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manifold3d import Manifold, Mesh64
 
-from fabricate.mould.benchmark import fused_solid
-from fabricate.mould.cad_solid import faceted_solid
+from fabricate.mould.cad.bodies import body_solid
+from fabricate.mould.cad.facets import faceted_solid
 from fabricate.mould.mesh import mesh
 from fabricate.mould.prisms import Body, Prism
 
@@ -68,4 +68,4 @@ def test_any_union_of_boxes(seed):
         return
     solid = faceted_solid(mesh(body))
     assert solid.is_valid
-    assert solid.volume == pytest.approx(fused_solid(body).volume, rel=1e-7)
+    assert solid.volume == pytest.approx(body_solid(body).volume, rel=1e-7)

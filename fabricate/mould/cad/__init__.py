@@ -1,0 +1,1 @@
+"""The mould as a CAD model: true curves, named and coloured parts."""

@@ -1,0 +1,134 @@
+"""Which part of a mould fills every cell of its drawing, from what height to what height.
+
+Parts touch and do not overlap: tracks and numbers stand on the tray, and where tracks cross the taller one goes
+through. Lengths are mm, z = 0 is the underside of the tray.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from fabricate.mould import parts
+from fabricate.mould.plan import Plan
+
+from .outlines.drawing import GRID_MM, Drawing
+from .outlines.joints import joints, with_joints
+from .outlines.pieces import FINE_MM, Piece, outline_pieces, straight_pieces
+from .walls import FLOOR, RIM, Walls, walls_of
+
+Surface = float | tuple[Walls, int]
+"""A height, mm, or one of the walls' planes."""
+TRAY, HORIZONTAL, VERTICAL, NUMBERS = PARTS = ("tray", "horizontal tracks", "vertical tracks", "numbers")
+
+
+class Span(NamedTuple):
+    """What bounds a part below and above."""
+
+    bottom: Surface
+    top: Surface
+
+
+@dataclass(frozen=True)
+class Part:
+    """A named part: of every cell of the drawing what it fills, None for nothing."""
+
+    name: str
+    spans: Sequence[Span | None]
+
+
+class _Standing(NamedTuple):
+    """What stands on the floor: of which part, up to where, and its outline."""
+
+    part: str
+    top_mm: float
+    outline: BaseGeometry
+    pieces: list[Piece]
+
+
+def layout(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) -> tuple[Drawing, list[Part]]:
+    """The drawing of a mould and its parts.
+
+    Args:
+        fit_mm: how near splines stay to the finely drawn outlines.
+        wells: outlines that belong to the ridges of each level; none for a pad whose fibres are laid.
+    """
+    walls = walls_of(plan)
+    rim_mm = walls.floor_mm + walls.depth_mm
+    standing = sorted([*_ridges(plan, fit_mm, wells), *_numbers(plan)], key=lambda each: -each.top_mm)
+    opened = [walls.outline(z).boundary for z in sorted({*(each.top_mm for each in standing), rim_mm})]
+    straight = [plan.tray.boundary, *opened, *walls.creases()]
+    pieces = [piece for line in straight for piece in straight_pieces(line)]
+    pieces += [piece for each in standing for piece in each.pieces]
+    drawing = Drawing([*straight, *(each.outline.boundary for each in standing)], pieces)
+
+    sheets = walls.sheets(drawing.middles).tolist()
+    under: list[Surface] = [walls.floor_mm if k == FLOOR else rim_mm if k == RIM else (walls, k) for k in sheets]
+    heights = walls.heights(drawing.middles)
+    spans: dict[str, list[Span | None]] = {name: [None] * len(under) for name in PARTS}
+    free = np.ones(len(under), dtype=bool)
+    for each in standing:
+        shapely.prepare(each.outline)
+        for cell in np.flatnonzero(free & shapely.contains_xy(each.outline, drawing.middles) & (heights < each.top_mm)):
+            spans[each.part][cell] = Span(under[cell], each.top_mm)
+            free[cell] = False
+    for cell in np.flatnonzero(shapely.contains_xy(plan.tray, drawing.middles)):
+        spans[TRAY][cell] = Span(0.0, under[cell])
+    for thin, beside in drawing.thin().items():
+        for each in spans.values():
+            each[thin] = each[beside]
+    return drawing, [Part(name, each) for name, each in spans.items() if any(each)]
+
+
+def _ridges(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_Standing]:
+    """The terraces of the ridges of every level."""
+    families = {level: plan.family(fibre) for fibre, level in enumerate(plan.levels)}
+    for level, height_mm in enumerate(plan.heights_mm):
+        for down_mm in parts.terraces(height_mm, plan.settings.terrace_mm):
+            outline = plan.outline(level, down_mm, FINE_MM)
+            if wells and not down_mm:
+                outline = shapely.union_all([outline, wells[level]], grid_size=GRID_MM)
+            at = joints(plan, level, plan.settings.mould.ridge_width_mm / 2 + down_mm * plan.settings.ridge_slope)
+            outline = with_joints(outline, at)
+            top = plan.settings.mould.floor_mm + height_mm - down_mm
+            yield _Standing(
+                (HORIZONTAL, VERTICAL)[families[level]],
+                top,
+                outline,
+                outline_pieces(outline, at, (plan.settings.mould.floor_mm, top), fit_mm),
+            )
+
+
+def _numbers(plan: Plan) -> Iterator[_Standing]:
+    top = plan.settings.mould.floor_mm + plan.settings.mould.shallow_ridge_height_mm
+    for outline in plan.numbers:
+        if outline is not None:
+            yield _Standing(NUMBERS, top, outline, straight_pieces(outline.boundary))
+
+
+def contact_mm2(drawing: Drawing, parts: Sequence[Part]) -> float:
+    """The area where parts touch each other: undersides of what stands, crossings, ends at upright walls."""
+    area = 0.0
+    owner: dict[int, tuple[str, Span]] = {}
+    for part in sorted(parts, key=lambda part: part.name != TRAY):  # what stands on the tray hides it
+        for cell, span in enumerate(part.spans):
+            if span is not None:
+                owner[cell] = part.name, span
+                if part.name != TRAY:
+                    lean = math.hypot(*span.bottom[0].normal(span.bottom[1])) if isinstance(span.bottom, tuple) else 1.0
+                    area += lean * drawing.cells[cell].area
+    for (a, b), (left, right) in zip(drawing.edges, drawing.sides.tolist(), strict=True):
+        if left in owner and right in owner and owner[left][0] != owner[right][0]:
+            (_, one), (_, other) = owner[left], owner[right]
+            low, top = max(_level(one.bottom), _level(other.bottom)), min(_level(one.top), _level(other.top))
+            area += GRID_MM * math.dist(a, b) * max(0.0, top - low)
+    return area
+
+
+def _level(surface: Surface) -> float:
+    """The height of a surface, mm; of a leaning wall its foot."""
+    return surface[0].floor_mm if isinstance(surface, tuple) else surface

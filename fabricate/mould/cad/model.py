@@ -1,0 +1,167 @@
+"""The CAD model of what is printed: named and coloured parts in one assembly, of true curves.
+
+Importing this module loads the CAD kernel, which takes seconds: import it where it is used.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# The CAD kernel's modules come without types.
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from build123d import Color, Compound, Location, Solid
+from OCP.BRepGProp import BRepGProp
+from OCP.GProp import GProp_GProps
+from shapely.geometry.base import BaseGeometry
+
+from design.common.errors import InputError
+from design.common.figures import HORIZONTAL, VERTICAL
+from design.pad.morphology import Morphology
+from fabricate.mould.assembly import conductive_plan, pins, well_outlines
+from fabricate.mould.parts import INTO_FLOOR_MM
+from fabricate.mould.plan import Plan
+from fabricate.mould.prisms import COLOURS, Body
+from fabricate.settings import DEFAULTS, FabricationSettings
+
+from . import layout
+from .bodies import body_solid, prism_solids
+from .shells import solids
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+FITS_MM = (2e-3, 5e-4, 1e-4)
+"""How near curves are to the exact outlines; where the kernel finds a solid invalid, it is tried with the next.
+
+Curves that hardly cross may do so in another order than what they stand for, which finer ones do not.
+"""
+_TRACKS = {layout.HORIZONTAL: HORIZONTAL, layout.VERTICAL: VERTICAL}
+_GREY = "#5D6B7A"
+_ROUND = 512
+"""Sides of the polygons that stand for circles until they become arcs: cut anywhere, also on a chord, they do."""
+_APART_MM = 10.0
+"""Between bodies that stand side by side."""
+_EXACT = 1e-2
+"""Error asked for of volumes and surfaces, as a share: what comes is a million times better, unlike without asking."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A body in CAD.
+
+    Attributes:
+        shape: its named parts, which touch and do not overlap. contact_mm2: the area where they touch.
+        fit_mm: how near its curves are to the exact outlines; 0 where it has none.
+    """
+
+    shape: Compound
+    contact_mm2: float = 0.0
+    fit_mm: float = 0.0
+
+    def apart(self, mesh: "Manifold") -> tuple[float, float]:
+        """How far volume and surface lie from those of a mesh of the same body, as shares of them."""
+        volumes, surfaces = GProp_GProps(), GProp_GProps()
+        BRepGProp.VolumeProperties_s(self.shape.wrapped, volumes, _EXACT)
+        BRepGProp.SurfaceProperties_s(self.shape.wrapped, surfaces, _EXACT)
+        surface_mm2 = surfaces.Mass() - 2 * self.contact_mm2
+        return abs(volumes.Mass() / mesh.volume() - 1), abs(surface_mm2 / mesh.surface_area() - 1)
+
+
+def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> Compound:
+    """The mould in CAD: tray, horizontal tracks, vertical tracks, numbers and pins, each named and coloured.
+
+    Args:
+        pad: the fibres.
+        settings: tray, ridges and fibre.
+
+    Returns:
+        An assembly of closed solids, mm, which touch and do not overlap.
+
+    Raises:
+        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out.
+    """
+    plan = Plan(pad, settings)
+    plan.require_levels()
+    return mould_model(plan.enlarged, "mould").shape
+
+
+def mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> Model:
+    """The mould of a plan.
+
+    Args:
+        wells: outlines that belong to the ridges of each level; none for a pad whose fibres are laid.
+
+    Raises:
+        InputError: the CAD kernel finds a solid invalid, however fine its curves.
+    """
+    for fit_mm in FITS_MM:
+        drawing, parts = layout.layout(plan, fit_mm, wells)
+        together = {part.name: list(solids(drawing, part.spans)) for part in parts}
+        if all(solid.is_valid for own in together.values() for solid in own):
+            break
+    else:
+        raise InputError(f"{name}: the CAD kernel finds a solid invalid; leave step out of the formats")
+    colours = {layout.TRAY: COLOURS["mould"], **_TRACKS}
+    children = [_part(part, own, colours.get(part, _GREY)) for part, own in together.items()]
+    contact = layout.contact_mm2(drawing, parts)
+    if plan.settings.mould.pins:
+        standing = [replace(pin, bottom_mm=pin.bottom_mm + INTO_FLOOR_MM) for pin in pins(plan)]
+        children.append(_part("pins", prism_solids(standing), _GREY))
+        contact += sum(pin.area.area for pin in standing)
+    return Model(Compound(label=name, children=children), contact, fit_mm)
+
+
+def body_model(body: Body, name: str) -> Model:
+    """A body of few prisms: a lid, a holder.
+
+    Raises:
+        InputError: the CAD kernel finds the solid invalid.
+    """
+    own = body_solid(body).solids()
+    if not all(solid.is_valid for solid in own):
+        raise InputError(f"{name}: the CAD kernel finds the solid invalid; leave step out of the formats")
+    return Model(_part(name, own, COLOURS[name]))
+
+
+def models(plan: Plan, bodies: Mapping[str, Body]) -> list[Model]:
+    """All bodies of a pad in CAD, in their order: the moulds from their plans, the others from what they are made of.
+
+    Args:
+        plan: of the pad as used.
+
+    Raises:
+        InputError: the CAD kernel finds a solid invalid.
+    """
+    made = []
+    for name, body in bodies.items():
+        if name == "mould":
+            made.append(mould_model(plan.enlarged, name))
+        elif name == "conductive":
+            second = conductive_plan(plan).enlarged
+            made.append(mould_model(second, name, well_outlines(second, sides=_ROUND)))
+        else:
+            made.append(body_model(body, name))
+    return made
+
+
+def assembly(models: Sequence[Model], plan: Plan) -> Compound:
+    """All that is printed for a pad: the lid on the rim of the mould, which is of a plan, and the others beside it."""
+    if len(models) == 1:
+        return models[0].shape
+    beside, children = 0.0, []
+    for model in models:
+        box = model.shape.bounding_box()
+        if model.shape.label == "lid":
+            place = (0.0, 0.0, plan.settings.mould.floor_mm + plan.silicone_mm)
+        else:
+            place = (beside - box.min.X if children else 0.0, 0.0, 0.0)
+            beside = place[0] + box.max.X + _APART_MM
+        children.append(model.shape.locate(Location(place)))
+    return Compound(label="moulds of the pad", children=children)
+
+
+def _part(name: str, own: Iterable[Solid], colour: str) -> Any:
+    part = Compound(list(own), label=name)
+    part.color = Color(colour)
+    return part

@@ -1,0 +1,1 @@
+"""Outlines drawn finely, and the true curves and cells that come of them."""

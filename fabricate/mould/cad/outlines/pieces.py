@@ -1,0 +1,184 @@
+"""Smooth pieces of outlines: a finely drawn ring becomes straight lines, arcs and cubic splines that follow it.
+
+A ring is cut where it has a corner, where a straight edge begins or ends, and where the curvature jumps. What is left
+between two cuts is smooth, and one curve follows all of it: a circle's arc where one does, else a cubic spline. Its
+ends are exact, and tangent to what goes on smoothly from there. Lengths are mm.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from shapely.geometry.base import BaseGeometry
+
+from fabricate.mould.plan import polygon_rings
+
+from .joints import Joints
+from .splines import breaks, lengths, spline, stretch
+
+Array = NDArray[np.float64]
+
+FINE_MM = 3e-4
+"""How near the drawn rings are to the exact outlines: a vertex is far nearer still."""
+_CORNER_RAD = 0.2
+"""A sharper turn at one vertex is a corner; finely drawn curves turn by less, but where they hardly have a radius."""
+_STRAIGHT_MM = 1e-3
+"""An edge is straight if it were so much away from its arc otherwise: drawn curves are several times nearer."""
+_ARC_MM = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A smooth run of an outline from s = 0 to `length`, the length along its vertices.
+
+    Attributes:
+        points: (n, 2) vertices. curve: a cubic spline over s, None for lines and arcs.
+        arc: centre x and y, radius, angle at the start and angle swept (positive counter-clockwise), radians.
+        rise: from what height to what height the wall of its outline stands, mm, where that is known.
+    """
+
+    points: Array
+    curve: BSpline | None = None
+    arc: tuple[float, float, float, float, float] | None = None
+    rise: tuple[float, float] = (math.inf, -math.inf)
+    length: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "length", float(lengths(self.points)[-1]))
+
+    def at(self, s: Array | float) -> Array:
+        """(..., 2) points at lengths (...,) from the start."""
+        if self.curve is not None:
+            return self.curve(s)
+        if self.arc is not None:
+            x, y, radius, start, sweep = self.arc
+            angle = start + sweep * s / self.length
+            return np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=-1)
+        return self.points[0] + np.multiply.outer(s / self.length, self.points[-1] - self.points[0])
+
+    def tangent(self, s: Array | float) -> Array:
+        """(..., 2) derivative of the points by s."""
+        if self.curve is not None:
+            return self.curve(s, 1)
+        if self.arc is not None:
+            _, _, radius, start, sweep = self.arc
+            angle = start + sweep * s / self.length
+            return radius * sweep / self.length * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+        return np.broadcast_to((self.points[-1] - self.points[0]) / self.length, (*np.shape(s), 2))
+
+
+def outline_pieces(area: BaseGeometry, joints: Joints, rise: tuple[float, float], fit_mm: float) -> list[Piece]:
+    """The pieces of all rings of an area whose curves are drawn within `FINE_MM`.
+
+    Args:
+        joints: vertices where the curvature jumps; their directions may be those of who walks the other way.
+        rise: from what height to what height the outline's wall stands, mm.
+        fit_mm: how near splines stay to the rings.
+    """
+    pieces = (piece for rings in polygon_rings(area) for ring in rings for piece in ring_pieces(ring, joints, fit_mm))
+    return [replace(piece, rise=rise) for piece in pieces]
+
+
+def straight_pieces(lines: BaseGeometry) -> list[Piece]:
+    """Every edge of lines or rings as a piece of its own."""
+    ends = (shapely.get_coordinates(line) for line in shapely.get_parts(lines))
+    return [Piece(points[i : i + 2]) for points in ends for i in range(len(points) - 1)]
+
+
+def ring_pieces(ring: Array, joints: Joints, fit_mm: float) -> Iterator[Piece]:
+    """The pieces of one closed ring (n, 2), first point not repeated, in order."""
+    edges = np.roll(ring, -1, axis=0) - ring
+    along = np.linalg.norm(edges, axis=1)
+    before = np.roll(edges, 1, axis=0)
+    turn = np.abs(np.arctan2(before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0], (before * edges).sum(axis=1)))
+    corner = turn > _CORNER_RAD
+    straight = _straight(along, turn, corner)
+    joint = np.array([vertex in joints for vertex in map(tuple, ring.tolist())])
+    cuts = np.flatnonzero(corner | straight | np.roll(straight, 1) | joint)
+    if not len(cuts):  # smooth all round: two halves
+        cuts = np.array([0, len(ring) // 2])
+
+    def direction(vertex: int) -> Array | None:
+        """Where the ring runs at a vertex; None at corners, where it runs two ways, and where nobody knows."""
+        if corner[vertex]:
+            return None
+        if straight[vertex]:
+            return edges[vertex] / along[vertex]
+        if straight[vertex - 1]:
+            return before[vertex] / along[vertex - 1]
+        given = joints.get((ring[vertex, 0], ring[vertex, 1]))
+        return None if given is None else given * np.sign(given @ edges[vertex])
+
+    for first, last in zip(cuts.tolist(), np.roll(cuts, -1).tolist(), strict=True):
+        count = (last - first - 1) % len(ring) + 1
+        points = ring[(first + np.arange(count + 1)) % len(ring)]
+        if count == 1:
+            yield Piece(points)
+        else:
+            yield from _curved(points, [direction(first), direction(last)], fit_mm)
+
+
+def _straight(along: Array, turn: Array, corner: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which edges are straight lines rather than chords of a curve."""
+    smooth = np.where(corner, 0.0, turn)
+    ends = (~corner).astype(int) + np.roll(~corner, -1)
+    mean = (smooth + np.roll(smooth, -1)) / np.maximum(ends, 1)
+    return (ends == 0) | (along * mean / 8 > _STRAIGHT_MM)
+
+
+def _curved(points: Array, tangents: list[Array | None], fit_mm: float) -> Iterator[Piece]:
+    """The pieces of a smooth run of vertices (n, 2), n > 2, with the directions at its ends where they are known."""
+    if np.abs(_beside(points)).max() < _ARC_MM:
+        yield Piece(points[[0, -1]])
+        return
+    if (arc := arc_through(points)) is not None:
+        yield Piece(points, arc=arc)
+        return
+    s = lengths(points)
+    ends = [_end_tangent(s, points) if tangents[0] is None else tangents[0]]
+    ends.append(_end_tangent(s[-1] - s[::-1], points[::-1]) * -1 if tangents[1] is None else tangents[1])
+    curve = spline(points, ends, fit_mm)
+    cuts = sorted({0, *np.searchsorted(s, breaks(curve)).tolist(), len(s) - 1})
+    for first, last in pairwise(cuts):
+        part = stretch(curve, s[first], s[last])
+        yield Piece(points[first : last + 1], curve=BSpline(part.t - part.t[0], part.c, 3))
+
+
+def arc_through(points: Array) -> tuple[float, float, float, float, float] | None:
+    """The circle's arc through vertices (n, 2), or None where no arc is near all of them."""
+    if len(points) < 5:
+        return None
+    middle = points.mean(axis=0)
+    away = points - middle
+    system = np.column_stack([2 * away, np.ones(len(away))])
+    x, y, rest = np.linalg.lstsq(system, (away**2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(rest + x * x + y * y))
+    from_centre = away - (x, y)
+    if not np.abs(np.linalg.norm(from_centre, axis=1) - radius).max() < _ARC_MM:
+        return None
+    angles = np.unwrap(np.arctan2(from_centre[:, 1], from_centre[:, 0]))
+    return middle[0] + x, middle[1] + y, radius, float(angles[0]), float(angles[-1] - angles[0])
+
+
+def _beside(points: Array) -> Array:
+    """(n,) how far points lie to the left of the line from the first to the last."""
+    away, along = points - points[0], points[-1] - points[0]
+    return (along[0] * away[:, 1] - along[1] * away[:, 0]) / np.linalg.norm(along)
+
+
+def _end_tangent(s: Array, points: Array) -> Array:
+    """Direction at the first vertex: that of the parabola through the first three, as far as the first edge allows.
+
+    An edge is a chord that its curve stays within `FINE_MM` of: directions differ by 4 `FINE_MM` / length at most.
+    """
+    a, b = s[1], s[2]
+    chord = (points[1] - points[0]) / a
+    slope = chord * b / (b - a) - (points[2] - points[0]) / b * a / (b - a)
+    turn = np.arctan2(chord[0] * slope[1] - chord[1] * slope[0], chord @ slope)
+    turn = np.clip(turn, -4 * FINE_MM / a, 4 * FINE_MM / a)
+    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ chord

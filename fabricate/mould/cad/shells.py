@@ -1,0 +1,270 @@
+"""Solids from slabs: faces on planes, cylinders and spline surfaces that share their edges.
+
+Nothing is intersected or fused by the CAD kernel: the boundary is put together face by face. Lengths are mm.
+
+Importing this module loads the CAD kernel, which takes seconds: import it where it is used.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# The CAD kernel's modules come without types.
+
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from build123d import Solid
+from OCP.BRep import BRep_Builder
+from OCP.Geom import Geom_Plane
+from OCP.gp import gp_Dir, gp_Pnt
+from OCP.TopAbs import TopAbs_REVERSED
+from OCP.TopLoc import TopLoc_Location
+from OCP.TopoDS import TopoDS_Edge, TopoDS_Face, TopoDS_Shell, TopoDS_Solid, TopoDS_Vertex, TopoDS_Wire
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .layout import Span, Surface
+from .outlines.arrangement import Arrangement, Loop
+from .outlines.drawing import Drawing
+from .rising import Rising, rising, upright_line
+
+Steps = tuple[int, int, int]
+"""Heights over start, end and middle of a chain, in steps of `STEP_MM`."""
+
+STEP_MM, SAME_MM = 1e-7, 1e-5
+"""Heights are whole steps, and those no further apart than `SAME_MM` are one."""
+EXACT_MM = 1e-6
+"""Tolerance of edges and vertices where curves meet as they should."""
+
+
+def solids(drawing: Drawing, spans: Sequence[Span | None]) -> Iterator[Solid]:
+    """The solids of a part, outward normals, each in one piece.
+
+    Args:
+        spans: what the part fills of every cell of the drawing.
+    """
+    arrangement = Arrangement(drawing, spans)
+    together = _connected(drawing, spans)
+    number = {cell: k for k, cells in enumerate(together) for cell in cells}
+    around: list[list[int]] = [[] for _ in together]
+    for k, chain in enumerate(arrangement.chains):
+        around[number[max(chain.left, chain.right)]].append(k)
+    for cells, chains in zip(together, around, strict=True):
+        yield _solid(arrangement, cells, chains, spans)
+
+
+def _connected(drawing: Drawing, spans: Sequence[Span | None]) -> list[list[int]]:
+    """The cells of every solid."""
+    filled = np.array([*(span is not None for span in spans), False])
+    a, b = drawing.sides[filled[drawing.sides].all(axis=1)].T
+    links = coo_array((np.ones(len(a)), (a, b)), shape=2 * (len(spans),))
+    group = connected_components(links, directed=False)[1]
+    together: dict[int, list[int]] = defaultdict(list)
+    for cell, number in enumerate(group.tolist()):
+        if spans[cell]:
+            together[number].append(cell)
+    return list(together.values())
+
+
+@dataclass(frozen=True)
+class _Side:
+    """An upright face over a chain."""
+
+    chain: int
+    low: Surface
+    high: Surface
+    solid_left: bool
+
+
+def _solid(arrangement: Arrangement, cells: list[int], chains: list[int], spans: Sequence[Any]) -> Solid:
+    """The solid over cells that hang together, bounded by chains."""
+    shell = _Shell(arrangement)
+    sides = [side for k in chains for side in _sides(shell, k, spans)]
+    for side in sides:
+        shell.note(side)
+    for side in sides:
+        shell.rise(side)
+    for upward in (True, False):
+        together: dict[Surface, list[int]] = defaultdict(list)
+        for cell in cells:
+            together[spans[cell].top if upward else spans[cell].bottom].append(cell)
+        for surface, own in together.items():
+            for loops in arrangement.faces(own):
+                shell.cover(surface, loops, upward)
+    return Solid(shell.close())
+
+
+def _sides(shell: "_Shell", k: int, spans: Sequence[Any]) -> Iterator[_Side]:
+    """The upright faces over a chain: where one side is solid and the other is not."""
+    chain = shell.arrangement.chains[k]
+    for mine, other, left in ((chain.left, chain.right, True), (chain.right, chain.left, False)):
+        if mine < 0:
+            continue
+        low, top = spans[mine]
+        if other >= 0:
+            low = max(low, spans[other].top, key=lambda surface: shell.over(k, surface))
+        if shell.over(k, low) < shell.over(k, top):
+            yield _Side(k, low, top, left)
+
+
+class _Shell:
+    """A shell in the making: faces that share vertices and edges."""
+
+    def __init__(self, arrangement: Arrangement) -> None:
+        self.arrangement = arrangement
+        self.builder = BRep_Builder()
+        self.shell = TopoDS_Shell()
+        self.builder.MakeShell(self.shell)
+        self.known: dict[Hashable, list[int]] = defaultdict(list)
+        self.heights: dict[int, set[int]] = defaultdict(set)
+        self.vertices: dict[tuple[int, int], Any] = {}
+        self.edges: dict[Any, Any] = {}
+        self.risings: dict[int, Rising] = {}
+
+    def over(self, k: int, surface: Surface) -> Steps:
+        """Heights of a surface over a chain."""
+        chain = self.arrangement.chains[k]
+        if isinstance(surface, tuple):
+            middle = self.arrangement.pieces[chain.piece].at((chain.start + chain.end) / 2)
+            places = np.vstack([self.arrangement.nodes[list(chain.nodes)], middle])
+            heights = surface[0].plane(surface[1], places).tolist()
+        else:
+            heights = [surface] * 3
+        start, end, half = (self._one(at, z) for at, z in zip((*chain.nodes, (k,)), heights, strict=True))
+        return start, end, half
+
+    def _one(self, at: Hashable, height_mm: float) -> int:
+        """A height over a node or the middle of a chain in steps: the same for all that differ by rounding only."""
+        step = round(height_mm / STEP_MM)
+        known = self.known[at]
+        for other in known:
+            if abs(other - step) < SAME_MM / STEP_MM:
+                return other
+        known.append(step)
+        return step
+
+    def note(self, side: _Side) -> None:
+        """Remember where a side's corners are: uprights are divided there."""
+        nodes = self.arrangement.chains[side.chain].nodes
+        for surface in (side.low, side.high):
+            for node, z in zip(nodes, self.over(side.chain, surface), strict=False):
+                self.heights[node].add(z)
+
+    def rise(self, side: _Side) -> None:
+        """Add an upright face."""
+        k, wall = side.chain, self._rising(side.chain)
+        start, end = self.arrangement.chains[k].nodes
+        low, high = self.over(k, side.low), self.over(k, side.high)
+        surface = wall.surface(_height(side.low), _height(side.high))
+        ups, downs = self._uprights(end, low[1], high[1]), self._uprights(start, low[0], high[0])[::-1]
+        bottom, top = self._level(k, side.low), self._level(k, side.high)
+        round_ = [
+            (bottom, True),
+            *((edge, True) for edge, _ in ups),
+            (top, False),
+            *((edge, False) for edge, _ in downs),
+        ]
+        if not wall.rightward:
+            round_ = [(edge, not forward) for edge, forward in reversed(round_)]
+        for edge, over in ((bottom, side.low), (top, side.high)):
+            self._lie(edge, wall.across(_height(over)), surface)
+        for at, uprights in ((1, ups), (0, downs)):
+            for edge, z in uprights:
+                self._lie(edge, wall.upright(at, z), surface)
+        self._add(surface, [self._wire(round_)], side.solid_left != wall.rightward)
+
+    def cover(self, surface: Surface, loops: list[Loop], upward: bool) -> None:
+        """Add a face above (upward) or below, its loops counter-clockwise seen from above, the outer one first."""
+        node = self.arrangement.chains[loops[0][0][0]].nodes[0]
+        place = self.arrangement.nodes[node]
+        if isinstance(surface, tuple):
+            walls, sheet = surface
+            plane = Geom_Plane(gp_Pnt(*place, float(walls.plane(sheet, place[None])[0])), gp_Dir(*walls.normal(sheet)))
+        else:
+            plane = Geom_Plane(gp_Pnt(*place, surface), gp_Dir(0, 0, 1))
+        wires = [self._wire([(self._level(k, surface), forward) for k, forward in loop]) for loop in loops]
+        self._add(plane, wires, not upward)
+
+    def close(self) -> Any:
+        """The solid inside the shell."""
+        self.shell.Closed(True)
+        solid = TopoDS_Solid()
+        self.builder.MakeSolid(solid)
+        self.builder.Add(solid, self.shell)
+        return solid
+
+    def _add(self, surface: Any, wires: list[Any], reverse: bool) -> None:
+        face = TopoDS_Face()
+        self.builder.MakeFace(face, surface, EXACT_MM)
+        for wire in wires:
+            self.builder.Add(face, wire)
+        self.builder.Add(self.shell, face.Reversed() if reverse else face)
+
+    def _wire(self, edges: list[tuple[Any, bool]]) -> Any:
+        wire = TopoDS_Wire()
+        self.builder.MakeWire(wire)
+        for edge, forward in edges:
+            self.builder.Add(wire, edge if forward else edge.Reversed())
+        wire.Closed(True)
+        return wire
+
+    def _lie(self, edge: Any, curve: Any, surface: Any) -> None:
+        """Say where an edge lies in a surface's parameters, unless that is a plane, which needs no such word."""
+        if curve is not None:
+            self.builder.UpdateEdge(edge, curve, surface, TopLoc_Location(), EXACT_MM)
+
+    def _rising(self, k: int) -> Rising:
+        if k not in self.risings:
+            chain = self.arrangement.chains[k]
+            ends = self.arrangement.nodes[list(chain.nodes)]
+            self.risings[k] = rising(self.arrangement.pieces[chain.piece], chain, ends)
+        return self.risings[k]
+
+    def _level(self, k: int, surface: Surface) -> Any:
+        """The edge over a chain on a surface, along its piece."""
+        over = self.over(k, surface)
+        if (k, over) not in self.edges:
+            ends = [self._vertex(node, z) for node, z in zip(self.arrangement.chains[k].nodes, over, strict=False)]
+            self.edges[k, over] = self._edge(*self._rising(k).curve(_height(surface)), ends, self._slack(k))
+        return self.edges[k, over]
+
+    def _uprights(self, node: int, low: int, high: int) -> list[tuple[Any, float]]:
+        """The edges upwards over a node from one height to another, each with the height it begins at."""
+        edges = []
+        for a, b in pairwise(sorted(z for z in self.heights[node] if low <= z <= high)):
+            if (node, a, b) not in self.edges:
+                x, y = self.arrangement.nodes[node].tolist()
+                ends, slack = [self._vertex(node, a), self._vertex(node, b)], float(self.arrangement.slack_mm[node])
+                line = upright_line(x, y, a * STEP_MM)
+                self.edges[node, a, b] = self._edge(line, 0.0, (b - a) * STEP_MM, ends, slack)
+            edges.append((self.edges[node, a, b], a * STEP_MM))
+        return edges
+
+    def _slack(self, k: int) -> float:
+        return float(self.arrangement.slack_mm[list(self.arrangement.chains[k].nodes)].max())
+
+    def _edge(self, curve: Any, first: float, last: float, ends: list[Any], slack_mm: float) -> Any:
+        edge = TopoDS_Edge()
+        self.builder.MakeEdge(edge, curve, EXACT_MM + slack_mm)
+        self.builder.Add(edge, ends[0])
+        self.builder.Add(edge, ends[1].Oriented(TopAbs_REVERSED))
+        self.builder.Range(edge, first, last)
+        return edge
+
+    def _vertex(self, node: int, z: int) -> Any:
+        if (node, z) not in self.vertices:
+            vertex, place = TopoDS_Vertex(), self.arrangement.nodes[node].tolist()
+            tolerance = 2 * (EXACT_MM + float(self.arrangement.slack_mm[node]))
+            self.builder.MakeVertex(vertex, gp_Pnt(*place, z * STEP_MM), tolerance)
+            self.vertices[node, z] = vertex
+        return self.vertices[node, z]
+
+
+def _height(surface: Surface) -> Any:
+    """A surface as heights over places."""
+    if not isinstance(surface, tuple):
+        return surface
+    walls, sheet = surface
+    return lambda places: walls.plane(sheet, places)

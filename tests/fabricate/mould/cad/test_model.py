@@ -1,0 +1,283 @@
+"""CAD models of moulds: closed forms, exact offsets of fibres, and the mesh as judge."""
+
+# pyright: reportAttributeAccessIssue=false
+# The CAD kernel's modules come without types.
+
+import math
+
+import numpy as np
+import pytest
+from build123d import Compound, GeomType, Solid, import_step
+from hypothesis import given
+from hypothesis import strategies as st
+from OCP.BRepGProp import BRepGProp
+from OCP.GProp import GProp_GProps
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial import KDTree
+
+from design.common.errors import InputError
+from design.pad.courses.curves import lengths
+from design.pad.morphology import Morphology
+from fabricate.mould.assembly import conductive_plan, holder_body, lid_body, mould_body, well_outlines
+from fabricate.mould.cad import model as of_model
+from fabricate.mould.cad.model import FITS_MM, Model, assembly, body_model, build_mould, models, mould_model
+from fabricate.mould.cad.step_file import write_step
+from fabricate.mould.mesh import mesh
+from fabricate.mould.plan import Plan
+from tests.fabricate.planted import level_pad, winding_pad, with_settings
+from tests.helpers.effort import LONG, few
+
+PLAIN: dict[str, object] = {"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0}
+SOFT = winding_pad((0.3, 1.0), (0.6, 1.5), (0.9, 1.35), (1.3, 0.6), (1.7, 1.0))
+"""A fibre without tight bends that leaves the pad straight on."""
+
+
+def part(model: Model, name: str) -> Compound:
+    (found,) = (child for child in model.shape.children if child.label == name)
+    return found
+
+
+def judged(plan: Plan, **wells) -> Model:
+    """The model of a plan's mould, valid and as large as its mesh."""
+    model = mould_model(plan.enlarged, "mould", **wells)
+    assert all(solid.is_valid for solid in model.shape.solids())
+    apart = model.apart(mesh(mould_body(plan.enlarged, **wells)))
+    assert max(apart) < 2e-4, apart
+    return model
+
+
+def mild_pad(grid: int, knots: int, seed: int) -> Morphology:
+    """Fibres that wind about their straight courses, as designed ones do."""
+    rng = np.random.default_rng(seed)
+    along = (np.arange(1, knots + 1) / (knots + 1) + rng.uniform(-0.2, 0.2, (2 * grid, knots)) / knots) * (grid + 1)
+    aside = np.tile(np.arange(1, grid + 1), 2)[:, None] + rng.uniform(-0.6, 0.6, (2 * grid, knots))
+    places = np.stack([along, aside], axis=2)
+    places[grid:] = places[grid:, :, ::-1]
+    straight = Morphology.straight(grid)
+    ends = [straight.knots[:, :1], places, straight.knots[:, -1:]]
+    return Morphology(np.concatenate(ends, axis=1), straight.pitch_mm)
+
+
+@pytest.mark.parametrize("draft_deg", [0.0, 2.0, 20.0])
+def test_a_straight_pad_has_the_volume_and_surface_that_arithmetic_gives(draft_deg):
+    plan = Plan(Morphology.straight(4), with_settings(PLAIN | {"wall_draft_deg": draft_deg}))
+    slope = math.tan(math.radians(draft_deg))
+    inner, ridge, lean = 56.25, 0.4, 2 * 6 * slope
+    ridges = 4 * inner * ridge * (1.2 + 0.4) - 16 * ridge * ridge * 0.4  # the shallow ones end at the deep ones
+    rim = inner + lean
+    hollow = 6 * (inner**2 + inner * rim + rim**2) / 3
+    behind = 2 * ridge * slope * 4 * (1.2**2 + 0.4**2) / 2  # where the wall leans off a ridge's end
+    expected = (rim + 4) ** 2 * 8 - hollow + ridges + behind
+    model = judged(plan)
+    assert sum(child.volume for child in model.shape.children) == pytest.approx(expected, rel=1e-9)
+    assert build_mould(plan.pad, plan.settings).volume == pytest.approx(expected, rel=1e-9)
+    assert max(model.apart(mesh(mould_body(plan)))) < 1e-7
+    assert all(face.geom_type == GeomType.PLANE for face in model.shape.faces())
+
+
+def test_the_walls_of_a_curved_fibre_are_as_long_as_its_exact_offsets():
+    """Where a bend is wider than half the track, the offsets to the left and right are together as long as two fibres.
+
+    So are each by itself where a fibre leaves the pad as it came: what one gains in a bend the other loses.
+    """
+    plan = Plan(SOFT, with_settings(PLAIN))
+    model = judged(plan)
+    length = SOFT.pitch_mm * float(lengths(SOFT)[0])
+    tracks = part(model, "horizontal tracks")
+    upright = [face for face in tracks.faces() if abs(face.normal_at().Z) < 0.5]
+    ends = 2 * 0.4 * 1.2
+    assert sum(face.area for face in upright) == pytest.approx(2 * length * 1.2 + ends, rel=5e-5)
+    found = GProp_GProps()
+    BRepGProp.VolumeProperties_s(tracks.wrapped, found, 1e-6)  # build123d's own volume is to a thousandth
+    assert found.Mass() == pytest.approx(length * 0.4 * 1.2, rel=3e-4)
+    curved = sum(face.area for face in upright if face.geom_type in (GeomType.BSPLINE, GeomType.CYLINDER))
+    assert curved > 0.9 * (2 * length * 1.2 - 2 * 2 * 3.0 * 1.2)  # the fibre begins and ends 3 mm straight
+
+
+@pytest.mark.parametrize(("pad", "mould"), [(SOFT, {}), (Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8})])
+def test_edges_of_tracks_are_half_a_width_from_the_exact_fibres(pad, mould):
+    """Thousands of places on the kernel's own curves, on the floor, against scipy's own PCHIP."""
+    plan = Plan(pad, with_settings(PLAIN | mould))
+    x, y = pad.to_mm(pad.knots)[0].T
+    curve, t = PchipInterpolator(x, y), np.unique(np.linspace(x[:-1], x[1:], 3000))
+    along = np.concatenate([[0], np.cumsum(np.hypot(np.diff(t), np.diff(curve(t))))])
+    t = np.interp(np.arange(0, along[-1], 5e-3), along, t)
+    points = []
+    for edge in part(mould_model(plan, "mould"), "horizontal tracks").edges():
+        if edge.geom_type != GeomType.LINE and abs(edge.center().Z - 2.0) < 1e-9:
+            points += [(p.X, p.Y) for p in edge.positions(np.linspace(0, 1, 200).tolist())]
+    inside = np.array(points)
+    inside = inside[np.abs(inside[:, 0]) < plan.cavity.bounds[2] - 1.0]
+    distance, _ = KDTree(np.stack([t, curve(t)], axis=1)).query(inside)
+    assert len(inside) > 2000
+    assert np.abs(distance - plan.settings.mould.ridge_width_mm / 2).max() < 3e-3
+
+
+SETTINGS = {
+    "upright": {"wall_draft_deg": 0.0},
+    "leaning": {"wall_draft_deg": 5.0},
+    "border": {"border_mm": 2.5},
+    "no exits": {"exit_mm": 0.0},
+    "terraces": {"ridge_draft_deg": 6.0},
+    "pins": {"pins": True, "wall_mm": 3.0},
+    "wide": {"ridge_width_mm": 1.5},
+}
+
+
+@pytest.mark.parametrize("case", SETTINGS)
+def test_models_are_as_large_as_their_meshes(case):
+    model = judged(Plan(Morphology.random(1, 3, seed=5), with_settings(SETTINGS[case])))
+    assert model.fit_mm == FITS_MM[0]
+
+
+ODD = {
+    "a family that crosses itself": (level_pad(1.8, 1.2), {}),
+    "two that lie on each other": (level_pad(1.5, 1.5), {}),
+    "two nearly so": (level_pad(1.5, 1.501), {}),
+    "two that overlap by a micrometre": (level_pad(1.5, 1.5399), {}),
+    "two a micrometre apart": (level_pad(1.5, 1.5401), {}),
+    "along the wall": (level_pad(0.0, 1.5), {"wall_draft_deg": 0.0}),
+    "half in the wall": (level_pad(0.01, 1.5), {}),
+    "touching the wall": (level_pad(0.02, 1.5), {"wall_draft_deg": 0.0, "exit_mm": 0.0}),
+    "touching a wall that leans": (level_pad(0.02, 1.5), {}),
+    "grazing the wall": (winding_pad((0.7, 0.4), (1.0, 0.015), (1.3, 0.4)), {}),
+    "a tip on the wall": (winding_pad((0.9999, 0.5), (1.0, 0.02), (1.0001, 0.5)), {"ridge_width_mm": 2.0}),
+    "a tight S": (winding_pad((0.57, 0.5), (0.6, 0.3), (0.63, 1.5), (0.66, 1.2)), {}),
+    "a hairpin": (winding_pad((0.59, 0.5), (0.595, 1.6), (0.6, 0.5), (0.605, 1.6), (0.61, 0.5)), {}),
+    "a step": (winding_pad((0.6, 0.5), (0.6 + 1e-7, 1.5)), {}),
+    "a fold in a wide track": (winding_pad((0.5, 0.6), (0.6, 1.5), (0.7, 0.6)), {"ridge_width_mm": 2.0}),
+    "three knots at one place": (winding_pad((0.6, 1.3), (0.6, 1.3), (0.6, 1.3), (1.5, 0.4)), {}),
+}
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_odd_pads_come_out_valid(case):
+    pad, mould = ODD[case]
+    judged(Plan(pad, with_settings(mould)))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 2), st.integers(1, 8))
+@few(4)
+def test_any_pad(seed, grid, knots):
+    judged(Plan(Morphology.random(grid, knots, seed)))
+
+
+@LONG
+@pytest.mark.parametrize(("grid", "knots", "seed"), [(5, 8, 0), (4, 20, 4), (3, 20, 9), (5, 20, 10), (4, 20, 41)])
+def test_dense_pads(grid, knots, seed):
+    judged(Plan(Morphology.random(grid, knots, seed)))
+
+
+@pytest.mark.parametrize("name", ["1para", pytest.param("5para_dis", marks=LONG), pytest.param("20para", marks=LONG)])
+def test_published_pads(published, name):
+    judged(Plan(Morphology.load(published / f"{name}.mat")))
+
+
+def test_the_second_mould_has_its_wells():
+    plan = conductive_plan(Plan(SOFT, with_settings({"conductive": True, "pins": True})))
+    model = judged(plan, wells=well_outlines(plan, sides=512))
+    round_ = [face for face in part(model, "vertical tracks").faces() if face.geom_type == GeomType.CYLINDER]
+    assert sum(face.area for face in round_) == pytest.approx(2 * (2 * math.pi * 1.5 - 2 * 0.4) * 0.4, rel=0.01)
+
+
+def test_parts_are_named_and_coloured():
+    plan = Plan(Morphology.random(1, 2, seed=7), with_settings({"pins": True}))
+    model = mould_model(plan, "mould")
+    assert model.shape.label == "mould"
+    colours = {child.label: tuple(child.color) for child in model.shape.children}
+    assert list(colours) == ["tray", "horizontal tracks", "vertical tracks", "numbers", "pins"]
+    assert len(set(colours.values())) == 4  # numbers and pins are alike
+    for child in model.shape.children:
+        assert child.volume > 0
+
+
+def test_parts_touch_and_do_not_overlap():
+    model = mould_model(Plan(SOFT, with_settings({"pins": True})), "mould")
+    children = list(model.shape.children)
+    for number, one in enumerate(children):
+        for other in children[number + 1 :]:
+            for a in one.solids():
+                for b in other.solids():
+                    shared = a.intersect(b)
+                    assert sum(each.volume for each in shared.solids()) < 1e-6 if shared else True
+
+
+def test_the_mould_is_that_of_silicone_that_shrinks():
+    plan = Plan(SOFT, with_settings(silicone={"shrinkage": 0.02}))
+    model = judged(plan)
+    for shape in (model.shape, build_mould(SOFT, plan.settings)):
+        size = np.array([*shape.bounding_box().size])
+        assert size == pytest.approx([2 * plan.enlarged.tray.bounds[2]] * 2 + [2.0 + plan.enlarged.silicone_mm])
+
+
+def test_all_that_is_printed_stands_side_by_side_with_the_lid_on():
+    settings = with_settings({"lid": True, "pins": True, "spout": True, "holder": True, "conductive": True})
+    plan = Plan(SOFT, settings)
+    wells = conductive_plan(plan)
+    second = mould_body(wells, well_outlines(wells, sides=512))
+    bodies = {"mould": mould_body(plan), "lid": lid_body(plan), "conductive": second, "holder": holder_body(wells)}
+    made = models(plan, bodies)
+    for name, model in zip(bodies, made, strict=True):
+        assert max(model.apart(mesh(bodies[name]))) < 5e-4  # a lid's mesh has polygons for circles
+    whole = assembly(made, plan)
+    assert [child.label for child in whole.children] == list(bodies)
+    low = {child.label: [*child.bounding_box().min] for child in whole.children}
+    high = {child.label: [*child.bounding_box().max] for child in whole.children}
+    assert low["lid"][2] == pytest.approx(8.0)
+    assert high["mould"][2] == pytest.approx(10.0)
+    assert low["lid"][:2] == pytest.approx(low["mould"][:2])
+    assert low["conductive"][0] == pytest.approx(high["mould"][0] + 10)
+    assert low["holder"][0] == pytest.approx(high["conductive"][0] + 10)
+    assert whole.is_valid
+
+
+def test_a_small_pitch_is_no_matter_without_a_second_mould():
+    """Wells would find no room there, but nobody asked for any."""
+    plan = Plan(Morphology.straight(1, pitch_mm=5.0))
+    with pytest.raises(InputError, match="exit_width_mm"):
+        conductive_plan(plan)
+    (made,) = models(plan, {"mould": mould_body(plan)})
+    assert made.shape.is_valid
+
+
+def test_an_invalid_solid_is_tried_with_finer_curves(monkeypatch):
+    plan, tried = Plan(SOFT), []
+    exact = of_model.layout.layout
+
+    def noted(plan, fit_mm, wells=()):
+        tried.append(fit_mm)
+        return exact(plan, fit_mm, wells)
+
+    monkeypatch.setattr(of_model.layout, "layout", noted)
+    monkeypatch.setattr(Solid, "is_valid", property(lambda solid: tried[-1] < FITS_MM[0]))
+    assert mould_model(plan, "mould").fit_mm == FITS_MM[1]
+    assert tried == list(FITS_MM[:2])
+    tried.clear()
+    monkeypatch.setattr(Solid, "is_valid", False)
+    with pytest.raises(InputError, match="the second: the CAD kernel finds a solid invalid; leave step out"):
+        mould_model(plan, "the second")
+    assert tried == list(FITS_MM)
+
+
+def test_an_invalid_body_is_named(monkeypatch):
+    monkeypatch.setattr(Solid, "is_valid", False)
+    with pytest.raises(InputError, match="lid: the CAD kernel finds the solid invalid"):
+        body_model(lid_body(Plan(Morphology.straight(1))), "lid")
+
+
+def test_a_mild_pad_is_a_small_file_of_true_curves(tmp_path):
+    """4 x 4 fibres, 8 knots each: what a CAD user opens."""
+    pad = mild_pad(4, 8, seed=2)
+    plan = Plan(pad)
+    model = judged(plan)
+    write_step(tmp_path / "mould.step", model.shape)
+    assert (tmp_path / "mould.step").stat().st_size < 1.5e6
+    read = import_step(tmp_path / "mould.step")
+    assert read.is_valid
+    faces = read.faces()
+    assert len(faces) == len(model.shape.faces()) < 1500
+    tracks = [child for child in read.children if child.label.endswith("tracks")]
+    upright = [face for track in tracks for face in track.faces() if abs(face.normal_at().Z) < 0.5]
+    curved = sum(face.area for face in upright if face.geom_type in (GeomType.BSPLINE, GeomType.CYLINDER))
+    within = pad.pitch_mm * lengths(pad).reshape(2, -1).sum(axis=1) @ [1.2, 0.4]
+    assert curved > 0.9 * (2 * within - 16 * 4 * 0.4 * 0.4)  # less where the deep ones go through the others

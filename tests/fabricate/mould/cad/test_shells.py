@@ -1,0 +1,168 @@
+"""Solids put together face by face, against volumes and surfaces that arithmetic gives."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import shapely
+from build123d import Solid
+from hypothesis import given
+from hypothesis import strategies as st
+from shapely.geometry.base import BaseGeometry
+
+from fabricate.mould.cad.layout import Span, Surface
+from fabricate.mould.cad.outlines.drawing import Drawing
+from fabricate.mould.cad.outlines.pieces import ring_pieces, straight_pieces
+from fabricate.mould.cad.shells import solids
+from fabricate.mould.cad.walls import FLOOR, RIM, Walls
+from fabricate.mould.plan import polygon_rings
+from tests.helpers.effort import few
+
+
+def disc(x: float, y: float, radius: float) -> BaseGeometry:
+    return shapely.Point(x, y).buffer(radius, quad_segs=512)
+
+
+def drawn(*areas: BaseGeometry) -> Drawing:
+    pieces = []
+    for area in areas:
+        for ring in polygon_rings(area)[0]:
+            pieces += ring_pieces(ring, {}, 2e-3) if len(ring) > 100 else straight_pieces(shapely.LinearRing(ring))
+    return Drawing([area.boundary for area in areas], pieces)
+
+
+def built(areas: Sequence[BaseGeometry], top: Callable[[set[int]], float | None]) -> list[Solid]:
+    """The solids over z = 0 up to a height that is given for the set of areas which cover a cell."""
+    drawing = drawn(*areas)
+    spans: list[Span | None] = []
+    for place in drawing.middles:
+        height = top({k for k, area in enumerate(areas) if area.contains(shapely.Point(place))})
+        spans.append(None if height is None else Span(0.0, height))
+    return list(solids(drawing, spans))
+
+
+def kinds(solid: Solid) -> dict[str, int]:
+    names = [face.geom_type.name for face in solid.faces()]
+    return {name: names.count(name) for name in sorted(set(names))}
+
+
+def sizes(solid: Solid) -> tuple[int, int, int]:
+    return len(solid.faces()), len(solid.edges()), len(solid.vertices())
+
+
+def test_a_box():
+    (solid,) = built([shapely.box(0, 0, 1, 2)], lambda within: 3.0 if within else None)
+    assert solid.is_valid
+    assert sizes(solid) == (6, 12, 8)
+    assert (solid.volume, solid.area) == pytest.approx((6, 22))
+
+
+def test_a_washer():
+    (solid,) = built([disc(0, 0, 3), disc(0.5, 0, 1)], lambda within: 2.0 if within == {0} else None)
+    assert solid.is_valid
+    assert solid.volume == pytest.approx(2 * math.pi * 8, rel=1e-9)
+    assert solid.area == pytest.approx(2 * math.pi * 8 + 2 * 2 * math.pi * 4, rel=1e-9)
+    assert kinds(solid) == {"CYLINDER": 4, "PLANE": 2}
+
+
+def test_steps_share_their_edges():
+    """A tower on a plate: no face where they meet, one ring of walls from either height to the next."""
+    (solid,) = built([shapely.box(0, 0, 4, 4), disc(2, 2, 1)], lambda within: {0: None, 1: 1.0, 2: 3.0}[len(within)])
+    assert solid.is_valid
+    assert solid.volume == pytest.approx(16 + 2 * math.pi, rel=1e-9)
+    assert kinds(solid) == {"CYLINDER": 2, "PLANE": 4 + 3}
+    assert solid.area == pytest.approx(2 * 16 + 16 + 2 * 2 * math.pi, rel=1e-9)
+
+
+def test_walls_of_several_heights_end_at_shared_corners():
+    """Four blocks around one upright line, each of its own height."""
+    blocks = [shapely.box(x, y, x + 1, y + 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    (solid,) = built(blocks, lambda within: 1.0 + min(within) if within else None)
+    assert solid.is_valid
+    assert solid.volume == pytest.approx(1 + 2 + 3 + 4)
+    assert solid.area == pytest.approx(4 + 4 + 2 * (1 + 2 + 3 + 4) + (1 + 1 + 1 + 3))
+
+
+def test_separate_cells_are_separate_solids():
+    found = built([shapely.box(0, 0, 1, 1), disc(5, 0, 1), disc(9, 0, 1)], lambda within: 1.0 if within else None)
+    assert [solid.is_valid for solid in found] == [True] * 3
+    assert sorted(solid.volume for solid in found) == pytest.approx([1, math.pi, math.pi])
+
+
+def test_circles_that_cross():
+    (solid,) = built([disc(0, 0, 2), disc(2, 1, 1.5)], lambda within: float(len(within)) or None)
+    assert solid.is_valid
+    areas = [disc(0, 0, 2), disc(2, 1, 1.5)]
+    assert solid.volume == pytest.approx(math.pi * (4 + 2.25), rel=1e-8)  # where both are it is twice as high
+    lens = areas[0] & areas[1]
+    walls = 2 * math.pi * (2 + 1.5)  # of height one each, whether on the ground or on the other
+    assert solid.area == pytest.approx(2 * (math.pi * (4 + 2.25) - lens.area) + walls, rel=1e-5)
+
+
+BOWL = Walls(np.array([[-3.0, -2.0, 3.0, 2.0]]), floor_mm=1.0, depth_mm=4.0, flare_mm=0.8)
+
+
+def surfaces(drawing: Drawing) -> list[Surface]:
+    rim = BOWL.floor_mm + BOWL.depth_mm
+    sheets = BOWL.sheets(drawing.middles).tolist()
+    return [BOWL.floor_mm if k == FLOOR else rim if k == RIM else (BOWL, k) for k in sheets]
+
+
+def bowl_drawn(*areas: BaseGeometry) -> Drawing:
+    lines = [shapely.box(-5, -4, 5, 4).exterior, *BOWL.creases(), BOWL.outline(5.0).exterior]
+    lines += [BOWL.outline(3.0).exterior] if areas else []
+    within = drawn(*areas).pieces if areas else []
+    pieces = [*(piece for line in lines for piece in straight_pieces(line)), *within]
+    return Drawing([*lines, *(area.boundary for area in areas)], pieces)
+
+
+def test_a_tray_with_walls_that_lean():
+    drawing = bowl_drawn()
+    (solid,) = solids(drawing, [Span(0.0, top) for top in surfaces(drawing)])
+    assert solid.is_valid
+    hollow = 4 * (6 * 4 + 4 * 6.8 * 4.8 + 7.6 * 5.6) / 6
+    assert solid.volume == pytest.approx(10 * 8 * 5 - hollow, rel=1e-9)
+    lean = math.hypot(4, 0.8)
+    walls = lean * ((6 + 7.6) + (4 + 5.6))
+    assert solid.area == pytest.approx(80 + 2 * 18 * 5 + (80 - 7.6 * 5.6) + 24 + walls, rel=1e-9)
+    assert kinds(solid) == {"PLANE": 6 + 5}
+
+
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (2.5, 0.3), (3.0, 0.0), (2.9, 1.9), (0, -2.45)])
+def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
+    """It ends where the wall comes out of its top; wherever it stands, its volume is that above what is below."""
+    round_ = disc(x, y, 0.5)
+    drawing = bowl_drawn(round_)
+    heights = BOWL.heights(drawing.middles)
+    spans = [
+        Span(under, 3.0) if round_.contains(shapely.Point(place)) and height < 3.0 else None
+        for under, place, height in zip(surfaces(drawing), drawing.middles, heights, strict=True)
+    ]
+    (solid,) = solids(drawing, spans)
+    assert solid.is_valid
+    grid = (np.arange(1000) + 0.5) / 1000 - 0.5
+    places = np.stack(np.meshgrid(x + grid, y + grid), axis=-1).reshape(-1, 2)
+    places = places[np.hypot(*(places - (x, y)).T) < 0.5]
+    assert solid.volume == pytest.approx(np.maximum(3.0 - BOWL.heights(places), 0).sum() * 1e-6, rel=1e-3)
+    rest = [Span(0.0, top) for top in surfaces(drawing)]
+    (tray,) = solids(drawing, rest)
+    assert tray.is_valid
+    assert tray.volume == pytest.approx(10 * 8 * 5 - 4 * (6 * 4 + 4 * 6.8 * 4.8 + 7.6 * 5.6) / 6, rel=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+@few(4)
+def test_any_drums_and_blocks(seed, count):
+    rng = np.random.default_rng(seed)
+    areas = [disc(*row) for row in rng.uniform([0, 0, 0.3], [4, 4, 1.5], (count, 3))]
+    areas += [shapely.box(*low, *(low + size)) for low, size in rng.uniform(0.2, 3, (2, 2, 2))]
+    tops = rng.uniform(0.5, 3, len(areas))
+    found = built(areas, lambda within: max((tops[k] for k in within), default=None))
+    assert all(solid.is_valid for solid in found)
+    drawing = drawn(*areas)
+    volume = 0.0
+    for cell, place in zip(drawing.cells, drawing.middles, strict=True):
+        within = [top for area, top in zip(areas, tops, strict=True) if area.contains(shapely.Point(place))]
+        volume += cell.area * max(within, default=0.0)
+    assert sum(solid.volume for solid in found) == pytest.approx(volume, rel=1e-5)
