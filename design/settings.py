@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, field_validator, model_validator
 
@@ -48,9 +48,10 @@ class PadSettings(Settings):
             where that is.
     """
 
+    MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
+
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M); the pad is M x M grid units")
     pitch_mm: float = Field(default=11.25, ge=0.1, le=1000, description="distance of neighbouring fibre ends, mm")
-    fibre_diameter_mm: float = Field(default=0.3, gt=0, le=10, description="diameter of the laid fibre, mm")
     deep_family: Literal["horizontal", "vertical"] = Field(
         default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
     )

@@ -1,14 +1,16 @@
-"""The sections of `pad.toml` that fabricate owns, and everything a mould depends on gathered in one object."""
+"""`[mould]`, `[printer]` and `[dispenser]` of `pad.toml`, and everything a mould depends on gathered in one object."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, PlainSerializer, field_validator
 
 from design.common.errors import InputError, instance
 from design.common.settings import Settings, Spec
 from design.settings import PadSettings, RulesSettings
+
+from .materials import FibreSettings, SiliconeSettings
 
 
 class MouldSettings(Settings):
@@ -71,23 +73,92 @@ class PrinterSettings(Settings):
     )
     resin: bool = Field(default=False, description="true for a resin printer")
 
+    def is_whole(self, height_mm: float) -> bool:
+        """Whether a height is a whole number of layers."""
+        layers = height_mm / self.layer_mm
+        return round(layers) > 0 and abs(layers - round(layers)) <= 1e-6
+
+
+def _tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
+Place = Annotated[tuple[Coordinate, Coordinate], BeforeValidator(_tuple)]
+Box = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(_tuple)]
+Pose = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | None,
+    BeforeValidator(lambda value: None if value == "unknown" else _tuple(value)),
+    PlainSerializer(lambda pose: "unknown" if pose is None else pose),
+]
+
+
+class DispenserSettings(Settings):
+    """`[dispenser]`: what lays the fibres where no hand does, a needle on a gantry or in an arm.
+
+    The pad lies turned over, tracks up; z is 0 at its upper face. By default the needle is a tube of thin wall through
+    which a fibre of 0.3 mm runs and which fits into a track of 0.4 mm; it is slow, for hands are near, and a spool
+    hangs on it.
+
+    Attributes:
+        travel_height_mm: above the pad, and what stands out of it, on the way from one fibre to the next.
+        acceleration_mm_s2: in a bend of radius r the tip is no faster than the root of r times this.
+        origin_mm: where the middle of the pad lies on the machine.
+        box_mm: x, y and z from and to, as the machine counts them, which the tip may not leave; for an arm, which
+            counts from the middle of the pad, less the origin.
+        arm_pose: of the middle of the pad, x to the right and z up, in the base of a UR arm; the script does not move
+            the arm while it is unknown.
+    """
+
+    tip_mm: float = Field(default=0.37, gt=0, le=20, description="outer diameter of the needle's tip, mm")
+    travel_height_mm: float = Field(default=5.0, ge=0.5, le=500, description="height between fibres, mm over the pad")
+    travel_mm_s: float = Field(default=30.0, ge=0.1, le=500, description="speed between fibres, mm/s")
+    feed_mm_s: float = Field(default=10.0, ge=0.1, le=500, description="speed along a straight fibre, mm/s")
+    acceleration_mm_s2: float = Field(default=100.0, ge=1, le=1e5, description="greatest acceleration, mm/s^2")
+    origin_mm: Place = Field(default=(110.0, 110.0), description="the pad's middle [x, y] on the machine, mm")
+    box_mm: Box = Field(
+        default=(0.0, 220.0, 0.0, 220.0, -20.0, 50.0),
+        description="where the tip may go on the machine, [x0, x1, y0, y1, z0, z1], mm",
+    )
+    arm_pose: Pose = Field(
+        default=None, description="the pad's middle in a UR arm's base, [x, y, z, rx, ry, rz], m, rad, or \"unknown\""
+    )
+
+    @field_validator("box_mm")
+    @classmethod
+    def _from_low_to_high(cls, box_mm: Box) -> Box:
+        if any(low >= high for low, high in zip(box_mm[::2], box_mm[1::2], strict=True)):
+            raise ValueError("each axis goes from low to high: [x0, x1, y0, y1, z0, z1]")
+        return box_mm
+
 
 STEP_MM = 0.03
 """Width of the terraces of a tapered ridge: no wider than what printers place a line by."""
 
 
 _SECTIONS: dict[str, type[Any]] = {"mould": MouldSettings, "printer": PrinterSettings}
-_SECTIONS |= {"pad": PadSettings, "rules": RulesSettings}
+_SECTIONS |= {"pad": PadSettings, "rules": RulesSettings, "silicone": SiliconeSettings, "fibre": FibreSettings}
+_SECTIONS |= {"dispenser": DispenserSettings}
+
+_ACROSS = ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm")
+_RIDGES, _DEPTH = ("deep_ridge_height_mm", "shallow_ridge_height_mm"), ("silicone_mm",)
+"""Lengths of `[mould]` that the pad has too: seen from above, of the ridges upright, and of the cavity upright."""
 
 
 @dataclass(frozen=True)
 class FabricationSettings:
-    """All that shapes a mould beside the morphology; of `[pad]` only the fibre and the deep family are used."""
+    """All that shapes a mould, and the way of what lays its fibres, beside the morphology.
+
+    Of `[pad]` only the deep family is used.
+    """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
     printer: PrinterSettings = field(default_factory=PrinterSettings)
     pad: PadSettings = field(default_factory=PadSettings)
     rules: RulesSettings = field(default_factory=RulesSettings)
+    silicone: SiliconeSettings = field(default_factory=SiliconeSettings)
+    fibre: FibreSettings = field(default_factory=FibreSettings)
+    dispenser: DispenserSettings = field(default_factory=DispenserSettings)
 
     def __post_init__(self) -> None:
         for name, model in _SECTIONS.items():
@@ -114,6 +185,26 @@ class FabricationSettings:
         layer = self.printer.layer_mm
         step = self.ridge_slope * layer
         return layer * max(1, int(STEP_MM / step)) if step else math.inf
+
+    @property
+    def shrunk(self) -> float:
+        """How large the pad is as a share of its mould: 1 - shrinkage."""
+        return 1 - self.silicone.material.shrinkage
+
+    def enlarged(self) -> "FabricationSettings":
+        """Those of the mould, larger by 1 / `shrunk` and taken for what does not shrink; floor and walls are as set.
+
+        What is whole layers high stays so: ridges, or the cavity. A printer makes whole layers of any height, and of
+        one that lies between them, such as the 0.4004 mm that 0.4 mm by 0.1 % would be, every slicer its own. So it
+        is rounded here, and known: what is set comes out within half a layer (`Plan.depths_mm` has what does).
+        """
+        larger = {key: getattr(self.mould, key) / self.shrunk for key in (*_ACROSS, *_RIDGES, *_DEPTH)}
+        layer = self.printer.layer_mm
+        for keys in (_RIDGES, _DEPTH):
+            if all(self.printer.is_whole(getattr(self.mould, key)) for key in keys):
+                larger |= {key: round(round(larger[key] / layer) * layer, 9) for key in keys}
+        mould = self.mould.model_copy(update=larger)
+        return replace(self, mould=mould, silicone=self.silicone.model_copy(update={"shrinkage": 0.0}))
 
     def require_consistent(self, pitch_mm: float) -> None:
         """Refuse settings that contradict each other or the pitch of the pad.

@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -21,6 +21,9 @@ class Settings(BaseModel):
     """One table of `pad.toml`: immutable, no unknown keys, no NaN; a field's description is its comment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+    MOVED: ClassVar[Mapping[str, str]] = {}
+    """Keys that were in this table once, and where they are now."""
 
     def __init__(self, **values: Any) -> None:
         try:
@@ -122,8 +125,12 @@ def validated(model: type[AnySettings], values: Mapping[str, Any], where: str) -
 def _finding(error: ValidationError, model: type[Settings], where: str) -> InputError:
     """The first of pydantic's findings on a `model` as one line that begins with `where`."""
     first = error.errors()[0]
+    if not first["loc"]:  # a finding on the whole section names the key itself
+        return InputError(f"{where} {first['msg']}")
     key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
     if first["type"] == "extra_forbidden":
+        if moved := model.MOVED.get(str(first["loc"][0])):
+            return InputError(f"{where} {first['loc'][0]}: no such key, it is {moved} now")
         allowed = f", allowed are {', '.join(model.model_fields)}" if len(first["loc"]) == 1 else ""
         return InputError(f"{where} {'.'.join(map(str, first['loc']))}: no such key{allowed}")
     return InputError(f"{where} {key}: got {shown(first['input'])}, {first['msg'].lower()}")

@@ -91,6 +91,12 @@ def test_files_that_are_no_toml_are_refused(tmp_path, content):
         Spec.load(path)
 
 
+def test_a_key_that_has_moved_is_told_where_it_is():
+    with pytest.raises(InputError) as error:
+        Spec({"pad": {"fibre_diameter_mm": 0.3}}, "pad.toml").section(PadSettings)
+    assert str(error.value) == "pad.toml: [pad] fibre_diameter_mm: no such key, it is [fibre] diameter_mm now"
+
+
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         Spec.load(tmp_path / "none.toml")
@@ -100,7 +106,6 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     assert PadSettings().model_dump() == {
         "grid": 4,
         "pitch_mm": 11.25,
-        "fibre_diameter_mm": 0.3,
         "deep_family": "horizontal",
         "sensed_mm": "beyond",
     }

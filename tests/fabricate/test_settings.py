@@ -4,12 +4,15 @@ import pytest
 
 from design.common.errors import InputError
 from design.common.settings import Spec, commented_toml
-from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
+from fabricate.materials import FibreSettings, SiliconeSettings
+from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
+from tests.fabricate.planted import with_settings
 
 
 def test_defaults_come_back_from_their_own_file(tmp_path):
     path = tmp_path / "pad.toml"
-    path.write_text(commented_toml({"mould": MouldSettings, "printer": PrinterSettings}), encoding="utf-8")
+    models = (MouldSettings, PrinterSettings, DispenserSettings, SiliconeSettings, FibreSettings)
+    path.write_text(commented_toml({model.section(): model for model in models}), encoding="utf-8")
     assert FabricationSettings.from_spec(Spec.load(path)) == DEFAULTS
 
 
@@ -20,6 +23,9 @@ def test_defaults_come_back_from_their_own_file(tmp_path):
         ({"mould": {"wall_mm": 0.1}}, ("[mould] wall_mm", "0.1", "greater than or equal to 0.8")),
         ({"mould": {"floor_mm": "2"}}, ("[mould] floor_mm", "'2'", "number")),
         ({"printer": {"bed_mm": [100.0, 100.0]}}, ("[printer] bed_mm", "at least 3")),
+        ({"dispenser": {"box_mm": [0.0, 9.0, 5.0, 5.0, 0.0, 9.0]}}, ("[dispenser] box_mm", "5.0", "from low to high")),
+        ({"dispenser": {"arm_pose": [0.0, 1.0]}}, ("[dispenser] arm_pose", "1.0")),
+        ({"dispenser": {"arm_pose": "known"}}, ("[dispenser] arm_pose", "'known'")),
         ({"printer": {"layer_mm": 0.0}}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
     ],
 )
@@ -77,6 +83,33 @@ def test_default_ridges_are_whole_layers_of_common_printers():
         ):
             assert height / layer_mm == pytest.approx(round(height / layer_mm))
     assert PrinterSettings().layer_mm == 0.1
+
+
+@pytest.mark.parametrize("shrinkage", [1e-3, 0.013, 0.2])
+def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
+    asked = with_settings({"border_mm": 1.5}, silicone={"shrinkage": shrinkage})
+    mould = asked.enlarged().mould
+    for key in ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm"):
+        assert getattr(mould, key) * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), rel=1e-12)
+    for key in ("floor_mm", "wall_mm", "wall_draft_deg", "tolerance_mm", "min_silicone_mm", "lead_mm"):
+        assert getattr(mould, key) == getattr(asked.mould, key)
+    assert asked.enlarged().shrunk == 1
+
+
+@pytest.mark.parametrize("layer_mm", [0.1, 0.2])
+@pytest.mark.parametrize("shrinkage", [1e-3, 0.02, 0.13])
+def test_heights_of_whole_layers_stay_so_and_come_out_within_half_a_layer(layer_mm, shrinkage):
+    asked = with_settings(printer={"layer_mm": layer_mm}, silicone={"shrinkage": shrinkage})
+    for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
+        height = getattr(asked.enlarged().mould, key)
+        assert height / layer_mm == pytest.approx(round(height / layer_mm))
+        assert height * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), abs=layer_mm / 2)
+
+
+def test_heights_between_layers_are_larger_like_all_else():
+    asked = with_settings({"silicone_mm": 5.55, "shallow_ridge_height_mm": 0.45}, silicone={"shrinkage": 0.1})
+    for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
+        assert getattr(asked.enlarged().mould, key) * 0.9 == pytest.approx(getattr(asked.mould, key))
 
 
 def test_the_defaults_are_those_the_pads_were_made_with():
