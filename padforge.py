@@ -7,6 +7,7 @@ as well: `padforge.search`, `padforge.build`, `padforge.calibrate`, with the set
 import shutil
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -51,6 +52,9 @@ SECTIONS = {
     "rules": "design.settings:RulesSettings",
     "mould": "fabricate.settings:MouldSettings",
     "printer": "fabricate.settings:PrinterSettings",
+    "silicone": "fabricate.materials:SiliconeSettings",
+    "fibre": "fabricate.materials:FibreSettings",
+    "dispenser": "fabricate.settings:DispenserSettings",
     "rig": "sense.settings:RigSettings",
     "localizer": "sense.settings:LocalizerSettings",
 }
@@ -225,7 +229,8 @@ def _run_stages(spec: "Spec", seed: int | None, out: Path) -> int:
     if found.stopped:
         return INTERRUPTED
     written = [out / "morphology.json"]
-    mould = build(found.morphology, out, settings=FabricationSettings.from_spec(spec), inputs=written)
+    fabrication = FabricationSettings.from_spec(spec)
+    mould = build(found.morphology, out, settings=fabrication, inputs=written, warn=partial(click.echo, err=True))
     click.echo("\n".join(mould_lines(mould, out)))
     recorded = out / "recording"
     refuse_replacing(recorded)

@@ -1,5 +1,6 @@
 """`padforge fabricate`: the edge where morphologies come in and moulds go out."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ def fabricate() -> None:
 @fabricate.command()
 @click.argument("morphology", type=click.Path(path_type=Path))
 @click.option(
-    "--formats", default="stl,step,svg,png", show_default=True, help="Which to write, of stl, 3mf, step, svg, dxf, png."
+    "--formats",
+    default="stl,step,svg,png",
+    show_default=True,
+    help="Which to write, of stl, 3mf, step, svg, dxf, png, gcode, urscript.",
 )
 @spec_option
 @out_option(what="Folder for the files")
@@ -55,6 +59,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     \b
     padforge fabricate build out/pad/morphology.json --formats stl,3mf,dxf
     padforge fabricate 5.mat --out out/published   a pad of the published study
+    padforge fabricate build out/pad/morphology.json --formats gcode   the way of a machine that lays the fibres
 
     The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
     """
@@ -69,7 +74,8 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     folder = out or pad_folder(morphology)
     wanted = [name.strip() for name in formats.split(",") if name.strip()]
     with claimed(folder):
-        document = build_files(pad, folder, wanted, settings, [path for path in (morphology, spec) if path])
+        inputs = [path for path in (morphology, spec) if path]
+        document = build_files(pad, folder, wanted, settings, inputs, warn=partial(click.echo, err=True))
     show_result(document, mould_lines(document, folder), as_json)
 
 

@@ -1,6 +1,7 @@
 """Making a mould and writing it: meshes, CAD, drawings, the fabrication document and the page for the bench.
 
-The same inputs give the same bytes. Everything is built and checked before the first file is written.
+The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
+appear together or not at all.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,11 +15,22 @@ from numpy.typing import NDArray
 
 from design.common import profiling
 from design.common.errors import InputError, instance, path, shown
-from design.common.files import atomic, provenance, require_file, write_json, write_text
+from design.common.files import (
+    provenance,
+    read_json,
+    require_file,
+    sha256,
+    staged,
+    unchanged,
+    write_json,
+    writing,
+)
 from design.pad.morphology import Morphology
-from fabricate.checks.findings import Finding
+from fabricate.checks.findings import Finding, verdict
 from fabricate.checks.mesh_checks import SOUND, sound
 from fabricate.checks.plan_checks import inspect
+from fabricate.dispensing.files import LANGUAGES, dispensing
+from fabricate.materials import PLASTICS
 from fabricate.mould.assembly import (
     bed_frame,
     conductive_body,
@@ -28,28 +40,30 @@ from fabricate.mould.assembly import (
     lid_holes,
     mould_body,
     sizes,
-    valid_solid,
 )
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body
-from fabricate.report.laying import guide
+from fabricate.report.laying import guide, orientation
 from fabricate.report.pictures import draw_mould, draw_tracks
 from fabricate.report.track_drawings import tracks_dxf, tracks_svg
 
-from .mesh_files import write_3mf, write_step, write_stl, write_utf8
+from .mesh_files import write_3mf, write_stl, write_utf8
 from .settings import DEFAULTS, FabricationSettings
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
 FORMAT = "padforge-fabrication/1"
-FORMATS = ("stl", "3mf", "step", "svg", "dxf", "png")
+FORMATS = ("stl", "3mf", "step", "svg", "dxf", "png", *LANGUAGES)
 
 Write = tuple[str, Callable[[Path], None]]
 """A file's name and what writes it to a path."""
 
-_VOLUME_RATIO = 1e-3
-"""How far the volumes of mesh and solid may lie apart."""
+_CAD_VOLUME, _CAD_SURFACE = 5e-4, 5e-3
+"""How far volume and surface of a CAD solid and of its mesh may lie apart, as shares of them.
+
+The mesh keeps its tolerance: a gap between two walls may be there in one of them and not in the other.
+"""
 
 
 @dataclass(frozen=True)
@@ -68,58 +82,104 @@ def build(
     formats: Sequence[str] = ("stl", "step", "svg", "png"),
     settings: FabricationSettings = DEFAULTS,
     inputs: Sequence[Path] = (),
+    *,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Make the mould of a pad and write it, with the lid and the second mould the settings ask for.
+
+    Files of an earlier mould in `out` go, also those that are not written anew; unless somebody has changed them.
 
     Args:
         pad: the fibres.
         out: folder that takes the files; made if missing.
         formats: which of `FORMATS` to write; `fabrication.json` and `laying.md` always are.
-        settings: tray, ridges, printer, fibre and rules.
+        settings: tray, ridges, printer, fibre, rules and dispenser.
         inputs: files the work came from, for the provenance.
+        warn: told in a line what is gone of an earlier mould, and what is left of it.
 
     Returns:
-        The fabrication document, as written to `fabrication.json`.
+        The fabrication document, as written to `fabrication.json`; "sha256" has the digests of the other files.
 
     Raises:
         InputError: an unknown format, an input that is no file, settings that contradict each other or refuse this
-            pad, or a mould that is no closed solid; nothing has been written then.
+            pad, a mould that is no closed solid, or files that cannot be written; `out` is as it was then.
     """
     out = path("out", out)
-    for name in instance("formats", formats, Sequence):
-        if not isinstance(name, str) or name not in FORMATS:
-            raise InputError(f"formats: got {shown(name)}, allowed are {', '.join(FORMATS)}")
-    inputs = [path("inputs", given) for given in instance("inputs", inputs, Sequence)]
-    for given in inputs:
-        require_file(given)
+    inputs = _require_known(formats, inputs)
     profiling.looked_at("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
         plan.require_levels()
         printed = [_meshed(name, body) for name, body in _bodies(plan)]
     with profiling.stage("checks"):
-        findings = inspect(plan, printed[0].vertices, printed[0].triangles)
-        _require_sound(printed[0], findings)
-        for body in printed[1:]:
-            holes = lid_holes(plan) if body.name == "lid" else 0
-            _require_sound(body, sound(body.vertices, body.triangles, genus=holes))
-    writes = [*(write for body in printed for write in _solids(body, formats)), *_drawings(plan, findings, formats)]
+        findings = _checked(plan, printed)
+    by_machine = dispensing(plan, formats)
+    findings += by_machine.findings
+    cad = []
+    if "step" in formats:
+        with profiling.stage("CAD solid"):
+            file, finding = _cad(plan, printed)
+        cad.append(file)
+        findings.append(finding)
+    writes = [
+        *(write for body in printed for write in _solids(plan, body, formats)),
+        *cad,
+        *_drawings(plan, findings, formats),
+        *((name, partial(write_utf8, text=text)) for name, text in by_machine.texts.items()),
+    ]
     document = _document(plan, printed, findings, [name for name, _ in writes], formats, inputs)
-    for name, write in writes:
-        with profiling.stage(f"write {name}"), atomic(out / name) as temporary:
-            write(temporary)
-    write_text(out / "laying.md", guide.laying_page(document))
-    write_json(out / "fabrication.json", document)
+    writes += [
+        (orientation.FILE, partial(write_utf8, text=orientation.orientation_svg(plan))),
+        ("laying.md", partial(write_utf8, text=guide.laying_page(document))),
+    ]
+    _put_in_place(out, writes, document, warn)
     return document
 
 
+def _require_known(formats: Sequence[str], inputs: Sequence[Path]) -> list[Path]:
+    for name in instance("formats", formats, Sequence):
+        if not isinstance(name, str) or name not in FORMATS:
+            raise InputError(f"formats: got {shown(name)}, allowed are {', '.join(FORMATS)}")
+    inputs = [path("inputs", given) for given in instance("inputs", inputs, Sequence)]
+    for given in inputs:
+        require_file(given)
+    return inputs
+
+
+def _put_in_place(out: Path, writes: Sequence[Write], document: dict[str, Any], warn: Callable[[str], None]) -> None:
+    """Write the files of a mould and their digests at once, and take those of an earlier one out."""
+    names = {name for name, _ in writes}
+    earlier = _earlier_files(out)
+    gone = unchanged(out, earlier) - names
+    with staged(out, without=gone) as folder:
+        for name, write in writes:
+            with profiling.stage(f"write {name}"), writing(out / name):
+                write(folder / name)
+        document["sha256"] = {name: sha256(folder / name) for name, _ in writes}
+        write_json(folder / "fabrication.json", document)
+    for name in sorted(gone):
+        warn(f"{out / name} is gone: it was of the mould before this one")
+    for file in sorted(out.iterdir()):
+        if file.name in earlier.keys() - names:
+            warn(f"{file} is left from the mould before this one: it is not as it was written")
+
+
+def _earlier_files(out: Path) -> dict[str, str]:
+    """The digest of every file that was written with the fabrication document in a folder, if there is one."""
+    try:
+        digests = read_json(out / "fabrication.json", FORMAT).get("sha256")
+    except InputError:
+        return {}
+    return digests if isinstance(digests, dict) else {}
+
+
 def _bodies(plan: Plan) -> list[tuple[str, Body]]:
-    """What is printed, the mould first."""
-    bodies = [("mould", mould_body(plan))]
+    """What is printed, the mould first: all but the holder larger than the pad by what the silicone shrinks."""
+    bodies = [("mould", mould_body(plan.enlarged))]
     if plan.settings.mould.lid:
-        bodies.append(("lid", lid_body(plan)))
+        bodies.append(("lid", lid_body(plan.enlarged)))
     if plan.settings.mould.conductive:
-        bodies.append(("conductive", conductive_body(conductive_plan(plan))))
+        bodies.append(("conductive", conductive_body(conductive_plan(plan).enlarged)))
     if plan.settings.mould.holder:
         wide = conductive_plan(plan) if plan.settings.mould.conductive else plan  # so that either pad fits
         bodies.append(("holder", holder_body(wide)))
@@ -133,27 +193,57 @@ def _meshed(name: str, body: Body) -> Printed:
     return Printed(name, solid, *arrays(solid))
 
 
+def _checked(plan: Plan, printed: Sequence[Printed]) -> list[Finding]:
+    findings = inspect(plan, printed[0].vertices, printed[0].triangles)
+    _require_sound(printed[0], findings)
+    for body in printed[1:]:
+        holes = lid_holes(plan) if body.name == "lid" else 0
+        _require_sound(body, sound(body.vertices, body.triangles, genus=holes))
+    return findings
+
+
 def _require_sound(body: Printed, findings: Sequence[Finding]) -> None:
     broken = [f.message for f in findings if f.name in SOUND and f.status == "fail"]
     if broken:
         raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
 
 
-def _solids(body: Printed, formats: Sequence[str]) -> Iterator[Write]:
-    """The wanted files of a body; its CAD solid is made and checked here, before anything is written."""
+def _solids(plan: Plan, body: Printed, formats: Sequence[str]) -> Iterator[Write]:
+    """The wanted mesh files of a body."""
     if "stl" in formats:
         yield f"{body.name}.stl", partial(write_stl, vertices=body.vertices, triangles=body.triangles)
     if "3mf" in formats:
-        yield f"{body.name}.3mf", partial(write_3mf, vertices=body.vertices, triangles=body.triangles)
-    if "step" in formats:
-        with profiling.stage("CAD solid"):
-            solid, volume = valid_solid(body.mesh, body.name), body.mesh.volume()
-        if abs(solid.volume - volume) > _VOLUME_RATIO * volume:
-            raise InputError(f"{body.name}: solid {solid.volume:.1f} mm³, mesh {volume:.1f}; nothing was written")
-        yield f"{body.name}.step", partial(write_step, solid=solid)
+        title = f"{body.name}, for a pad of {plan.pad.grid} + {plan.pad.grid} fibres {plan.pad.pitch_mm:g} mm apart"
+        material, _ = PLASTICS[plan.settings.printer.resin]
+        label = {"name": body.name, "title": title, "material": material}
+        yield f"{body.name}.3mf", partial(write_3mf, vertices=body.vertices, triangles=body.triangles, **label)
+
+
+def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
+    """The STEP file of all bodies, made and judged by their meshes before anything is written.
+
+    Raises:
+        InputError: a CAD solid is not valid, or not of its mesh.
+    """
+    from fabricate.mould.cad.model import assembly, models
+    from fabricate.mould.cad.step_file import write_step
+
+    made = models(plan, dict(_bodies(plan)))
+    apart = [model.apart(body.mesh) for model, body in zip(made, printed, strict=True)]
+    for body, (volume, surface) in zip(printed, apart, strict=True):
+        if volume > _CAD_VOLUME or surface > _CAD_SURFACE:
+            shares = f"volume {100 * volume:.3g} %, surface {100 * surface:.3g} %"
+            raise InputError(f"{body.name}: the CAD solid is not of its mesh ({shares} off); nothing was written")
+    volume, surface = (max(shares) for shares in zip(*apart, strict=True))
+    message = f"volume and surface are within {100 * volume:.3f} % and {100 * surface:.3f} % of the mesh's"
+    message += f", curves within {1000 * max(model.fit_mm for model in made):g} µm"
+    measured = [round(volume, 6), round(surface, 6)]
+    found = verdict("cad_solid", True, measured, [_CAD_VOLUME, _CAD_SURFACE], message)
+    return ("mould.step", partial(write_step, shape=assembly(made, plan.enlarged))), found
 
 
 def _drawings(plan: Plan, findings: Sequence[Finding], formats: Sequence[str]) -> Iterator[Write]:
+    plan = plan.enlarged  # they show the tray
     if "svg" in formats:
         yield "tracks.svg", partial(write_utf8, text=tracks_svg(plan))
     if "dxf" in formats:
@@ -175,7 +265,7 @@ def _document(
     settings = plan.settings
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
     size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
-    rim = settings.mould.floor_mm + plan.silicone_mm
+    rim = settings.mould.floor_mm + plan.enlarged.silicone_mm
     pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
     bench = guide.document(plan, printed[0].mesh.volume() - pins)
     return {
@@ -192,8 +282,11 @@ def _document(
             "pitch_mm": plan.pad.pitch_mm,
             "mould": settings.mould.model_dump(),
             "printer": settings.printer.model_dump(),
-            "pad": settings.pad.model_dump(include={"fibre_diameter_mm", "deep_family"}),
+            "pad": settings.pad.model_dump(include={"deep_family"}),
             "rules": settings.rules.model_dump(include={"min_bend_radius_mm"}),
+            "silicone": settings.silicone.model_dump(mode="json"),
+            "fibre": settings.fibre.model_dump(),
+            **({"dispenser": settings.dispenser.model_dump(mode="json")} if {*LANGUAGES} & {*formats} else {}),
         },
         "provenance": provenance("fabricate", inputs=inputs, packages=packages),
     }

@@ -1,11 +1,13 @@
-"""Files of a solid: STL, 3MF and STEP, the same bytes for the same solid."""
+"""Files of a mesh: STL and 3MF, the same bytes for the same mesh."""
 
 import logging
 import zipfile
 from functools import cache
+from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.parsers import expat
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,7 @@ from design.common.errors import InputError
 from design.common.errors import path as as_path
 from design.common.files import require_file
 from design.pad.knots import Array
-
-if TYPE_CHECKING:
-    from build123d import Solid
+from fabricate.mould.prisms import COLOURS
 
 Numbers = NDArray[np.int64]
 
@@ -28,8 +28,6 @@ MOST_COPIES = 1000
 """Objects that are built, each counted as often as it is used."""
 MOST_DEPTH = 16
 """Objects within objects within objects."""
-_EPOCH = "2000-01-01T00:00:00"
-"""The time written into STEP files, which must carry one."""
 
 
 def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
@@ -44,8 +42,16 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
     path.write_bytes(header + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
 
 
-def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    """Write a 3MF, mm: vertices (n, 3), triangles (m, 3) vertex numbers; same digits as the STL's floats."""
+def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
+    """Write a 3MF, mm, as slicers take it: one object by its name, of one material in the colour of the body.
+
+    Args:
+        vertices: (n, 3); same digits as the STL's floats.
+        triangles: (m, 3) vertex numbers.
+        name: of the body, one of `COLOURS`.
+        title: of the file, for people.
+        material: what to print it in.
+    """
     points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
     package = "http://schemas.openxmlformats.org/package/2006"
@@ -57,22 +63,21 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
         '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>',
         "_rels/.rels": f'<Relationships xmlns="{package}/relationships">'
         f'<Relationship Id="model" Target="/3D/3dmodel.model" Type="{core}/2013/01/3dmodel"/></Relationships>',
-        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{core}/core/2015/02"><resources>'
-        f'<object id="1" type="model"><mesh><vertices>{points}</vertices><triangles>{faces}</triangles></mesh></object>'
-        '</resources><build><item objectid="1"/></build></model>',
+        "3D/3dmodel.model": f'<model unit="millimeter" xml:lang="en" xmlns="{core}/core/2015/02">'
+        f'<metadata name="Title">{escape(title)}</metadata>'
+        f'<metadata name="Application">padforge {version("padforge")}</metadata><resources>'
+        f'<basematerials id="1"><base name={quoteattr(material)} displaycolor="{COLOURS[name]}"/></basematerials>'
+        f'<object id="2" type="model" name={quoteattr(name)} pid="1" pindex="0">'
+        f"<mesh><vertices>{points}</vertices><triangles>{faces}</triangles></mesh></object>"
+        '</resources><build><item objectid="2"/></build></model>',
     }
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, text in parts.items():
-            entry = zipfile.ZipInfo(name)  # a fixed date, unlike what writestr makes of a name
-            archive.writestr(entry, declaration + text, zipfile.ZIP_DEFLATED)
-
-
-def write_step(path: Path, solid: "Solid") -> None:
-    """Write a STEP file; its faces are plane, so the curves in face coordinates would only treble its size."""
-    from build123d import export_step
-
-    if not export_step(solid, path, write_pcurves=False, timestamp=_EPOCH):
-        raise InputError(f"{path}: the CAD kernel could not write it")
+    content = BytesIO()
+    archive = zipfile.ZipFile(content, "w")  # nothing closes it after a Ctrl-C, of which that would make an error
+    for part, text in parts.items():
+        entry = zipfile.ZipInfo(part)  # a fixed date, unlike what writestr makes of a name
+        archive.writestr(entry, declaration + text, zipfile.ZIP_DEFLATED)
+    archive.close()
+    path.write_bytes(content.getvalue())
 
 
 def write_utf8(path: Path, text: str) -> None:

@@ -14,6 +14,8 @@ from shapely import ops
 from shapely.geometry.base import BaseGeometry
 
 from design.criteria.rules import tight_bends
+from design.pad.courses.bending import traced_curve
+from design.pad.courses.curves import beziers, flatten, slope_beziers
 from design.pad.morphology import Morphology
 from fabricate.mesh_files import read_mesh
 from fabricate.mould.assembly import plan_mesh
@@ -28,6 +30,8 @@ _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""
 _SLENDER, _TOO_SLENDER = 5.0, 10.0
 """Ridges taller than so many times their width may break off in demoulding, or do not print upright at all."""
+_FINE_MM, _TURN = 3e-4, 0.05
+"""Folds are looked for along fibres drawn so finely, at points between which they turn by so many radians at most."""
 _NAMED = 8
 """More fibres than this are counted instead of named."""
 
@@ -60,7 +64,7 @@ def meshed(plan: Plan) -> Inspected:
     """The mesh of a plan, and every check on both."""
     from fabricate.mould.mesh import arrays
 
-    vertices, triangles = arrays(plan_mesh(plan))
+    vertices, triangles = arrays(plan_mesh(plan.enlarged))
     return vertices, triangles, inspect(plan, vertices, triangles)
 
 
@@ -71,19 +75,21 @@ def inspect(plan: Plan, vertices: NDArray[np.floating], triangles: NDArray[np.in
 
 
 def check_plan(plan: Plan) -> list[Finding]:
-    """The checks that need no mesh."""
+    """The checks that need no mesh: of the mould as it is printed, and of the pad as it is used."""
+    mould = plan.enlarged
     return [
-        _ridge_width(plan),
-        _track_size(plan.settings),
-        _layers(plan),
-        _slenderness(plan),
+        _ridge_width(mould),
+        _track_size(plan),
+        _layers(mould),
+        _slenderness(mould),
         _crossing_gap(plan),
         _same_family_crossings(plan),
         _silicone_wall(plan),
         _tray_wall(plan),
         _cover(plan),
         _fibre_bend(plan),
-        _numbers(plan),
+        _folds(mould),
+        _numbers(mould),
     ]
 
 
@@ -97,23 +103,24 @@ def _ridge_width(plan: Plan) -> Finding:
     return verdict("ridge_width", wide, width, least, message, places)
 
 
-def _track_size(settings: FabricationSettings) -> Finding:
+def _track_size(plan: Plan) -> Finding:
     """A fibre must lie within its track, neither pinched nor standing out."""
-    room = min(settings.mould.ridge_width_mm, settings.mould.shallow_ridge_height_mm)
-    fibre = settings.pad.fibre_diameter_mm
+    room = min(plan.settings.mould.ridge_width_mm, plan.depths_mm[0])
+    fibre = plan.settings.fibre.material.diameter_mm
     message = f"the tightest track is {room:g} mm, the fibre {fibre:g} mm"
     return verdict("track_size", room >= fibre, room, fibre, message)
 
 
 def _layers(plan: Plan) -> Finding:
     """Ridges of less than two layers do not print; heights between layers come out rounded."""
-    layer, mould = plan.settings.printer.layer_mm, plan.settings.mould
+    printer, mould = plan.settings.printer, plan.settings.mould
+    layer = printer.layer_mm
     heights = {
         "floor_mm": mould.floor_mm,
         "shallow_ridge_height_mm": mould.shallow_ridge_height_mm,
         "deep_ridge_height_mm": mould.deep_ridge_height_mm,
     }
-    uneven = [key for key, height in heights.items() if abs(height / layer - round(height / layer)) > 1e-6]
+    uneven = [key for key, height in heights.items() if not printer.is_whole(height)]
     least = min(heights.values()) / layer
     if least < 2 - 1e-6:
         return Finding("layers", "fail", least, 2.0, f"the lowest step has {least:.2f} layers of {layer:g} mm")
@@ -135,7 +142,7 @@ def _slenderness(plan: Plan) -> Finding:
 def _crossing_gap(plan: Plan) -> Finding:
     """Where fibres cross, silicone or adhesive between them keeps them from shorting."""
     mould = plan.settings.mould
-    gap = mould.level_step_mm - plan.settings.pad.fibre_diameter_mm
+    gap = plan.depths_mm[1] - plan.depths_mm[0] - plan.settings.fibre.material.diameter_mm
     message = f"{gap:.3f} mm lie between fibres of neighbouring depths where they cross"
     return Finding("crossing_gap", graded(gap, mould.min_silicone_mm), gap, mould.min_silicone_mm, message)
 
@@ -218,14 +225,52 @@ def _cover(plan: Plan) -> Finding:
 
 
 def _fibre_bend(plan: Plan) -> Finding:
-    """A fibre cannot follow a bend tighter than the rules allow for: it lifts out of its track or breaks."""
-    limit = plan.settings.rules.min_bend_radius_mm
+    """A fibre cannot follow a bend tighter than it bears, or than the rules: it lifts out of its track or breaks."""
+    limit = max(plan.settings.rules.min_bend_radius_mm, plan.settings.fibre.material.least_bend_mm or 0)
     tight = tight_bends(plan.pad, limit)
     least = min((bend.measured for bend in tight), default=limit)
     names = _listed("fibre", [bend.fibres[0] for bend in tight])
     message = f"{names} bent as tightly as {least:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
     places = [bend.place_mm for bend in tight if bend.place_mm is not None]
     return verdict("fibre_bend", not tight, least, limit, message, places)
+
+
+def _folds(plan: Plan) -> Finding:
+    """In a bend tighter than half its width, a track's inner wall would run back through itself: it is cut there.
+
+    Ends of fibres, where every track turns as it leaves the pad, are left out.
+    """
+    pad, mould = plan.pad, plan.settings.mould
+    found: list[tuple[float, NDArray[np.floating]]] = []
+    curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, _FINE_MM / pad.pitch_mm), strict=True)
+    for fibre, (spans, slopes, line) in enumerate(curves):
+        half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.levels[fibre]] * plan.settings.ridge_slope
+        points, headings = traced_curve(spans, slopes, _TURN)
+        aside = -1 if plan.family(fibre) else 1
+        places, walls = _inner_walls(pad.to_mm(points)[:, ::aside], headings, half)
+        cuts = half - shapely.distance(shapely.LineString(pad.to_mm(line)), shapely.points(walls[:, ::aside]))
+        found += zip(cuts.tolist(), places[:, ::aside], strict=True)
+    folds = [place for cut, place in found if cut > mould.tolerance_mm]
+    most = max((cut for cut, _ in found), default=0.0)
+    bends = "1 bend is" if len(folds) == 1 else f"{len(folds)} bends are"
+    message = f"no bend cuts a track's inner wall by more than {mould.tolerance_mm:g} mm"
+    if folds:
+        message = f"{bends} tighter than half the track's width, which cuts its inner wall by up to {most:.2f} mm"
+    return Finding("folds", "warn" if folds else "pass", len(folds), 0, message, as_places(folds))
+
+
+def _inner_walls(points: NDArray[np.float64], headings: NDArray[np.float64], half: float) -> NDArray[np.float64]:
+    """(2, k, 2) the middle of every bend whose radius is below `half`, and the place so far beside it, inwards."""
+    turns = np.diff(headings)
+    tight = np.flatnonzero(np.abs(turns) * half > np.hypot(*np.diff(points, axis=0).T))
+    others = np.flatnonzero((np.diff(tight) > 1) | (np.diff(np.sign(turns[tight])) != 0)) + 1
+    bends = [bend for bend in np.split(tight, others) if len(bend)]
+    ends = np.array([(headings[bend[0]], headings[bend[-1] + 1]) for bend in bends]).reshape(-1, 2)
+    along = ends.mean(axis=1)
+    middle = [bend[np.abs(headings[bend] - at).argmin()] for bend, at in zip(bends, along, strict=True)]
+    inward = np.sign(np.diff(ends)) * np.stack([-np.sin(along), np.cos(along)], axis=1)
+    places = points[np.array(middle, dtype=int)]
+    return np.stack([places, places + half * inward])
 
 
 def _numbers(plan: Plan) -> Finding:

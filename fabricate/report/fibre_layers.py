@@ -42,7 +42,7 @@ def layers(plan: Plan) -> list[Layer]:
     ]
     families = [plan.family(fibres[0]) for fibres in laid]
     found = []
-    for level, (family, depth_mm, fibres) in enumerate(zip(families, plan.heights_mm, laid, strict=True)):
+    for level, (family, depth_mm, fibres) in enumerate(zip(families, plan.depths_mm, laid, strict=True)):
         white = _PALEST * families[level + 1 :].count(family) / families.count(family)
         found.append(Layer(family, level, depth_mm, fibres, pale(COLOURS[family], white)))
     return found[::-1]

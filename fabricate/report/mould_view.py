@@ -148,8 +148,8 @@ def _tops(document: Mapping[str, Any], ground_mm: float) -> list[list[float]]:
     found = {}
     for fibre in document["fibres"]:
         colour = COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
-        found[float(fibre["depth_mm"])] = [part / 255 for part in bytes.fromhex(colour[1:])]
-    return [[floor_mm + depth_mm, *colour] for depth_mm, colour in sorted(found.items())][:_MOST_LEVELS]
+        found[float(fibre["ridge_mm"])] = [part / 255 for part in bytes.fromhex(colour[1:])]
+    return [[floor_mm + ridge_mm, *colour] for ridge_mm, colour in sorted(found.items())][:_MOST_LEVELS]
 
 
 def _base64(values: NDArray[Any]) -> str:

@@ -4,6 +4,7 @@ All are seen from above. The same input gives the same bytes; files are small, f
 """
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from fabricate.checks.findings import Finding
 from fabricate.mould.plan import INTO_WALL_MM, Plan, polygon_rings
 
 from .fibre_layers import COLOURS, FAMILIES, Layer, layers
+from .laying.orientation import SENTENCE
 from .relief import RIDGE, lit, mesh_relief, mould_relief
 from .track_drawings import SCALE_MM
 
@@ -40,6 +42,8 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 66, 24, 44, 62
 """Pixels around it for title, ticks and axis labels; the rows of the legend come below."""
 _ROW, _COLUMNS = 21, 3
 """Height of a row of the legend in pixels, and entries in one."""
+_LINE, _LETTER = 15, 6.2
+"""Height of a line of the note below the legend and width of a letter in it, pixels."""
 _FAIL_MARKS, _CARE_MARKS = "osp8H", "D^v<>"
 """A mark of its own for every check, as long as they last."""
 
@@ -82,7 +86,7 @@ def draw_tracks(plan: Plan, path: Path) -> None:
     places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
     title = f"Fibres as they lie in the tray, from above: {2 * plan.pad.grid} fibres, {len(plan.crossings)} crossings"
     bounds = (left - room, right + room, low - room, high + room)
-    sheet = _sheet(bounds, title, len(order) + (len(places) > 0))
+    sheet = _sheet(bounds, title, len(order) + (len(places) > 0), SENTENCE)
     for area in (plan.silicone, plan.cavity):
         for ring in (ring for polygon in polygon_rings(area) for ring in polygon):
             sheet.axes.fill(*ring.T, facecolor=PAPER, edgecolor=_EDGE, linewidth=1, zorder=1)
@@ -125,7 +129,7 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
     from matplotlib.patheffects import withStroke
     from shapely.ops import substring
 
-    width = max(1.3, sheet.points(plan.settings.pad.fibre_diameter_mm))
+    width = max(1.3, sheet.points(plan.settings.fibre.material.diameter_mm))
     size = min(11.0, 0.5 * sheet.points(plan.pad.pitch_mm))
     drawn = []
     for fibre in layer.fibres:
@@ -155,12 +159,14 @@ class _Sheet:
 
     Attributes:
         extent: left, right, low and high of the axes, mm. pixels: their width and height.
+        note: lines below the legend.
     """
 
     figure: "Figure"
     axes: "Axes"
     extent: tuple[float, float, float, float]
     pixels: tuple[int, int]
+    note: tuple[str, ...] = ()
 
     def points(self, length_mm: float) -> float:
         """A length on the picture in typographic points."""
@@ -208,25 +214,33 @@ class _Sheet:
         """Write the picture with its legend as PNG."""
         from design.common.figures import save_figure
 
+        width, height = self.figure.get_size_inches() * _DPI
+        below = _LINE * len(self.note)
         if handles:
             style: dict[str, Any] = {"frameon": False, "fontsize": 9, "borderaxespad": 0.2, "handlelength": 1.6}
-            self.figure.legend(handles=handles, loc="lower center", ncols=_COLUMNS, **style)
+            room = (0, below / height, 1, 1)
+            self.figure.legend(handles=handles, loc="lower center", bbox_to_anchor=room, ncols=_COLUMNS, **style)
+        for row, line in enumerate(self.note):
+            place = _LEFT / 2 / width, (below - (row + 0.5) * _LINE) / height
+            self.figure.text(*place, line, fontsize=8, color=_GREY, va="center")
         save_figure(self.figure, path, _DPI)
 
 
-def _sheet(extent: tuple[float, float, float, float], title: str, entries: int) -> _Sheet:
-    """An empty picture of `extent` (left, right, low, high) mm with room for the legend's entries."""
+def _sheet(extent: tuple[float, float, float, float], title: str, entries: int, note: str = "") -> _Sheet:
+    """An empty picture of `extent` (left, right, low, high) mm with room for the legend's entries and a note."""
     from matplotlib.figure import Figure
 
     left, right, low, high = extent
     scale = _PIXELS / max(right - left, high - low)
     wide, tall = max(1, round(scale * (right - left))), max(1, round(scale * (high - low)))
-    below = _BOTTOM + _ROW * math.ceil(entries / _COLUMNS) + 6 * (entries > 0)
-    width, height = _LEFT + max(wide, _NARROWEST) + _RIGHT, below + tall + _TOP
+    width = _LEFT + max(wide, _NARROWEST) + _RIGHT
+    lines = tuple(textwrap.wrap(note, int((width - _LEFT) / _LETTER)))
+    below = _BOTTOM + _ROW * math.ceil(entries / _COLUMNS) + 6 * (entries > 0) + _LINE * len(lines)
+    height = below + tall + _TOP
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
     axes = figure.add_axes((_LEFT / width, below / height, wide / width, tall / height))
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x (mm)", ylabel="y (mm)")
     axes.set_title(title, fontsize=11, color=INK, loc="left")
     axes.tick_params(colors=_GREY, labelsize=9)
     axes.spines[:].set_color(_EDGE)
-    return _Sheet(figure, axes, extent, (wide, tall))
+    return _Sheet(figure, axes, extent, (wide, tall), lines)

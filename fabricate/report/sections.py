@@ -1,14 +1,18 @@
 """What a report has to say of a mould, and of the making of a pad with it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from design.common.errors import InputError
+from design.common.files import unchanged
 from design.common.page.elements import PageSection, figures, folded, heading, html_pieces, paragraph, table
 
+from .laying import orientation
 from .laying.guide import laying_page
 from .mould_view import packed, script, view
 
+_SHOWN = ("mould.stl", "mould.png", "tracks.png", "dispensing.svg", orientation.FILE)
 _SHOWN_PLACES = 3
 
 
@@ -17,15 +21,16 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
 
     Raises:
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: the mesh or a picture beside it cannot be read.
+        InputError: the mesh or a picture that was written with it is another one now.
     """
-    return [_mould(folder, document), _bench(document)]
+    shown = _written_with(folder, document)
+    return [_mould(folder, shown, document), _bench(folder, shown, document)]
 
 
-def _mould(folder: Path, document: Mapping[str, Any]) -> PageSection:
+def _mould(folder: Path, shown: Collection[str], document: Mapping[str, Any]) -> PageSection:
     """The mould to be turned, its pictures, and the checks."""
     solid = folder / "mould.stl"
-    mesh = packed(solid) if solid.is_file() else None
+    mesh = packed(solid) if solid.name in shown else None
     findings = document["findings"]
     size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     passed = [finding for finding in findings if finding["status"] == "pass"]
@@ -34,12 +39,13 @@ def _mould(folder: Path, document: Mapping[str, Any]) -> PageSection:
     captions = {
         "mould.png": f"The mould from above, {size} mm: colour tells family and height.",
         "tracks.png": "The fibres as they lie in the mould; the deeper one interrupts the other.",
+        "dispensing.svg": "The ways of a needle that lays the fibres, the pad turned over.",
     }
     return PageSection(
         "Mould",
         [
-            *([view(mesh, document)] if mesh else [paragraph(large)] if solid.is_file() else []),
-            figures([(folder / name, caption) for name, caption in captions.items()]),
+            *([view(mesh, document)] if mesh else [paragraph(large)] if solid.name in shown else []),
+            figures([(folder / name, caption) for name, caption in captions.items() if name in shown]),
             heading("Printability"),
             paragraph(f"{len(passed)} of {len(findings)} checks pass."),
             *([_checks(remarks)] if remarks else []),
@@ -53,10 +59,26 @@ def _mould(folder: Path, document: Mapping[str, Any]) -> PageSection:
     )
 
 
-def _bench(document: Mapping[str, Any]) -> PageSection:
+def _written_with(folder: Path, document: Mapping[str, Any]) -> set[str]:
+    """Names of the mesh and the pictures in a folder that were written with its fabrication document.
+
+    Raises:
+        InputError: one of them is another one now.
+    """
+    digests = {name: document["sha256"][name] for name in _SHOWN if name in document["sha256"]}
+    own = unchanged(folder, digests)
+    for name in digests.keys() - own:
+        if (folder / name).exists():
+            raise InputError(f"{folder / name}: is not the one fabrication.json was written with; fabricate again")
+    return own
+
+
+def _bench(folder: Path, shown: Collection[str], document: Mapping[str, Any]) -> PageSection:
     """How to make the pad, as `laying.md` has it: what to print and to mix, lengths to cut, the order of laying."""
     guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section has in full
-    return PageSection("Making the pad", list(html_pieces(guide)))
+    before, _, after = guide.partition(orientation.LINK)
+    drawing = [figures([(folder / orientation.FILE, orientation.CAPTION)])] if orientation.FILE in shown else []
+    return PageSection("Making the pad", [*html_pieces(before), *drawing, *html_pieces(after)])
 
 
 def _checks(findings: Sequence[Mapping[str, Any]]) -> str:

@@ -1,13 +1,13 @@
 """The tracks as drawings of true size, with nothing approximated: SVG and DXF, 1 unit = 1 mm.
 
-Both show the pad as it lies in the tray, tracks down, seen from above. Turned over for laying, it is the mirror
-image of the drawing: left and right change places.
+Both show the pad as it lies in the tray, tracks down, seen from above, and say which way round it is laid and used.
 """
 
 # pyright: reportPrivateImportUsage=false
 # ezdxf does not mark what its own manual imports as exported.
 
 import io
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from design.pad.knots import Array
 from fabricate.mould.plan import Plan, polygon_rings
 
 from .fibre_layers import COLOURS, FAMILIES, fibre_name, layers
+from .laying.orientation import SENTENCE
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
@@ -36,13 +37,12 @@ _TEXT_MM = 2.5
 _ASIDE_MM = 1.0
 """Between the silicone and the writing beside it."""
 _NOTE = "as it lies in the tray, seen from above"
-_NOTE_MM = 70.0
-"""Room for the scale bar and its two texts."""
 _DESCRIPTION = (
     "True size, 1 unit = 1 mm. Seen from above as the pad lies in the tray, tracks down: the mould's ridges lie as"
-    " drawn. The numbers beside the starts read as drawn. Turned over for laying, the pad is the mirror image of this"
-    " drawing, left and right change places. Layers are in laying order, the deepest first."
+    f" drawn. {SENTENCE} Layers are in laying order, the deepest first."
 )
+_LETTER_MM = 0.6
+"""Width of a letter, at most and on average, for a height of 1."""
 
 _ACI = (5, 30)
 """Blue and orange of the old CAD colour index, for readers that know no others."""
@@ -128,10 +128,11 @@ class _Sheet:
     @cached_property
     def frame(self) -> tuple[float, float, float, float]:
         """Left, low, right and high of the drawing; the scale bar and the numbers lie outside of the silicone."""
-        left, _, right, high = self.bounds
+        left, _, _, high = self.bounds
         digits = len(str(2 * self.plan.pad.grid))
         left -= 2 * _ASIDE_MM + digits * self.text_mm
-        return left, self.scale_y - 3 * _ASIDE_MM, max(right + 2 * _ASIDE_MM, left + _NOTE_MM), high + 2 * _ASIDE_MM
+        low = self.scale_y - 3 * _ASIDE_MM - len(self.said) * self.line_mm
+        return left, low, self.bounds[0] + self.room_mm + 2 * _ASIDE_MM, high + 2 * _ASIDE_MM
 
     @cached_property
     def spans(self) -> Array:
@@ -168,11 +169,29 @@ class _Sheet:
         return [((left, y), (left + SCALE_MM, y)), *(((x, y), (x, y + tick)) for x, tick in ticks)]
 
     @cached_property
+    def line_mm(self) -> float:
+        """From one line of writing to the next."""
+        return 1.4 * self.text_mm
+
+    @cached_property
+    def room_mm(self) -> float:
+        """For writing: as wide as the silicone, or as the scale bar with its two texts."""
+        left, _, right, _ = self.bounds
+        return max(right - left, SCALE_MM + _ASIDE_MM + (5 + _LETTER_MM * len(_NOTE)) * self.text_mm)
+
+    @cached_property
+    def said(self) -> list[str]:
+        """Which way round, in lines as long as there is room for."""
+        return textwrap.wrap(SENTENCE, int(self.room_mm / (_LETTER_MM * self.text_mm)))
+
+    @cached_property
     def notes(self) -> list[_Text]:
-        """What is written beside the scale bar."""
-        x, y = self.bounds[0] + SCALE_MM + _ASIDE_MM, self.scale_y + self.text_mm / 4
-        after = x + 5 * self.text_mm
-        return [_Text(f"{SCALE_MM:g} mm", x, y, "start", "#555555"), _Text(_NOTE, after, y, "start", "#555555")]
+        """What is written beside the scale bar and below it."""
+        left, x, y = self.bounds[0], self.bounds[0] + SCALE_MM + _ASIDE_MM, self.scale_y + self.text_mm / 4
+        beside = [(f"{SCALE_MM:g} mm", x, y), (_NOTE, x + 5 * self.text_mm, y)]
+        first = self.scale_y - _ASIDE_MM - self.line_mm / 2
+        below = [(line, left, first - row * self.line_mm) for row, line in enumerate(self.said)]
+        return [_Text(*text, "start", "#555555") for text in (*beside, *below)]
 
 
 def _svg_layer(name: str, label: str, style: str, content: Iterator[str]) -> list[str]:
@@ -187,7 +206,7 @@ def _svg_silicone(plan: Plan) -> Iterator[str]:
 
 
 def _svg_tracks(sheet: _Sheet) -> Iterator[str]:
-    width = f'stroke-width="{sheet.plan.settings.pad.fibre_diameter_mm:g}"'
+    width = f'stroke-width="{sheet.plan.settings.fibre.material.diameter_mm:g}"'
     for layer in layers(sheet.plan):
         label = f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
         paths = (_svg_path(sheet, fibre) for fibre in layer.fibres)

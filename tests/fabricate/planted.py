@@ -7,6 +7,7 @@ import numpy as np
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings
+from fabricate.materials import FibreSettings, SiliconeSettings
 from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
 
 
@@ -20,11 +21,20 @@ def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology
     return Morphology(assemble(inner), pitch_mm)
 
 
+def winding_pad(*places: tuple[float, float], pitch_mm: float = 10.0) -> Morphology:
+    """A pad of 1 x 1 whose horizontal fibre runs through places (grid units, 0..2); its vertical one is straight."""
+    along = 2 * np.arange(1, len(places) + 1) / (len(places) + 1)
+    vertical = np.stack([np.ones(len(places)), along], axis=1)
+    return Morphology(assemble(np.stack([np.array(places, dtype=float), vertical])), pitch_mm)
+
+
 def with_settings(
     mould: dict[str, object] | None = None,
     printer: dict[str, object] | None = None,
     pad: dict[str, object] | None = None,
     rules: dict[str, object] | None = None,
+    silicone: dict[str, object] | None = None,
+    fibre: dict[str, object] | None = None,
 ) -> FabricationSettings:
     """The defaults with some keys changed."""
     return replace(
@@ -33,4 +43,6 @@ def with_settings(
         printer=PrinterSettings.model_validate(printer or {}),
         pad=PadSettings.model_validate(pad or {}),
         rules=RulesSettings.model_validate(rules or {}),
+        silicone=SiliconeSettings.model_validate(silicone or {}),
+        fibre=FibreSettings.model_validate(fibre or {}),
     )

@@ -11,7 +11,7 @@ from design.pad.morphology import Morphology
 from fabricate.cli import fabricate
 from tests.fabricate.planted import level_pad
 
-FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md"}
+FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg"}
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +52,21 @@ def test_check_of_a_morphology(morphology):
     result = invoke("check", morphology)
     assert result.exit_code == 0
     assert all(line.startswith("ok") for line in result.stdout.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("table", "line"),
+    [
+        ('[silicone]\nname = "Eco 20"', "[silicone] name: got 'Eco 20', allowed are published, EcoFlex 00-10, "),
+        ("[pad]\nfibre_diameter_mm = 0.4", "[pad] fibre_diameter_mm: no such key, it is [fibre] diameter_mm now"),
+    ],
+)
+def test_materials_that_cannot_be_are_one_line(morphology, tmp_path, table, line):
+    (tmp_path / "pad.toml").write_text(table, encoding="utf-8")
+    result = invoke(morphology, "--spec", tmp_path / "pad.toml")
+    assert isinstance(result.exception, InputError)
+    assert line in str(result.exception)
+    assert not (tmp_path / "mould.stl").exists()
 
 
 def test_check_exits_1_when_a_check_fails(tmp_path):

@@ -1,23 +1,23 @@
 """What the person at the bench needs: silicone to mix, fibres to cut, the order to lay them in, and a page of it all.
 
-Places are in the frame of the plan, the pad as it lies in the tray; the page has them as on the pad turned over.
+Places are those of the plan, on the page too.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from design.pad.courses.curves import lengths
+from fabricate.materials import PLASTICS
 from fabricate.mould.plan import Plan, overlap
 from fabricate.report.fibre_layers import fibre_name, layers
+from fabricate.settings import MouldSettings, PrinterSettings
 
-SILICONE = "EcoFlex 00-20"
-DENSITY_G_PER_ML = 1.07
-"""Specific gravity of EcoFlex 00-20, as its maker states it."""
-SURPLUS_PERCENT = 10
-"""What sticks to the cup and the stick."""
-PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
-"""What a filament and a resin printer commonly print, and its density, g/ml."""
+from . import casting, print_settings, wiring
+from .orientation import LINK, SENTENCE
+from .tables import table
+
 _LONGEST_TABLE = 24
 """More crossings than this leave no room for them on a page."""
 
@@ -31,31 +31,17 @@ def document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
 
     Returns:
         "silicone": to mix. "adhesive": volume of the tracks that it seals, by step of laying.
-        "fibres": one each, in the order of their numbers. "laying_order": the numbers laid in each step, deep first.
+        "fibre": what they are of. "fibres": one each, in the order of their numbers.
+        "laying_order": the numbers laid in each step, deep first.
         "crossings": all of them, with the silicone left between the fibres.
     """
     return {
-        "silicone": _silicone(plan, mould_mm3),
+        "silicone": casting.silicone(plan, mould_mm3),
         "adhesive": _adhesive(plan),
+        "fibre": asdict(plan.settings.fibre.material),
         "fibres": _fibres(plan),
         "laying_order": [[fibre + 1 for fibre in layer.fibres] for layer in layers(plan)],
         "crossings": _crossings(plan),
-    }
-
-
-def _silicone(plan: Plan, mould_mm3: float) -> dict[str, Any]:
-    """What fills the mould to the top of its walls: the box around it without the mould itself."""
-    volume_ml = (plan.tray.area * (plan.settings.mould.floor_mm + plan.silicone_mm) - mould_mm3) / 1000
-    part_g = round(volume_ml * DENSITY_G_PER_ML * (1 + SURPLUS_PERCENT / 100) / 2, 2)
-    return {
-        "name": SILICONE,
-        "thickness_mm": plan.silicone_mm,
-        "volume_ml": round(volume_ml, 4),
-        "density_g_per_ml": DENSITY_G_PER_ML,
-        "surplus_percent": SURPLUS_PERCENT,
-        "mass_g": round(2 * part_g, 2),
-        "part_a_g": part_g,
-        "part_b_g": part_g,
     }
 
 
@@ -77,9 +63,11 @@ def _fibres(plan: Plan) -> list[dict[str, Any]]:
             "number": fibre + 1,
             "fibre": fibre_name(plan, fibre),
             "level": level,
-            "depth_mm": plan.heights_mm[level],
+            "ridge_mm": plan.enlarged.heights_mm[level],
+            "depth_mm": plan.depths_mm[level],
             "in_pad_mm": round(course, 2),
             "cut_mm": round(course + 2 * mould.lead_mm, 2),
+            **wiring.resistances(plan, course + 2 * mould.lead_mm),
         }
         for fibre, (level, course) in enumerate(zip(plan.levels, courses.tolist(), strict=True))
     ]
@@ -90,8 +78,8 @@ def _crossings(plan: Plan) -> dict[str, Any]:
     table: list[list[Any]] = []
     for crossing in plan.crossings:
         pair = crossing.first, crossing.second
-        depths = [plan.heights_mm[plan.levels[fibre]] for fibre in pair]
-        gap = abs(depths[0] - depths[1]) - plan.settings.pad.fibre_diameter_mm
+        depths = [plan.depths_mm[plan.levels[fibre]] for fibre in pair]
+        gap = abs(depths[0] - depths[1]) - plan.settings.fibre.material.diameter_mm
         place = [round(x, 3) for x in plan.pad.to_mm(crossing.place).tolist()]
         table.append([*(fibre_name(plan, fibre) for fibre in pair), *place, *depths, round(gap, 3)])
     return {
@@ -107,9 +95,11 @@ def laying_page(document: Mapping[str, Any]) -> str:
     """`laying.md` from a whole fabrication document: a page to print and take to the bench."""
     sections = {
         "Print": _printing(document),
-        "Mix": _mixing(document["silicone"]),
-        "Cast": _casting(document),
+        "Mix": casting.mixing(document["silicone"]),
+        "Cast": casting.casting(document),
+        "Which way round": _way_round(document),
         "Lay": _laying(document),
+        "Wire": wiring.wiring(document),
         "Crossings": _crossing_places(document),
         "Checks": _remarks(document["findings"]),
     }
@@ -120,61 +110,43 @@ def laying_page(document: Mapping[str, Any]) -> str:
 def _printing(document: Mapping[str, Any]) -> Iterator[str]:
     size = " x ".join(f"{side:.2f}".rstrip("0").rstrip(".") for side in document["size_mm"])
     volume_ml, mould = document["mould_volume_ml"], document["settings"]["mould"]
-    resin = document["settings"]["printer"]["resin"]
+    settings = MouldSettings(**mould), PrinterSettings(**document["settings"]["printer"])
+    resin = settings[1].resin
     plastic, density = PLASTICS[resin]
     yield f"- The mould is {size} mm and takes {volume_ml:.1f} ml, {volume_ml * density:.0f} g of {plastic} if solid."
     yield "- Print it as it lies, open side up, without supports."
     if resin:
+        yield from print_settings.for_resin(*settings)
         yield "- Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."
     if mould["lid"]:
         yield "- Print the lid as well."
     if mould["holder"]:
         yield (
             "- Print the holder last, in the middle of the bed, and leave it there. The finished pad lies in it with"
-            " its tracks down; fibres 1 and "
+            " its tracks up; fibres 1 and "
             f"{len(document['fibres']) // 2 + 1} start at the cut corner."
         )
     if mould["conductive"]:
         yield "- The mould called `conductive` is for casting a conductive material in place of fibres."
+    if not resin:
+        yield from ("", "What to set in the slicer, by the names it has there:", "")
+        yield from table(print_settings.HEAD, list(print_settings.rows(*settings)))
 
 
-def _mixing(silicone: Mapping[str, Any]) -> Iterator[str]:
-    parts = [round(silicone[key], 1) for key in ("part_a_g", "part_b_g")]
-    masses = [f"{mass:.1f} g" for mass in (*parts, sum(parts))]
-    yield from _table((silicone["name"], "part A", "part B", "together"), [("mass", *masses)])
+def _way_round(document: Mapping[str, Any]) -> Iterator[str]:
+    grid = len(document["fibres"]) // 2
+    yield f"{SENTENCE} Horizontal fibres are {_span(1, grid)}, vertical ones {_span(grid + 1, 2 * grid)}."
     yield ""
-    yield (
-        f"The mould holds {silicone['volume_ml']:.1f} ml, the pad is {silicone['thickness_mm']:g} mm thick."
-        f" The masses include {silicone['surplus_percent']:g} % for what stays in the cup."
-    )
-
-
-def _casting(document: Mapping[str, Any]) -> Iterator[str]:
-    mould = document["settings"]["mould"]
-    pour = "Pour it slowly into one corner of the level mould, up to the top of the walls."
-    if mould["spout"]:
-        pour = "Lay the lid on the level mould and pour through its spout until silicone rises in the vents."
-    elif mould["lid"]:
-        pour += " Lay the lid on: air and surplus leave by its vents."
-    yield "1. Stir part A and part B together. The pot life is 30 minutes: be done with pouring by then."
-    yield "2. Degas the mix in a vacuum until its bubbles have burst."
-    yield f"3. {pour}"
-    yield "4. Leave it for 4 hours at room temperature."
-    yield "5. Free the casting all along the walls, then pull it out from a corner."
+    yield LINK
 
 
 def _laying(document: Mapping[str, Any]) -> Iterator[str]:
     mould, adhesive, fibres = document["settings"]["mould"], document["adhesive"], document["fibres"]
-    grid = len(fibres) // 2
     read = " The numbers on it read the right way now." if mould["number_mm"] else ""
-    yield (
-        f"1. Turn the casting over, left to right: the tracks lie on top, mirrored.{read} The horizontal fibres"
-        f" ({_span(1, grid)}) start on the right, from near to far. The vertical ones ({_span(grid + 1, 2 * grid)})"
-        " start at the near side, from right to left."
-    )
+    yield f"1. Turn the casting over, as drawn above: the tracks lie on top.{read}"
     yield (
         "2. Cut the fibres and lay them in steps, the deepest first. Press each down to the bottom of its track, with"
-        f" {mould['lead_mm']:g} mm out at both ends."
+        f" {mould['lead_mm']:g} mm out at both ends.{_handling(document['fibre'])}"
     )
     yield (
         f"3. After each step, fill the tracks over the fibres with {adhesive['name']}. Keep the tracks that cross above"
@@ -186,8 +158,24 @@ def _laying(document: Mapping[str, Any]) -> Iterator[str]:
         for fibre in (fibres[number - 1] for number in numbers):
             lengths_mm = (f"{fibre[key]:.1f} mm" for key in ("in_pad_mm", "cut_mm"))
             sealed = f"{volume_ml:.2f} ml" if fibre["number"] == numbers[-1] else ""
-            rows.append((step, fibre["number"], fibre["fibre"], f"{fibre['depth_mm']:g} mm", *lengths_mm, sealed))
-    yield from _table(("step", "number", "fibre", "depth", "in the pad", "cut to", "then seal with"), rows)
+            rows.append((step, fibre["number"], fibre["fibre"], f"{fibre['depth_mm']:.3g} mm", *lengths_mm, sealed))
+    yield from table(("step", "number", "fibre", "depth", "in the pad", "cut to", "then seal with"), rows)
+    if programs := [f"`{name}`" for name in document["files"] if name.startswith("laying.")]:
+        yield ""
+        yield (
+            f"Or let a machine lay them in this order, on the pad turned over: its ways are in {' and '.join(programs)}"
+            " and drawn in `dispensing.svg`. It waits while you fasten and cut each fibre and seal each step."
+        )
+
+
+def _handling(fibre: Mapping[str, Any]) -> str:
+    """What a fibre bears, as far as it is known, as a sentence."""
+    limits = []
+    if fibre["largest_stretch"] is not None:
+        limits.append(f"{100 * fibre['largest_stretch']:.3g} % of stretch at most")
+    if fibre["least_bend_mm"] is not None:
+        limits.append(f"bends of no less than {fibre['least_bend_mm']:g} mm radius")
+    return f" Lay them unstretched: {fibre['name']} bears {' and '.join(limits)}." if limits else ""
 
 
 def _crossing_places(document: Mapping[str, Any]) -> Iterator[str]:
@@ -197,19 +185,19 @@ def _crossing_places(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"{crossings['total']} crossings, {crossings['same_family']} of them within a family. {least}"
     yield ""
     if crossings["total"] <= _LONGEST_TABLE:
-        yield "Places are from the middle of the pad turned over: x to the right, y away from you."
+        yield "Places are from the middle of the pad. As it lies, x runs to the left and y away from you."
         yield ""
         rows = [
-            (f"{number[one]} and {number[two]}", f"{0 - x:.1f} mm", f"{y:.1f} mm", f"{a:g} and {b:g} mm", f"{gap:g} mm")
+            (f"{number[one]} and {number[two]}", f"{x:.1f} mm", f"{y:.1f} mm", _depths(a, b), f"{gap:g} mm")
             for one, two, x, y, a, b, gap in crossings["table"]
         ]
-        yield from _table(("fibres", "x", "y", "depths", "between them"), rows)
+        yield from table(("fibres", "x", "y", "depths", "between them"), rows)
         return
     counts = Counter((max(a, b), min(a, b), gap) for *_, a, b, gap in crossings["table"])
-    rows = [(f"{a:g} and {b:g} mm", f"{gap:g} mm", count) for (a, b, gap), count in sorted(counts.items())[::-1]]
-    yield from _table(("depths", "between the fibres", "crossings"), rows)
+    rows = [(_depths(a, b), f"{gap:g} mm", count) for (a, b, gap), count in sorted(counts.items())[::-1]]
+    yield from table(("depths", "between the fibres", "crossings"), rows)
     yield ""
-    yield "`fabrication.json` has the place of each as in the tray: its x has the other sign."
+    yield "`fabrication.json` has the place of each."
 
 
 def _remarks(findings: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -225,9 +213,8 @@ def _remarks(findings: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield f"- **{finding['status']}** {finding['name']}: {finding['message']}{places}"
 
 
-def _table(head: Sequence[object], rows: Sequence[Sequence[object]]) -> Iterator[str]:
-    for row in (head, ["---"] * len(head), *rows):
-        yield f"| {' | '.join(map(str, row))} |"
+def _depths(first_mm: float, second_mm: float) -> str:
+    return f"{first_mm:.3g} and {second_mm:.3g} mm"
 
 
 def _span(first: int, last: int) -> str:

@@ -9,7 +9,7 @@ from design.common.errors import InputError
 from fabricate.checks import mesh_checks
 from fabricate.checks.mesh_checks import SOUND, check_mesh, inspect_mesh, sound
 from fabricate.settings import PrinterSettings
-from tests.fabricate.trays import CROSS, block, faults, inspected, line, near, prism, tray
+from tests.fabricate.checks.trays import CROSS, block, faults, inspected, line, near, prism, tray
 
 
 class TestSound:

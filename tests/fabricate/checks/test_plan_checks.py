@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import shapely
 
+from design.pad.courses.curves import beziers, cubic
 from design.pad.morphology import Morphology
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND
@@ -84,7 +85,7 @@ class TestPrinter:
 
 class TestFibres:
     def test_a_fibre_thicker_than_its_track(self):
-        finding = found(Morphology.straight(1), "track_size", with_settings(pad={"fibre_diameter_mm": 0.5}))
+        finding = found(Morphology.straight(1), "track_size", with_settings(fibre={"diameter_mm": 0.5}))
         assert (finding.status, finding.measured, finding.limit) == ("fail", 0.4, 0.5)
 
     @pytest.mark.parametrize(
@@ -93,8 +94,16 @@ class TestFibres:
     )
     def test_a_track_is_as_wide_and_as_deep_as_its_fibre(self, width, height, fibre, status):
         mould = {"ridge_width_mm": width, "shallow_ridge_height_mm": height}
-        finding = found(Morphology.straight(1), "track_size", with_settings(mould, pad={"fibre_diameter_mm": fibre}))
+        finding = found(Morphology.straight(1), "track_size", with_settings(mould, fibre={"diameter_mm": fibre}))
         assert (finding.status, finding.measured) == (status, min(width, height))
+
+    def test_tracks_shrink_and_fibres_do_not(self):
+        shrinking = with_settings(silicone={"shrinkage": 0.02}, fibre={"diameter_mm": 0.395})
+        assert found(Morphology.straight(1), "ridge_width", shrinking).measured == pytest.approx(0.4 / 0.98)
+        finding = found(Morphology.straight(1), "track_size", shrinking)  # 0.408 mm rounded to 4 layers, and shrunk
+        assert (finding.status, finding.measured) == ("fail", pytest.approx(0.392))
+        assert found(Morphology.straight(1), "crossing_gap", shrinking).measured == pytest.approx(0.98 * 0.8 - 0.395)
+        assert found(Morphology.straight(1), "layers", shrinking).status == "pass"
 
     @pytest.mark.parametrize(
         ("deep", "status", "gap"),
@@ -123,6 +132,17 @@ class TestFibres:
         x, y = finding.places_mm[0]
         assert x == pytest.approx((0.915 - 1) * 11.25, abs=0.4)
         assert y == pytest.approx(0.025 * 11.25, abs=0.4)
+
+    @pytest.mark.parametrize(
+        ("bears", "rule", "status", "limit"), [(20, 1, "fail", 20), (9, 1, "pass", 9), (9, 12, "pass", 12)]
+    )
+    def test_a_bend_tighter_than_the_fibre_bears(self, bears, rule, status, limit):
+        """Fibres that swing gently: their bends are of some 18 mm."""
+        knots = np.array([[0, 1], [0.5, 1.1], [1, 1], [1.5, 0.9], [2, 1]])
+        pad = Morphology(np.stack([knots, knots[:, ::-1]]), 15.0)
+        settings = with_settings(rules={"min_bend_radius_mm": float(rule)}, fibre={"least_bend_mm": float(bears)})
+        finding = found(pad, "fibre_bend", settings)
+        assert (finding.status, finding.limit) == (status, limit)
 
     @pytest.mark.parametrize(("deep", "status"), [(2.0, "pass"), (2.04, "warn"), (4.0, "warn"), (4.04, "fail")])
     def test_slender_ridges(self, deep, status):
@@ -189,6 +209,64 @@ class TestSilicone:
     def test_a_border_keeps_tracks_off_the_wall(self):
         finding = found(level_pad(0.01, 2.0), "tray_wall", with_settings({"border_mm": 2.0}))
         assert (finding.status, finding.places_mm) == ("pass", ())
+
+
+class TestFolds:
+    """Bends so tight that the inner wall of a track would run back through itself."""
+
+    def course(self, travel, cross, family: int) -> Morphology:
+        """A pad of 1 x 1, pitch 10 mm, with one fibre through the given knots and one that is straight."""
+        level = np.stack([np.linspace(0, 2, len(travel)), np.ones(len(travel))], axis=1)
+        fibres = [np.stack([travel, cross], axis=1), level]
+        horizontal, vertical = fibres if family == 0 else fibres[::-1]
+        return Morphology(np.stack([horizontal, vertical[:, ::-1]]), 10.0)
+
+    @pytest.mark.parametrize(("family", "up"), [(0, 1), (0, -1), (1, 1), (1, -1)])
+    def test_bends_are_told_by_their_radius(self, family, up):
+        # Two spans from 0.8 over 1 to 1.2, level at every knot: at each the curvature is 6 x 0.2 / 0.2^2 per grid unit.
+        bump = self.course([0, 0.8, 1, 1.2, 2], [1, 1, 1 + 0.2 * up, 1, 1], family)
+        radius_mm = 10 * 0.2**2 / (6 * 0.2)
+        near: dict[str, object] = {"tolerance_mm": 1e-3, "exit_width_mm": 2.0}
+        narrow, wide = ({**near, "ridge_width_mm": 2 * radius_mm * ratio} for ratio in (0.98, 1.25))
+        assert found(bump, "folds", with_settings(narrow)).status == "pass"
+        finding = found(bump, "folds", with_settings(wide))
+        assert (finding.status, finding.measured) == ("warn", 3)
+        knots = np.array([(-2, 0), (0, 2 * up), (2, 0)])[:, :: -1 if family else 1]
+        assert np.array(finding.places_mm) == pytest.approx(knots, abs=0.3)
+        assert found(bump, "folds", with_settings({**narrow, "ridge_draft_deg": 10.0})).status == "warn"  # at the foot
+
+    @pytest.mark.parametrize(("family", "rise"), [(0, 1.0), (0, -0.6), (1, 0.8)])
+    def test_knots_that_nearly_coincide_are_a_corner(self, family, rise):
+        # Straight to a corner at 0.8, where the slope climbs from `rise` to 4/3 of it and falls to 0 within 1e-6.
+        cross = 1 + rise * np.array([0, 0.8 - 1e-6, 0.8, 0.8, 0])
+        pad = self.course([0, 0.8 - 1e-6, 0.8, 1.2, 2], cross, family)
+        cut = 0.2 * (1 - np.cos(np.arctan(4 / 3 * rise) / 2))
+        finding = found(pad, "folds", with_settings({"tolerance_mm": 0.97 * cut}))
+        assert (finding.status, finding.measured) == ("warn", 1)
+        corner = np.array([-2, 10 * 0.8 * rise])[:: -1 if family else 1]
+        assert np.array(finding.places_mm[0]) == pytest.approx(corner, abs=1e-3)
+        assert f"{cut:.2f} mm" in finding.message
+        assert found(pad, "folds", with_settings({"tolerance_mm": 1.03 * cut})).status == "pass"
+
+    def test_a_bend_within_the_rules_folds_nothing(self):
+        # 28 degrees in one place: less than half a radian, which `min_bend_radius_mm` lets pass
+        rise = 3 / 4 * np.tan(np.radians(28))
+        cross = 1 + rise * np.array([0, 0.8 - 1e-6, 0.8, 0.8, 0])
+        pad = self.course([0, 0.8 - 1e-6, 0.8, 1.2, 2], cross, 0)
+        assert found(pad, "folds").status == "pass"
+
+    def test_a_dense_scan_finds_such_bends_where_they_are_told(self, published):
+        assert found(Morphology.load(published / "1para.mat"), "folds").status == "pass"
+        pad = Morphology.load(published / "5para_dis.mat")
+        finding = found(pad, "folds")
+        u = np.linspace(0, 1, 10_001)
+        scanned = cubic(pad.to_mm(beziers(pad))[:, :, None], np.broadcast_to(u, (8, 6, len(u)))).reshape(-1, len(u), 2)
+        first = np.asarray(np.gradient(scanned, axis=1))
+        second = np.asarray(np.gradient(first, axis=1))
+        bend = np.abs(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+        tight = scanned[bend * 0.2 > np.hypot(first[..., 0], first[..., 1]) ** 3]
+        assert (finding.status, finding.measured) == ("warn", len(finding.places_mm))
+        assert all(np.hypot(*(tight - place).T).min() < 0.02 for place in finding.places_mm)
 
 
 def test_findings_are_plain_json():

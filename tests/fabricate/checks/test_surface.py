@@ -5,7 +5,7 @@ import pytest
 
 from fabricate.checks.findings import graded
 from fabricate.checks.surface import Surface, spread
-from tests.fabricate.trays import block
+from tests.fabricate.checks.trays import block
 
 
 def surface(*meshes) -> Surface:

@@ -11,7 +11,7 @@ from manifold3d import CrossSection, Manifold, Mesh, OpType
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.thickness import least_line_mm
 from fabricate.settings import PrinterSettings
-from tests.fabricate.trays import (
+from tests.fabricate.checks.trays import (
     CROSS,
     DEPTH,
     FLOOR,

@@ -19,6 +19,7 @@ from scipy.interpolate import PchipInterpolator
 from design.pad.morphology import Morphology
 from fabricate.mould.plan import Plan
 from fabricate.report.fibre_layers import layers
+from fabricate.report.laying.orientation import SENTENCE
 from fabricate.report.track_drawings import tracks_dxf, tracks_svg
 from tests.fabricate.planted import level_pad, with_settings
 
@@ -126,7 +127,24 @@ def test_svg_numbers_stand_beside_the_starts_outside_the_silicone():
         assert place.distance(shapely.Point(line.coords[0])) < 3
     root = ElementTree.fromstring(tracks_svg(plan))
     assert "as it lies in the tray" in (root.findtext(f"{SVG}title") or "")
-    assert "mirror image" in (root.findtext(f"{SVG}desc") or "")
+    assert SENTENCE in (root.findtext(f"{SVG}desc") or "")
+
+
+@pytest.mark.parametrize("pad", [Morphology.straight(1, pitch_mm=4.0), PAD, Morphology.straight(10)])
+def test_both_drawings_say_which_way_round_and_have_room_for_it(pad, tmp_path):
+    plan = Plan(pad)
+    beside, *texts = svg_groups(plan)["scale"].findall(f"{SVG}text")[1:]
+    assert " ".join(text.text or "" for text in texts) == SENTENCE
+    notes = read_dxf(tracks_dxf(plan), tmp_path).modelspace().query('TEXT[layer=="scale"]')
+    assert [note.dxf.text for note in notes][2:] == [text.text for text in texts]
+    left, top, width, height = map(float, ElementTree.fromstring(tracks_svg(plan)).get("viewBox", "").split())
+    for text in (beside, *texts):
+        size = min(2.5, 0.6 * pad.pitch_mm)
+        assert float(text.get("x", "")) + 0.58 * size * len(text.text or "") < left + width  # DejaVu Sans is wide
+    lines = [float(text.get("y", "")) for text in texts]
+    assert max(lines) + 1 < top + height
+    assert min(lines) - 1 > -plan.silicone.bounds[1]
+    assert (np.diff(lines) > 0.6 * min(2.5, 0.6 * pad.pitch_mm)).all()
 
 
 def read_dxf(text: str, folder: Path) -> Drawing:

@@ -10,15 +10,16 @@ from design.pad.morphology import Morphology
 from fabricate.mould.assembly import mould_body, plan_mesh
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
-from fabricate.report.laying import guide
+from fabricate.report.laying import guide, orientation
 from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 
 def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
     """A fabrication document as far as the page reads it."""
-    volume = plan_mesh(plan).volume()
+    volume = plan_mesh(plan.enlarged).volume()
     return {
+        "files": ["mould.stl"],
         "size_mm": [64.669, 64.669, 8.0],
         "mould_volume_ml": volume / 1000,
         "findings": list(findings),
@@ -115,7 +116,7 @@ def test_silicone_between_fibres_at_every_crossing(published):
     ("settings", "gap"),
     [
         (DEFAULTS, 0.5),
-        (with_settings(pad={"fibre_diameter_mm": 1.0}), -0.2),
+        (with_settings(fibre={"diameter_mm": 1.0}), -0.2),
         (with_settings({"levels": "two"}), -0.3),
     ],
 )
@@ -159,17 +160,80 @@ def test_the_page_has_what_to_mix_and_to_cut():
     assert "4 hours" in page
 
 
+def test_every_fibre_has_its_resistance_by_its_length_and_its_resistor():
+    plan = Plan(Morphology.random(2, 3, seed=5), with_settings(fibre={"ohm_per_mm": 130.0, "least_bend_mm": 2.5}))
+    document = whole(plan)
+    page = guide.laying_page(document)
+    table = rows(page.partition("## Wire")[2], "number")
+    assert [row[:2] for row in table] == [[str(f["number"]), f["fibre"]] for f in document["fibres"]]
+    for fibre, (*_, shown, fixed) in zip(document["fibres"], table, strict=True):
+        assert fibre["resistance_ohm"] == pytest.approx(130 * fibre["cut_mm"], abs=130 * 0.0051)
+        assert float(shown.removesuffix(" kOhm")) == pytest.approx(fibre["resistance_ohm"] / 1e3, rel=0.005)
+        assert float(fixed.removesuffix(" kOhm")) * 1e3 == fibre["divider_ohm"]
+    assert "carbon-black TPE bears 80 % of stretch at most and bends of no less than 2.5 mm radius." in page
+
+
+def test_an_unknown_resistance_is_said_to_be_and_not_made_up():
+    document = whole(Plan(Morphology.straight(2)))
+    assert {fibre["resistance_ohm"] for fibre in document["fibres"]} == {None}
+    wire = guide.laying_page(document).partition("## Wire")[2].partition("##")[0]
+    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
+    assert "|" not in wire
+
+
+@pytest.mark.parametrize(
+    ("silicone", "pot_life", "cure"),
+    [
+        ({}, "30 minutes", "4 hours"),
+        ({"name": "Dragon Skin 10 fast"}, "8 minutes", "75 minutes"),
+        ({"name": "Dragon Skin 30"}, "45 minutes", "16 hours"),
+        ({"name": "EcoFlex 00-50", "cure_h": 2.5, "pot_life_min": 120}, "2 hours", "2.5 hours"),
+    ],
+)
+def test_the_page_follows_the_silicone(silicone, pot_life, cure):
+    plan = Plan(Morphology.straight(2), with_settings(silicone=silicone))
+    page = guide.laying_page(whole(plan))
+    assert f"The pot life is {pot_life}:" in page
+    assert f"Leave it for {cure} at room temperature." in page
+    assert rows(page, plan.settings.silicone.material.name)
+    assert ("shrinks by 0.1 %" in page) == bool(silicone)
+
+
+def test_parts_are_weighed_by_their_ratio():
+    mixed = with_settings(silicone={"density_g_per_ml": 1.3, "parts": [10.0, 1.0]})
+    silicone = whole(Plan(Morphology.straight(2), mixed))["silicone"]
+    assert silicone["part_a_g"] == pytest.approx(10 * silicone["part_b_g"], abs=0.06)
+    assert silicone["mass_g"] == pytest.approx(silicone["volume_ml"] * 1.3 * 1.1, abs=0.011)
+
+
 def test_the_page_tells_how_the_pad_lies_in_its_holder():
     page = guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
-    assert "tracks down; fibres 1 and 5 start at the cut corner" in page
+    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
     assert "holder" not in guide.laying_page(whole(Plan(Morphology.straight(4))))
 
 
-def test_the_page_has_places_as_on_the_pad_turned_over():
+def test_the_page_has_the_places_of_the_plan():
     plan = Plan(Morphology.straight(2))
-    table = rows(guide.laying_page(whole(plan)), "fibres")
+    page = guide.laying_page(whole(plan))
+    assert "x runs to the left" in page
+    table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
-    assert table[0][1:3] == ["5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
+    assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
+
+
+def test_the_page_names_the_ways_of_a_machine_where_there_are_some():
+    document = whole(Plan(Morphology.straight(2)))
+    assert "machine" not in guide.laying_page(document)
+    page = guide.laying_page(document | {"files": ["mould.stl", "laying.gcode", "laying.script", "dispensing.svg"]})
+    assert "in `laying.gcode` and `laying.script` and drawn in `dispensing.svg`" in page.partition("## Lay\n")[2]
+
+
+def test_the_page_says_and_shows_which_way_round():
+    page = guide.laying_page(whole(Plan(Morphology.straight(4))))
+    section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
+    assert orientation.SENTENCE in section
+    assert "Horizontal fibres are 1 to 4, vertical ones 5 to 8." in section
+    assert f"]({orientation.FILE})" in section
 
 
 def test_many_crossings_are_counted_by_depth(published):
@@ -195,3 +259,11 @@ def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
     plain = guide.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
     assert "the lid" not in plain
+
+
+def test_the_page_says_what_to_set_for_the_printer_at_hand():
+    page = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"layer_mm": 0.2}))))
+    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.2 mm"], "Layer Height: 0.2 mm"]
+    resin = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"resin": True}))))
+    assert "PrusaSlicer" not in resin
+    assert resin.index("- Slice it") < resin.index("- Turn anti-aliasing") < resin.index("- Wash and cure")
