@@ -77,7 +77,7 @@ def test_a_bare_command_shows_its_help(tmp_path):
 def test_init_writes_settings_that_every_command_reads(tmp_path):
     assert called("init", cwd=tmp_path).code == 0
     text = (tmp_path / "pad.toml").read_text()
-    for section in ("pad", "contact", "search", "rules", "mould", "printer", "rig", "localizer"):
+    for section in ("pad", "contact", "search", "rules", "mould", "printer", "dispenser", "rig", "localizer"):
         assert f"[{section}]" in text
     again = called("init", cwd=tmp_path)
     assert again.code == 2

@@ -48,7 +48,16 @@ def test_run_makes_everything(chain):
     names = {path.name for path in out.iterdir()}
     assert names >= {
         *("morphology.json", "design.json", "design.svg", "design.png"),
-        *("mould.stl", "mould.step", "tracks.svg", "mould.png", "tracks.png", "laying.md", "fabrication.json"),
+        *(
+            "mould.stl",
+            "mould.step",
+            "tracks.svg",
+            "mould.png",
+            "tracks.png",
+            "laying.md",
+            "orientation.svg",
+            "fabrication.json",
+        ),
         *("recording", "localizer.safetensors", "localizer.json", "calibration.json", "contacts.json"),
         *("error_map.png", "error_by_loss.png", "report.html"),
     }
@@ -77,7 +86,7 @@ def test_errors_are_told_under_other_contacts_than_the_one_believed(chain):
 
 def test_the_report_is_one_page_with_its_pictures(chain):
     text = (chain[0] / "out" / "pad" / "report.html").read_text()
-    assert text.count('src="data:image/') == 5
+    assert text.count('src="data:image/') == 6
     assert "http://" not in text.replace("http://www.w3.org", "")
     for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Provenance"):
         assert f">{heading}</h2>" in text

@@ -10,10 +10,13 @@ from markupsafe import escape
 
 from design.common.errors import InputError
 from design.common.files import provenance
+from design.pad.morphology import Morphology
 from design.report.contact_section import contact_line
+from fabricate import build
 from padforge import write_report
 from tests.padforge.report.documents import (
     HOSTILE,
+    PAD,
     contacts_document,
     design_document,
     errors,
@@ -30,7 +33,7 @@ def test_every_stage_has_its_section_and_a_link_to_it(page: Path) -> None:
     names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "The contact believed"]
     assert [title for _, title in titles] == [*names, "Studies", "Provenance"]
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
-    assert text.count("data:image/") == 4  # plan, mould, tracks, and the study's figure
+    assert text.count("data:image/") == 5  # plan, mould, tracks, which way round, and the study's figure
     assert page.stat().st_size < MOST_PAGE_BYTES
 
 
@@ -169,10 +172,26 @@ def test_a_damaged_file_is_named_in_one_line(pad: Path, name: str, content: str)
 
 
 def test_a_torn_picture_is_named(pad: Path) -> None:
-    whole = (pad / "mould.png").read_bytes()
-    (pad / "mould.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"mould\.png: not a picture"):
+    whole = (pad / "studies" / "drift.png").read_bytes()
+    (pad / "studies" / "drift.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"drift\.png: not a picture"):
         write_report(pad)
+
+
+@pytest.mark.parametrize("name", ["mould.stl", "mould.png", "tracks.png", "orientation.svg"])
+def test_no_mould_is_shown_beside_the_checks_of_another(pad: Path, tmp_path: Path, name: str) -> None:
+    build(Morphology.straight(2), tmp_path / "other", [name.partition(".")[2]])
+    shutil.copy(tmp_path / "other" / name, pad / name)
+    with pytest.raises(
+        InputError, match=rf"{name}: is not the one fabrication\.json was written with; fabricate again"
+    ):
+        write_report(pad)
+
+
+def test_pictures_that_are_not_of_this_mould_are_left_out(pad: Path) -> None:
+    build(PAD, pad, ["stl"])
+    shutil.copy(pad / "studies" / "drift.png", pad / "mould.png")
+    assert write_report(pad).read_text().count("data:image/") == 3  # plan, which way round, and the study's figure
 
 
 def test_errors_stand_by_the_contact_believed(page: Path) -> None:

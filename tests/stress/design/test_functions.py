@@ -132,7 +132,7 @@ CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Argument
     "to_mm": (PAD.to_mm, {"places": [1, 2]}, lambda found, given: finite(found)),
     "to_grid": (PAD.to_grid, {"places_mm": [1, 2]}, lambda found, given: finite(found)),
     "Contact": (Contact, {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan"}, a_section),
-    "Pad": (PadSettings, {"grid": 2, "pitch_mm": 5.0, "fibre_diameter_mm": 0.3, "deep_family": "vertical"}, a_section),
+    "Pad": (PadSettings, {"grid": 2, "pitch_mm": 5.0, "deep_family": "vertical"}, a_section),
     "Search": (
         SearchSettings,
         {"knots": 3, "lost": 2, "noise": 0.1, "contacts": [{"radius": 0.9}], "seed": 1},

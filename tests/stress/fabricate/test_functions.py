@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from design import InputError, Morphology
 from design.settings import PadSettings
 from fabricate import (
+    DispenserSettings,
     FabricationSettings,
     Finding,
     MouldSettings,
@@ -25,6 +26,7 @@ from fabricate import (
 )
 from fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
 from fabricate.checks.plan_checks import meshed
+from fabricate.materials import FibreSettings, SiliconeSettings
 from fabricate.mesh_files import read_mesh, write_3mf, write_stl
 from fabricate.report.pictures import draw_findings
 from tests.helpers.effort import few
@@ -75,6 +77,7 @@ def mesh_file(**given: Any) -> list[Finding]:
 CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Verify]] = {
     "Mould": (MouldSettings, {"floor_mm": 2.0, "pins": True, "levels": "two", "tolerance_mm": 0.01}, a_section),
     "Printer": (PrinterSettings, {"nozzle_mm": 0.4, "bed_mm": [1.0, 1.0, 1.0], "resin": False}, a_section),
+    "Dispenser": (DispenserSettings, {"tip_mm": 0.37, "origin_mm": [1.0, 2.0], "box_mm": [0.0, 9.0] * 3}, a_section),
     "Settings": (
         FabricationSettings,
         {"mould": MouldSettings(), "printer": PrinterSettings(), "pad": PadSettings()},
@@ -138,11 +141,10 @@ def tables(draw: st.DrawFn) -> FabricationSettings:
         layer_mm=draw(st.sampled_from([0.1, 0.01, 2.0])),
         resin=draw(st.booleans()),
     )
-    pad = PadSettings(
-        fibre_diameter_mm=draw(st.sampled_from([0.3, 1e-300, 10.0])),
-        deep_family=draw(st.sampled_from(["horizontal", "vertical"])),
-    )
-    return FabricationSettings(mould, printer, pad)
+    pad = PadSettings(deep_family=draw(st.sampled_from(["horizontal", "vertical"])))
+    silicone = SiliconeSettings(shrinkage=draw(st.sampled_from([None, 1e-12, 1e-3, 0.2])))
+    fibre = FibreSettings(diameter_mm=draw(st.sampled_from([None, 1e-300, 10.0])))
+    return FabricationSettings(mould, printer, pad, silicone=silicone, fibre=fibre)
 
 
 def of_a_sound_mould(found: list[Finding]) -> None:
@@ -187,7 +189,7 @@ def test_whatever_is_built_is_whole_and_can_be_read_back(data):
             assert not out.exists()
             return
         names = {child.name for child in out.iterdir()}
-        assert names == {*document["files"], "laying.md", "fabrication.json"}
+        assert names == {*document["files"], "laying.md", "orientation.svg", "fabrication.json"}
         assert json.loads((out / "fabrication.json").read_text()) == json.loads(json.dumps(document))
         assert document["silicone_volume_ml"] >= 0
         for name in names:
@@ -279,7 +281,10 @@ def test_a_broken_mesh_in_a_file_has_findings_or_one_line(mesh, suffix):
         return
     with tempfile.TemporaryDirectory() as folder, np.errstate(all="ignore"), ends_in_time():
         path = Path(folder) / f"mesh{suffix}"
-        (write_stl if suffix == ".stl" else write_3mf)(path, vertices, triangles)
+        if suffix == ".stl":
+            write_stl(path, vertices, triangles)
+        else:
+            write_3mf(path, vertices, triangles, name="mould", title="broken", material="PLA")
         try:
             found = check_mesh(path)
         except InputError:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from design.common.files import atomic, write_json
+from design.common.files import atomic, unchanged, write_json
 from design.pad.morphology import Morphology
 from fabricate.mesh_files import read_mesh
 from tests.helpers.effort import LONG, few
@@ -149,7 +149,7 @@ def test_a_closed_folder_is_one_line(room: Path, name: str):
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
-def test_an_end_while_writing_leaves_whole_files(room: Path, ending: signal.Signals):
+def test_an_end_while_writing_leaves_one_mould(room: Path, ending: signal.Signals):
     child = start(room, *COMMANDS["fabricate"])
     begun = time.monotonic()
     while not litter(room / "pad") and child.poll() is None and time.monotonic() < begun + 60:
@@ -161,6 +161,12 @@ def test_an_end_while_writing_leaves_whole_files(room: Path, ending: signal.Sign
     require_whole(room)
     if ending != signal.SIGKILL:
         assert litter(room) == []
+    digests = json.loads((room / "pad" / "fabrication.json").read_text()).get("sha256", {})
+    there = {path.name for path in (room / "pad").iterdir() if path.is_file()}
+    assert there - {"morphology.json", "fabrication.json"} == digests.keys() == unchanged(room / "pad", digests)
+    if litter(room):
+        _, err = start(room, *COMMANDS["fabricate"]).communicate(timeout=60)
+        assert litter(room) == [], err
 
 
 @pytest.mark.parametrize("name", ["fabricate", pytest.param("design", marks=LONG), pytest.param("genetic", marks=LONG)])
