@@ -21,7 +21,7 @@ Loop = list[tuple[int, bool]]
 
 _AT_END_MM = 5e-6
 _SHORT_MM = 1e-5
-"""Runs no longer than this come of moving vertices to the grid."""
+"""Runs shorter than this come of moving vertices to the grid, or are none where curves meet."""
 _LOOSE_MM, _HARDLY_MM = 1e-6, 0.02
 """Where curves stay further apart than the first, a run shorter than the second may be none: they meet beyond it."""
 _MEET_MM = 0.1
@@ -200,7 +200,7 @@ def _over(ends: Sequence[tuple[int, int]], reached: Sequence[tuple[float, float]
     """Runs that end where they have hardly begun: others meet in the other order, or beyond them."""
     lengths = np.array([end - start if a != b else np.inf for (a, b), (start, end) in zip(ends, reached, strict=True)])
     loose = [any(slack_mm[node] > _LOOSE_MM for node in nodes) for nodes in ends]
-    return np.flatnonzero((lengths <= 0) | (loose & (lengths < _HARDLY_MM))).tolist()
+    return np.flatnonzero((lengths < _SHORT_MM) | (loose & (lengths < _HARDLY_MM))).tolist()
 
 
 def _end_nodes(runs: Sequence[_Run], none: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -9,13 +9,15 @@ import shapely
 from design.pad.morphology import Morphology
 from fabricate.mould.assembly import conductive_body, conductive_plan, mould_body, plan_mesh, well_outlines
 from fabricate.mould.cad.layout import HORIZONTAL, NUMBERS, TRAY, VERTICAL, Part, Surface, contact_mm2, layout
+from fabricate.mould.cad.outlines.arrangement import Arrangement
 from fabricate.mould.cad.outlines.drawing import Drawing
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
 from tests.fabricate.planted import level_pad, winding_pad, with_settings
 
 UPRIGHT = with_settings({"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0})
-FIT_MM = 2e-3
+FITS_MM = 2e-3, 5e-4, 1e-4
+FIT_MM = FITS_MM[0]
 
 
 def volumes(drawing: Drawing, parts: list[Part]) -> dict[str, float]:
@@ -146,3 +148,12 @@ def test_the_curves_are_as_near_as_asked():
         drawing, _ = layout(plan, fit_mm)
         spans.append(sum(len(piece.curve.c) for piece in drawing.pieces if piece.curve))
     assert spans[0] < spans[1]
+
+
+@pytest.mark.parametrize("fit_mm", FITS_MM)
+def test_no_chain_is_too_short_for_the_kernel(fit_mm):
+    """A tip within a few micrometres whose walls meet where they leave the tray's wall."""
+    plan = Plan(winding_pad((1 - 1e-5, 0.5), (1.0, 0.01), (1 + 1e-5, 0.5)))
+    drawing, parts = layout(plan, fit_mm)
+    for part in parts:
+        assert min(chain.end - chain.start for chain in Arrangement(drawing, part.spans).chains) > 1e-5
