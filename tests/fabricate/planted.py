@@ -46,3 +46,15 @@ def with_settings(
         silicone=SiliconeSettings.model_validate(silicone or {}),
         fibre=FibreSettings.model_validate(fibre or {}),
     )
+
+
+def mild_pad(grid: int, knots: int, seed: int) -> Morphology:
+    """Fibres that wind about their straight courses, as designed ones do."""
+    rng = np.random.default_rng(seed)
+    along = (np.arange(1, knots + 1) / (knots + 1) + rng.uniform(-0.2, 0.2, (2 * grid, knots)) / knots) * (grid + 1)
+    aside = np.tile(np.arange(1, grid + 1), 2)[:, None] + rng.uniform(-0.6, 0.6, (2 * grid, knots))
+    places = np.stack([along, aside], axis=2)
+    places[grid:] = places[grid:, :, ::-1]
+    straight = Morphology.straight(grid)
+    ends = [straight.knots[:, :1], places, straight.knots[:, -1:]]
+    return Morphology(np.concatenate(ends, axis=1), straight.pitch_mm)

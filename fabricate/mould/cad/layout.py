@@ -61,7 +61,7 @@ def layout(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) -> tup
     rim_mm = walls.floor_mm + walls.depth_mm
     standing = sorted([*_ridges(plan, fit_mm, wells), *_numbers(plan)], key=lambda each: -each.top_mm)
     opened = [walls.outline(z).boundary for z in sorted({*(each.top_mm for each in standing), rim_mm})]
-    straight = [plan.tray.boundary, *opened, *walls.creases()]
+    straight = [plan.tray.boundary, *opened, *walls.creases(), plan.pillars.boundary]
     pieces = [piece for line in straight for piece in straight_pieces(line)]
     pieces += [piece for each in standing for piece in each.pieces]
     drawing = Drawing([*straight, *(each.outline.boundary for each in standing)], pieces)
@@ -69,6 +69,8 @@ def layout(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) -> tup
     sheets = walls.sheets(drawing.middles).tolist()
     under: list[Surface] = [walls.floor_mm if k == FLOOR else rim_mm if k == RIM else (walls, k) for k in sheets]
     heights = walls.heights(drawing.middles)
+    for cell in np.flatnonzero(shapely.contains_xy(plan.pillars, drawing.middles)):
+        under[cell] = heights[cell] = rim_mm
     spans: dict[str, list[Span | None]] = {name: [None] * len(under) for name in PARTS}
     free = np.ones(len(under), dtype=bool)
     for each in standing:
@@ -113,20 +115,19 @@ def _numbers(plan: Plan) -> Iterator[_Standing]:
 def contact_mm2(drawing: Drawing, parts: Sequence[Part]) -> float:
     """The area where parts touch each other: undersides of what stands, crossings, ends at upright walls."""
     area = 0.0
-    owner: dict[int, tuple[str, Span]] = {}
-    for part in sorted(parts, key=lambda part: part.name != TRAY):  # what stands on the tray hides it
+    owner = np.full(len(drawing.cells) + 1, -1)  # the last stands for no cell
+    low, top = np.zeros(len(owner)), np.zeros(len(owner))
+    for number, part in enumerate(sorted(parts, key=lambda part: part.name != TRAY)):  # what stands on it hides it
         for cell, span in enumerate(part.spans):
             if span is not None:
-                owner[cell] = part.name, span
+                owner[cell], low[cell], top[cell] = number, _level(span.bottom), _level(span.top)
                 if part.name != TRAY:
                     lean = math.hypot(*span.bottom[0].normal(span.bottom[1])) if isinstance(span.bottom, tuple) else 1.0
                     area += lean * drawing.cells[cell].area
-    for (a, b), (left, right) in zip(drawing.edges, drawing.sides.tolist(), strict=True):
-        if left in owner and right in owner and owner[left][0] != owner[right][0]:
-            (_, one), (_, other) = owner[left], owner[right]
-            low, top = max(_level(one.bottom), _level(other.bottom)), min(_level(one.top), _level(other.top))
-            area += GRID_MM * math.dist(a, b) * max(0.0, top - low)
-    return area
+    between = (owner[drawing.sides] >= 0).all(axis=1) & (owner[drawing.sides[:, 0]] != owner[drawing.sides[:, 1]])
+    (left, right), edges = drawing.sides[between].T, np.array(drawing.edges, dtype=float)[between]
+    long = GRID_MM * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    return area + float(long @ np.maximum(0, np.minimum(top[left], top[right]) - np.maximum(low[left], low[right])))
 
 
 def _level(surface: Surface) -> float:

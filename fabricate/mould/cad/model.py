@@ -6,13 +6,15 @@ Importing this module loads the CAD kernel, which takes seconds: import it where
 # pyright: reportAttributeAccessIssue=false
 # The CAD kernel's modules come without types.
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from build123d import Color, Compound, Location, Solid
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
+from OCP.Standard import Standard_Failure
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError
@@ -97,8 +99,8 @@ def mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> Mo
     """
     for fit_mm in FITS_MM:
         drawing, parts = layout.layout(plan, fit_mm, wells)
-        together = {part.name: list(solids(drawing, part.spans)) for part in parts}
-        if all(solid.is_valid for own in together.values() for solid in own):
+        together = _valid({part.name: partial(solids, drawing, part.spans) for part in parts})
+        if together:
             break
     else:
         raise InputError(f"{name}: the CAD kernel finds a solid invalid; leave step out of the formats")
@@ -118,10 +120,19 @@ def body_model(body: Body, name: str) -> Model:
     Raises:
         InputError: the CAD kernel finds the solid invalid.
     """
-    own = body_solid(body).solids()
-    if not all(solid.is_valid for solid in own):
+    own = _valid({name: lambda: body_solid(body).solids()})
+    if not own:
         raise InputError(f"{name}: the CAD kernel finds the solid invalid; leave step out of the formats")
-    return Model(_part(name, own, COLOURS[name]))
+    return Model(_part(name, own[name], COLOURS[name]))
+
+
+def _valid(makes: Mapping[str, Callable[[], Iterable[Solid]]]) -> dict[str, list[Solid]] | None:
+    """The solids of every part, or None if the kernel finds one invalid or cannot make it."""
+    try:
+        together = {part: list(make()) for part, make in makes.items()}
+        return together if all(solid.is_valid for own in together.values() for solid in own) else None
+    except (Standard_Failure, RuntimeError, ValueError):  # the kernel's own, and build123d's of what it was given
+        return None
 
 
 def models(plan: Plan, bodies: Mapping[str, Body]) -> list[Model]:

@@ -11,6 +11,7 @@ Importing this module loads the CAD kernel, which takes seconds: import it where
 
 import math
 from collections.abc import Callable
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -42,6 +43,8 @@ _PLACES, _SPARE_MM = 33, 0.01
 """A curve that is not level is looked at in so many places for its extreme heights, and might pass them so far."""
 _SITES = 65
 """Places through which the parameters of an ellipse are drawn on its cylinder."""
+_KEPT = 256
+"""So many curves and surfaces are kept for the other chains of their piece."""
 _ALONE = 0.4
 """A stretch of less than this share of its piece has a curve of its own at heights where nobody shares the whole."""
 
@@ -159,27 +162,31 @@ class _Spline:
     def __init__(self, piece: Piece, curve: BSpline, chain: Chain) -> None:
         self._rise, self._whole = piece.rise, curve
         self._range = chain.start, chain.end
-        self._along = curve(np.linspace(chain.start, chain.end, _PLACES))
         self._short = chain.end - chain.start < _ALONE * piece.length
+
+    @cached_property
+    def _along(self) -> Array:
+        return self._whole(np.linspace(*self._range, _PLACES))
+
+    @cached_property
+    def _own(self) -> BSpline:
+        return stretch(self._whole, *self._range)
 
     def _part(self, z: Height) -> BSpline:
         alone = callable(z) or (self._short and z not in self._rise)
-        return stretch(self._whole, *self._range) if alone else self._whole
+        return self._own if alone else self._whole
 
     def curve(self, z: Height) -> tuple[Any, float, float]:
         part = self._part(z)
-        poles = np.column_stack([part.c, _at(z, part.c)])
-        return Geom_BSplineCurve(_points(poles), *_knots(part), 3), *self._range
+        if part is self._whole:
+            return _level_curve(part, z), *self._range
+        return _raised_curve(part, _at(z, part.c)), *self._range
 
     def surface(self, bottom: Height, top: Height) -> Any:
-        low = min(self._rise[0], min(_at(bottom, self._along)) - (_SPARE_MM if callable(bottom) else 0))
-        high = max(self._rise[1], max(_at(top, self._along)) + (_SPARE_MM if callable(top) else 0))
-        poles = Array2_gp_Pnt(1, len(self._whole.c), 1, 2)
-        for row, (x, y) in enumerate(self._whole.c.tolist(), 1):
-            poles.SetValue(row, 1, gp_Pnt(x, y, low))
-            poles.SetValue(row, 2, gp_Pnt(x, y, high))
-        knots, counts = _knots(self._whole)
-        return Geom_BSplineSurface(poles, knots, _reals([low, high]), counts, _ints([2, 2]), 3, 1)
+        low = min(_at(bottom, self._along)) - _SPARE_MM if callable(bottom) else bottom
+        high = max(_at(top, self._along)) + _SPARE_MM if callable(top) else top
+        low, high = min(self._rise[0], low), max(self._rise[1], high)
+        return _upright_surface(self._whole, low, high)
 
     def across(self, z: Height) -> Any:
         if not callable(z):
@@ -201,6 +208,26 @@ def _at(z: Height, places: Array) -> list[float]:
     return z(places).tolist() if callable(z) else [z] * len(places)
 
 
+@lru_cache(_KEPT)
+def _level_curve(curve: BSpline, z: float) -> Any:
+    return _raised_curve(curve, [z] * len(curve.c))
+
+
+def _raised_curve(curve: BSpline, heights: list[float]) -> Any:
+    return Geom_BSplineCurve(_points(np.column_stack([curve.c, heights])), *_knots(curve), 3)
+
+
+@lru_cache(_KEPT)
+def _upright_surface(curve: BSpline, low: float, high: float) -> Any:
+    poles = Array2_gp_Pnt(1, len(curve.c), 1, 2)
+    for row, (x, y) in enumerate(curve.c.tolist(), 1):
+        poles.SetValue(row, 1, gp_Pnt(x, y, low))
+        poles.SetValue(row, 2, gp_Pnt(x, y, high))
+    knots, counts = _knots(curve)
+    return Geom_BSplineSurface(poles, knots, _reals([low, high]), counts, _ints([2, 2]), 3, 1)
+
+
+@lru_cache(_KEPT)
 def _knots(curve: BSpline) -> tuple[Any, Any]:
     """The knots of a spline, and how often each counts."""
     knots, counts = np.unique(curve.t, return_counts=True)

@@ -37,6 +37,8 @@ STEP_MM, SAME_MM = 1e-7, 1e-5
 """Heights are whole steps, and those no further apart than `SAME_MM` are one."""
 EXACT_MM = 1e-6
 """Tolerance of edges and vertices where curves meet as they should."""
+_ASTRAY_MM = 5e-3
+"""Curves stray less from what they stand for: so near its edge, a track's top may be passed by the wall under it."""
 
 
 def solids(drawing: Drawing, spans: Sequence[Span | None]) -> Iterator[Solid]:
@@ -81,6 +83,7 @@ class _Side:
 def _solid(arrangement: Arrangement, cells: list[int], chains: list[int], spans: Sequence[Any]) -> Solid:
     """The solid over cells that hang together, bounded by chains."""
     shell = _Shell(arrangement)
+    shell.meet(chains, spans)
     sides = [side for k in chains for side in _sides(shell, k, spans)]
     for side in sides:
         shell.note(side)
@@ -114,6 +117,8 @@ class _Shell:
 
     def __init__(self, arrangement: Arrangement) -> None:
         self.arrangement = arrangement
+        self.slack_mm: list[float] = arrangement.slack_mm.tolist()
+        self.steps: dict[tuple[int, Surface], Steps] = {}
         self.builder = BRep_Builder()
         self.shell = TopoDS_Shell()
         self.builder.MakeShell(self.shell)
@@ -123,25 +128,47 @@ class _Shell:
         self.edges: dict[Any, Any] = {}
         self.risings: dict[int, Rising] = {}
 
+    def meet(self, chains: list[int], spans: Sequence[Any]) -> None:
+        """Find out how far heights of walls may be off where they meet what is level: as far as curves stray there."""
+        for k in chains:
+            chain = self.arrangement.chains[k]
+            ends = list(chain.nodes)
+            for bottom, top in {spans[cell] for cell in (chain.left, chain.right) if cell >= 0}:
+                for surface in (bottom, top):
+                    if not isinstance(surface, tuple):
+                        self.over(k, surface)  # known first: what leans comes to it
+                        continue
+                    walls, sheet = surface
+                    off = walls.slope * self.arrangement.slack_mm[ends]
+                    if surface == bottom and not isinstance(top, tuple):
+                        above = walls.plane(sheet, self.arrangement.nodes[ends]) - top
+                        off = np.maximum(off, np.where(above < walls.slope * _ASTRAY_MM, above, 0))
+                    for node, each in zip(ends, off.tolist(), strict=True):
+                        self.slack_mm[node] = max(self.slack_mm[node], each)
+
     def over(self, k: int, surface: Surface) -> Steps:
         """Heights of a surface over a chain."""
-        chain = self.arrangement.chains[k]
-        if isinstance(surface, tuple):
-            middle = self.arrangement.pieces[chain.piece].at((chain.start + chain.end) / 2)
-            places = np.vstack([self.arrangement.nodes[list(chain.nodes)], middle])
-            heights = surface[0].plane(surface[1], places).tolist()
-        else:
-            heights = [surface] * 3
-        start, end, half = (self._one(at, z) for at, z in zip((*chain.nodes, (k,)), heights, strict=True))
-        return start, end, half
+        if (k, surface) not in self.steps:
+            chain = self.arrangement.chains[k]
+            if isinstance(surface, tuple):
+                middle = self.arrangement.pieces[chain.piece].at((chain.start + chain.end) / 2)
+                places = np.vstack([self.arrangement.nodes[list(chain.nodes)], middle])
+                heights = surface[0].plane(surface[1], places).tolist()
+                off = [SAME_MM + self.slack_mm[node] for node in chain.nodes]
+            else:
+                heights, off = [surface] * 3, [SAME_MM] * 2
+            ends = zip((*chain.nodes, (k,)), heights, (*off, SAME_MM), strict=True)
+            start, end, half = (self._one(*each) for each in ends)
+            self.steps[k, surface] = start, end, half
+        return self.steps[k, surface]
 
-    def _one(self, at: Hashable, height_mm: float) -> int:
+    def _one(self, at: Hashable, height_mm: float, off_mm: float) -> int:
         """A height over a node or the middle of a chain in steps: the same for all that differ by rounding only."""
         step = round(height_mm / STEP_MM)
         known = self.known[at]
-        for other in known:
-            if abs(other - step) < SAME_MM / STEP_MM:
-                return other
+        near = [other for other in known if abs(other - step) < off_mm / STEP_MM]
+        if near:
+            return min(near, key=lambda other: abs(other - step))
         known.append(step)
         return step
 
@@ -236,14 +263,14 @@ class _Shell:
         for a, b in pairwise(sorted(z for z in self.heights[node] if low <= z <= high)):
             if (node, a, b) not in self.edges:
                 x, y = self.arrangement.nodes[node].tolist()
-                ends, slack = [self._vertex(node, a), self._vertex(node, b)], float(self.arrangement.slack_mm[node])
+                ends, slack = [self._vertex(node, a), self._vertex(node, b)], self.slack_mm[node]
                 line = upright_line(x, y, a * STEP_MM)
                 self.edges[node, a, b] = self._edge(line, 0.0, (b - a) * STEP_MM, ends, slack)
             edges.append((self.edges[node, a, b], a * STEP_MM))
         return edges
 
     def _slack(self, k: int) -> float:
-        return float(self.arrangement.slack_mm[list(self.arrangement.chains[k].nodes)].max())
+        return max(self.slack_mm[node] for node in self.arrangement.chains[k].nodes)
 
     def _edge(self, curve: Any, first: float, last: float, ends: list[Any], slack_mm: float) -> Any:
         edge = TopoDS_Edge()
@@ -256,7 +283,7 @@ class _Shell:
     def _vertex(self, node: int, z: int) -> Any:
         if (node, z) not in self.vertices:
             vertex, place = TopoDS_Vertex(), self.arrangement.nodes[node].tolist()
-            tolerance = 2 * (EXACT_MM + float(self.arrangement.slack_mm[node]))
+            tolerance = 2 * (EXACT_MM + self.slack_mm[node])
             self.builder.MakeVertex(vertex, gp_Pnt(*place, z * STEP_MM), tolerance)
             self.vertices[node, z] = vertex
         return self.vertices[node, z]

@@ -16,22 +16,26 @@ _EPOCH = "2000-01-01T00:00:00"
 """The time written into STEP files, which must carry one."""
 _DIGITS = 6
 """Of coordinates in mm, after the point: a nanometre."""
-_ONCE = re.compile(
-    "(CARTESIAN_POINT|DIRECTION|VECTOR|LINE|CIRCLE|PLANE|AXIS2_PLACEMENT_3D|CYLINDRICAL_SURFACE|CONICAL_SURFACE"
-    "|B_SPLINE_(CURVE|SURFACE)_WITH_KNOTS|COLOUR_RGB|CURVE_STYLE|DRAUGHTING_PRE_DEFINED_CURVE_FONT|FILL_AREA_STYLE"
-    "|FILL_AREA_STYLE_COLOUR|SURFACE_S(TYLE_FILL_AREA|IDE_STYLE|TYLE_USAGE)|PRESENTATION_STYLE_ASSIGNMENT)[(]"
+_ROUNDED = ("CARTESIAN_POINT", "B_SPLINE")
+_ONCE = frozenset(
+    {
+        *("CARTESIAN_POINT", "DIRECTION", "VECTOR", "LINE", "CIRCLE", "ELLIPSE", "PLANE", "AXIS2_PLACEMENT_3D"),
+        *("CYLINDRICAL_SURFACE", "CONICAL_SURFACE", "B_SPLINE_CURVE_WITH_KNOTS", "B_SPLINE_SURFACE_WITH_KNOTS"),
+        *("COLOUR_RGB", "CURVE_STYLE", "DRAUGHTING_PRE_DEFINED_CURVE_FONT", "FILL_AREA_STYLE"),
+        *("FILL_AREA_STYLE_COLOUR", "SURFACE_STYLE_FILL_AREA", "SURFACE_SIDE_STYLE", "SURFACE_STYLE_USAGE"),
+        "PRESENTATION_STYLE_ASSIGNMENT",
+    }
 )
 """Geometry and styles; edges and faces stay one each, also where they coincide."""
 _OCCURRENCE = "NEXT_ASSEMBLY_USAGE_OCCURRENCE"
 _COLOURED = "MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION"
-_STYLE = re.compile(
-    f"({_COLOURED}|OVER_RIDING_STYLED_ITEM|STYLED_ITEM|CURVE_STYLE|FILL_AREA_STYLE|SURFACE_S(TYLE|IDE_STYLE)"
-    "|PRESENTATION_STYLE|COLOUR_|DRAUGHTING_)"
+_STYLES = (
+    *(_COLOURED, "OVER_RIDING_STYLED_ITEM", "STYLED_ITEM", "CURVE_STYLE", "FILL_AREA_STYLE", "SURFACE_STYLE"),
+    *("SURFACE_SIDE_STYLE", "PRESENTATION_STYLE", "COLOUR_", "DRAUGHTING_"),
 )
-_STRING, _NO_REFERENCE = re.compile(r"'[^']*'"), "\0"
-"""The latter stands for # in strings meanwhile."""
-_ENTITY = re.compile(r"#(\d+) *= *((?:[^';]|'[^']*')*);")
-_REFERENCE = re.compile(r"#(\d+)(?=[,)])")
+_PLAIN, _WORD = re.compile(r"\w*"), re.compile("\0(\\d+)")
+"""Words in quotes that nothing here mistakes for something else, and what stands for the others meanwhile."""
+_REFERENCE = re.compile(r"#(\d+)")
 _LONG_NUMBER = re.compile(rf"-?\d+\.(?:\d{{{_DIGITS + 1},}}(?:E[-+]?\d+)?|\d*E[-+]?\d+)")
 
 
@@ -59,10 +63,11 @@ def said_once(text: str) -> str:
     """A STEP file in which each point, direction, curve, surface and style stands once, in few digits."""
     head, _, rest = text.partition("DATA;")
     data, _, tail = rest.rpartition("ENDSEC;")
-    data = _STRING.sub(lambda found: found.group().replace("#", _NO_REFERENCE), data)
-    # every second part of an entity is the number of another one
-    parts = {number: _REFERENCE.split(_short(content)) for number, content in _ENTITY.findall(data)}
-    geometry = {number for number, own in parts.items() if _ONCE.match(own[0])}
+    quoted = data.split("'")  # every second part is inside of quotes
+    words = quoted[1::2]
+    quoted[1::2] = [word if _PLAIN.fullmatch(word) else f"\0{place}" for place, word in enumerate(words)]
+    parts = _parts("".join("'".join(quoted).split()))
+    geometry = {number for number, own in parts.items() if own[0].partition("(")[0] in _ONCE}
     # the placements of an assembly's parts are told apart by being several
     one = {
         other: other for number in parts.keys() - geometry for other in parts[number][1::2] if _placement(parts[other])
@@ -74,7 +79,7 @@ def said_once(text: str) -> str:
         if number not in one:
             own, one[number] = parts[number], number
             if number in geometry:
-                own[1::2] = [settled(other) for other in own[1::2]]
+                own[1::2] = map(settled, own[1::2])
                 one[number] = first.setdefault(tuple(own), number)
         return one[number]
 
@@ -82,15 +87,30 @@ def said_once(text: str) -> str:
     for place, own in enumerate(occurrences, 1):  # the kernel goes on counting from file to file
         own[0] = re.sub(r"'\d+'", f"'{place}'", own[0], count=1)
     for number in parts:
-        parts[number][1::2] = [settled(other) for other in parts[number][1::2]]
+        parts[number][1::2] = map(settled, parts[number][1::2])
     order = _in_order({number: own for number, own in parts.items() if settled(number) == number})
     places = {number: f"#{place}" for place, number in enumerate(order, 1)}
     lines = []
     for number in order:
         own = parts[number]
-        own[1::2] = [places[other] for other in own[1::2]]
+        own[1::2] = map(places.__getitem__, own[1::2])
         lines.append(f"{places[number]}={''.join(own)};\n")
-    return f"{head}DATA;\n{''.join(lines).replace(_NO_REFERENCE, '#')}ENDSEC;{tail}"
+    said = _WORD.sub(lambda found: words[int(found.group(1))], "".join(lines))
+    return f"{head}DATA;\n{said}ENDSEC;{tail}"
+
+
+def _parts(data: str) -> dict[str, list[str]]:
+    """Every entity by its number: what it says, every second part the number of another one, points in few digits."""
+    parts = {}
+    short: dict[str, str] = {}
+    for entity in data.split(";")[:-1]:
+        number, _, content = entity.partition("=")
+        if content.startswith(_ROUNDED):
+            if content not in short:
+                short[content] = _LONG_NUMBER.sub(_rounded, content)
+            content = short[content]
+        parts[number[1:]] = _REFERENCE.split(content) if "#" in content else [content]
+    return parts
 
 
 def _in_order(parts: dict[str, list[str]]) -> list[str]:
@@ -98,7 +118,9 @@ def _in_order(parts: dict[str, list[str]]) -> list[str]:
 
     The kernel writes colours in an order that differs from run to run.
     """
-    order = {number: place for place, number in enumerate(n for n, own in parts.items() if not _STYLE.match(own[0]))}
+    order = {
+        number: place for place, number in enumerate(n for n, own in parts.items() if not own[0].startswith(_STYLES))
+    }
 
     def shown(number: str) -> list[int]:
         """The places of the shapes that a colour is for."""
@@ -120,14 +142,6 @@ def _in_order(parts: dict[str, list[str]]) -> list[str]:
 
 def _placement(own: list[str]) -> bool:
     return own[0].startswith("AXIS2_PLACEMENT_3D")
-
-
-def _short(content: str) -> str:
-    """An entity without blanks, but in its names; points and splines in few digits."""
-    outside = content.split("'")  # every second part is inside of quotes
-    outside[::2] = ["".join(part.split()) for part in outside[::2]]
-    content = "'".join(outside)
-    return _LONG_NUMBER.sub(_rounded, content) if content.startswith(("CARTESIAN_POINT", "B_SPLINE")) else content
 
 
 def _rounded(found: re.Match[str]) -> str:

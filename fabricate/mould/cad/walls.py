@@ -43,15 +43,20 @@ class Walls:
         rise = np.clip(away / self.flare_mm, 0, 1) if self.flare_mm else away > 0
         return self.floor_mm + self.depth_mm * rise
 
+    @property
+    def slope(self) -> float:
+        """How steeply walls that lean rise, mm for every mm outwards."""
+        return self.depth_mm / self.flare_mm
+
     def plane(self, sheet: int, places: Array) -> Array:
         """(n,) heights of a wall's plane over places (n, 2), mm."""
         hollow, side = divmod(sheet, 4)
-        return self.floor_mm + self.depth_mm / self.flare_mm * self._beyond(places)[:, hollow, side]
+        return self.floor_mm + self.slope * self._beyond(places)[:, hollow, side]
 
     def normal(self, sheet: int) -> tuple[float, float, float]:
         """Upward normal of a wall's plane, not of unit length."""
-        side, slope = sheet % 4, self.depth_mm / self.flare_mm
-        along = slope if side < 2 else -slope
+        side = sheet % 4
+        along = self.slope if side < 2 else -self.slope
         return (along, 0.0, 1.0) if side % 2 == 0 else (0.0, along, 1.0)
 
     def outline(self, z: float) -> shapely.Polygon:

@@ -1,5 +1,6 @@
 """The cells of a drawing that belong to one part, their borders as chains of true curves that meet in nodes."""
 
+import math
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
@@ -131,33 +132,35 @@ class Arrangement:
         inner = [piece for piece, s in lengths.items() if 0 < s < self.pieces[piece].length]
         if inner and len(lengths) > 1:
             self._cross(lengths, inner)
-        points = np.array([self.pieces[piece].at(s) for piece, s in lengths.items()])
-        place = points.mean(axis=0)
-        return place, float(np.linalg.norm(points - place, axis=1).max())
+        points = [self.pieces[piece].run(s)[:2] for piece, s in lengths.items()]
+        place = np.mean(points, axis=0)
+        return place, max(math.dist(point, place) for point in points)
 
     def _cross(self, lengths: dict[int, float], inner: list[int]) -> None:
         """Move lengths to the common point of the two pieces that cross most steeply, by Newton's method."""
-        tangents = {piece: self.pieces[piece].tangent(s) for piece, s in lengths.items()}
-        units = {piece: tangent / np.linalg.norm(tangent) for piece, tangent in tangents.items()}
+        runs = {piece: self.pieces[piece].run(s) for piece, s in lengths.items()}
         pairs = [(a, b) for a in inner for b in lengths if a != b]
-        first, second = max(pairs, key=lambda pair: abs(_turn(units[pair[0]], units[pair[1]])))
+        first, second = max(pairs, key=lambda pair: abs(_turn(runs[pair[0]], runs[pair[1]])))
         a, b = self.pieces[first], self.pieces[second]
-        begun = s = np.array([lengths[first], lengths[second]])
+        s, u = begun = lengths[first], lengths[second]
         for _ in range(_STEPS):
-            system = np.stack([a.tangent(s[0]), -b.tangent(s[1])], axis=1)
-            if abs(np.linalg.det(system)) < 1e-6:
+            x, y, ax, ay = a.run(s)
+            other_x, other_y, bx, by = b.run(u)
+            det = bx * ay - ax * by
+            if abs(det) < 1e-6:
                 return
-            step = np.linalg.solve(system, b.at(s[1]) - a.at(s[0]))
-            s = np.clip(s + step, 0, [a.length, b.length])
-            if np.abs(step).max() < 1e-12:
+            away_x, away_y = other_x - x, other_y - y
+            forth, back = (bx * away_y - by * away_x) / det, (ax * away_y - ay * away_x) / det
+            s, u = min(max(s + forth, 0), a.length), min(max(u + back, 0), b.length)
+            if max(abs(forth), abs(back)) < 1e-12:
                 break
-        if np.linalg.norm(a.at(s[0]) - b.at(s[1])) < 1e-9 and np.abs(s - begun).max() < _MEET_MM:
-            lengths[first], lengths[second] = s.tolist()
+        if math.dist(a.run(s)[:2], b.run(u)[:2]) < 1e-9 and max(abs(s - begun[0]), abs(u - begun[1])) < _MEET_MM:
+            lengths[first], lengths[second] = s, u
 
 
-def _turn(a: Array, b: Array) -> float:
-    """Sine of the angle between two unit vectors."""
-    return float(a[0] * b[1] - a[1] * b[0])
+def _turn(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Sine of the angle between two pieces, from how they run."""
+    return (a[2] * b[3] - a[3] * b[2]) / math.hypot(*a[2:]) / math.hypot(*b[2:])
 
 
 def _runs(pieces: dict[Edge, int]) -> list[tuple[int, list[Vertex]]]:

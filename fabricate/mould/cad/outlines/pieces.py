@@ -6,8 +6,10 @@ ends are exact, and tangent to what goes on smoothly from there. Lengths are mm.
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -70,6 +72,42 @@ class Piece:
             angle = start + sweep * s / self.length
             return radius * sweep / self.length * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
         return np.broadcast_to((self.points[-1] - self.points[0]) / self.length, (*np.shape(s), 2))
+
+    def run(self, s: float) -> tuple[float, float, float, float]:
+        """x and y at a length, and how they grow by it: as `at` and `tangent` say of one place, but sooner."""
+        if self.curve is not None:
+            return self._de_boor(s)
+        if self.arc is not None:
+            x, y, radius, start, sweep = self.arc
+            angle, turn = start + sweep * s / self.length, radius * sweep / self.length
+            cos, sin = math.cos(angle), math.sin(angle)
+            return x + radius * cos, y + radius * sin, -turn * sin, turn * cos
+        (x0, y0), (x1, y1) = self._numbers[1]
+        dx, dy = (x1 - x0) / self.length, (y1 - y0) / self.length
+        return x0 + s * dx, y0 + s * dy, dx, dy
+
+    def _de_boor(self, s: float) -> tuple[float, float, float, float]:
+        t, poles = self._numbers
+        k = min(max(bisect_right(t, s) - 1, 3), len(t) - 5)
+        (x0, y0), (x1, y1), (x2, y2), (x3, y3) = poles[k - 3 : k + 1]
+        a = (s - t[k - 2]) / (t[k + 1] - t[k - 2])
+        b = (s - t[k - 1]) / (t[k + 2] - t[k - 1])
+        c = (s - t[k]) / (t[k + 3] - t[k])
+        x0, y0, x1, y1 = x0 + a * (x1 - x0), y0 + a * (y1 - y0), x1 + b * (x2 - x1), y1 + b * (y2 - y1)
+        x2, y2 = x2 + c * (x3 - x2), y2 + c * (y3 - y2)
+        a = (s - t[k - 1]) / (t[k + 1] - t[k - 1])
+        b = (s - t[k]) / (t[k + 2] - t[k])
+        x0, y0, x1, y1 = x0 + a * (x1 - x0), y0 + a * (y1 - y0), x1 + b * (x2 - x1), y1 + b * (y2 - y1)
+        span = t[k + 1] - t[k]
+        a = (s - t[k]) / span
+        return x0 + a * (x1 - x0), y0 + a * (y1 - y0), 3 * (x1 - x0) / span, 3 * (y1 - y0) / span
+
+    @cached_property
+    def _numbers(self) -> tuple[list[float], list[list[float]]]:
+        """Knots and poles of a spline, of a line its ends."""
+        if self.curve is not None:
+            return self.curve.t.tolist(), self.curve.c.tolist()
+        return [], self.points[[0, -1]].tolist()
 
 
 def outline_pieces(area: BaseGeometry, joints: Joints, rise: tuple[float, float], fit_mm: float) -> list[Piece]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -149,6 +150,29 @@ def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
     (tray,) = solids(drawing, rest)
     assert tray.is_valid
     assert tray.volume == pytest.approx(10 * 8 * 5 - 4 * (6 * 4 + 4 * 6.8 * 4.8 + 7.6 * 5.6) / 6, rel=1e-9)
+
+
+def test_a_curve_that_strays_past_its_top_on_a_wall_ends_at_it():
+    """Drawn, the drum stays below its top where two walls meet; its own curve crosses their crease a little above."""
+    walls = replace(BOWL, hollows=np.array([[-3.0, -2.0, 3.0, 2.0], [-1.0, -2.0, 1.0, 4.0]]))
+    short, astray = 1e-4, 3e-4
+    away = (0.5 + short) / math.sqrt(2)
+    round_ = disc(1.4 - away, 2.4 - away, 0.5)
+    lines = [*walls.creases(), walls.outline(3.0).exterior]
+    pieces = [*(piece for line in lines for piece in straight_pieces(line)), *drawn(round_).pieces]
+    drawing = Drawing([*lines, round_.boundary], pieces)
+    for number, piece in enumerate(pieces):
+        if piece.arc is not None:
+            x, y, radius, *angles = piece.arc
+            pieces[number] = replace(piece, arc=(x, y, radius + astray, *angles))
+    sheets = walls.sheets(drawing.middles).tolist()
+    spans = [
+        Span(walls.floor_mm if k == FLOOR else (walls, k), 3.0) if round_.contains(shapely.Point(place)) else None
+        for k, place in zip(sheets, drawing.middles, strict=True)
+    ]
+    (solid,) = solids(drawing, spans)
+    assert solid.is_valid
+    assert max(vertex.Z for vertex in solid.vertices()) == pytest.approx(3.0, abs=1e-9)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))

@@ -205,6 +205,18 @@ def test_the_step_file_is_judged_by_the_meshes(built):
     assert found["message"].endswith("curves within 2 µm")
 
 
+def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path):
+    """What chords take away of the volume grows with the tolerance."""
+    settings = with_settings({"tolerance_mm": 0.099, "ridge_width_mm": 1.2})
+    (found,) = (
+        finding
+        for finding in build(Morphology.random(2, 12, seed=0), tmp_path, ["step"], settings)["findings"]
+        if finding["name"] == "cad_solid"
+    )
+    assert found["limit"] == pytest.approx([9.9 * 5e-4, 9.9 * 5e-3])
+    assert 5e-4 < found["measured"][0] < found["limit"][0]
+
+
 def test_without_step_nothing_is_said_of_it(tmp_path):
     document = build(PAD, tmp_path, ["stl"])
     assert "cad_solid" not in {finding["name"] for finding in document["findings"]}

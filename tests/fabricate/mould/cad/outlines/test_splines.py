@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
@@ -79,6 +80,20 @@ def test_a_spline_keeps_to_chords_between_far_vertices():
     curve = spline(points, [np.array([1.0, 0.0]), np.array([0.0, 1.0])], 1e-2)
     places = curve(np.linspace(0, lengths(points)[2], 500))
     assert np.abs(places[:, 1]).max() <= 1e-2
+
+
+@pytest.mark.parametrize("far", [[19, 5], [10, 10, 10], [25]])
+def test_a_spline_strays_nowhere_along_far_vertices(far):
+    """A bend of 3 mm radius, drawn finely, and a run out of it that hardly bends, of few vertices."""
+    angle = np.linspace(0, 0.3, 10)
+    bend = 3 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    out, aside = np.array([np.cos(0.3), np.sin(0.3)]), np.array([-np.sin(0.3), np.cos(0.3)])
+    run = bend[-1] + np.outer(np.cumsum(far), out) + np.outer([1e-3, 1.5e-3, 0][: len(far)], aside)
+    points = np.vstack([bend, run])
+    end = (points[-1] - points[-2]) / np.linalg.norm(points[-1] - points[-2])
+    curve = spline(points, [np.array([1.0, 0.0]), end], 2e-3)
+    places = shapely.points(curve(np.linspace(curve.t[0], curve.t[-1], 5000)))
+    assert shapely.distance(places, shapely.LineString(points)).max() <= 2.2e-3
 
 
 @given(splines())
