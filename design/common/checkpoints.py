@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ FORMAT = "padforge-search/1"
 
 State = dict[str, NDArray[Any]]
 
+_STATE = re.compile(r"start_([0-9]{4,})\.npz")
 _SEAL = "seal"
 """Name of the array that tells whether the others are as they were written."""
 
@@ -54,8 +56,8 @@ class Checkpoints:
                         f"{self.folder}: begun with {section} {key} {shown(was)}, now {shown(value)}; "
                         "allowed to resume are the same settings"
                     )
-        named = {path.stem.removeprefix("start_"): path for path in sorted(self.folder.glob("start_*.npz"))}
-        return {int(number): self._read(path, int(number)) for number, path in named.items() if number.isdecimal()}
+        named = {path: _STATE.fullmatch(path.name) for path in sorted(self.folder.glob("start_*.npz"))}
+        return {int(number[1]): self._read(path, int(number[1])) for path, number in named.items() if number}
 
     def save(self, start: int, state: State) -> None:
         """Put the state of a start in the place of its last one, atomically."""
@@ -65,12 +67,24 @@ class Checkpoints:
             np.savez(temporary, allow_pickle=False, **state, **{_SEAL: np.array(self._seal(start, state))})
 
     def clear(self) -> None:
-        """Remove all states, and nothing else that may lie there: the search is finished, or begins anew."""
-        if (self.folder / "search.json").exists():
-            for path in (*self.folder.glob("start_[0-9]*.npz"), self.folder / "search.json"):
+        """Remove all states, and nothing else that may lie there: what they led to is kept, or it begins anew.
+
+        Raises:
+            InputError: a search.json there that is none of a search.
+        """
+        about = self.folder / "search.json"
+        if not about.exists():
+            return
+        try:
+            read_json(about, FORMAT)
+        except InputError as error:
+            raise InputError(f"{error}; remove it, or choose another folder") from error
+        for path in self.folder.iterdir():
+            if _STATE.fullmatch(path.name) and path.is_file() and not path.is_symlink():
                 path.unlink()
-            with suppress(OSError):  # where there is more in it than states
-                self.folder.rmdir()
+        about.unlink()
+        with suppress(OSError):  # where there is more in it than states
+            self.folder.rmdir()
 
     def _read(self, path: Path, start: int) -> State:
         content = io.BytesIO(read_bytes(path))

@@ -33,6 +33,7 @@ def run_tasks(
     *,
     at_once: int | None = None,
     then: Callable[[Key, Result], Callable[[], Result] | None] = lambda key, result: None,
+    given_up: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[Key, Result]]:
     """Results of tasks as they come, in any order, each with its task's key.
 
@@ -47,6 +48,7 @@ def run_tasks(
         executor: of the `concurrent.futures` kind; daemon threads of this machine if None.
         at_once: tasks at most; as many as there are cores if there is no executor, else as the executor has it.
         then: the next task of the same key once a result has been listened to, None if there is none.
+        given_up: whether to leave behind what is at work, as where an executor hangs.
     """
     pool = executor or DaemonThreads()
     most = at_once or (None if executor else os.cpu_count() or 1)
@@ -55,7 +57,7 @@ def run_tasks(
         while True:
             for key, work in islice(waiting, most and most - len(running)):
                 running[pool.submit(work)] = key
-            if not running:
+            if not running or given_up():
                 return
             for future in wait(running, LOOK_S, FIRST_COMPLETED).done:
                 key, result = running.pop(future), future.result()

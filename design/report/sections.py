@@ -1,12 +1,12 @@
 """What a report has to say of the design of a pad, and of where all its results came from."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from design.common.files import sha256
+from design.common.files import as_written, read_json, unchanged
 from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
-from design.settings import RulesSettings
+from design.settings import PadSettings, RulesSettings, sensed_rectangle
 
 _TERMS = {
     "information": "mutual information of places and signals, bits",
@@ -29,10 +29,11 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     terms, broken = document["terms"], document["violations"]
     settings = document["provenance"]["settings"]
     pad, enforced = settings["pad"], settings["rules"]["enforce"]
-    grid, pitch_mm = int(pad["grid"]), float(pad["pitch_mm"])
+    layout = PadSettings(**pad).layout
+    unit_mm, (low, high) = layout.unit_mm, sensed_rectangle(layout)
     spread = {int(name[-1]): float(value) for name, value in terms.items() if name.startswith("ambiguity")}
     holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
-    size = f"{grid * pitch_mm:g} x {grid * pitch_mm:g} mm"
+    size = " x ".join(f"{round((b - a) * unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
     plan = (
         f"The plan of the pad, {size}: horizontal and vertical fibres, their crossings, and the contact in the middle."
     )
@@ -51,7 +52,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
                     table(
                         ["fibres lost", "grid units", "mm", "mm, straight fibres"],
                         [
-                            [lost, f"{value:#.3g}", f"{value * pitch_mm:#.3g}", _straight(document, lost, pitch_mm)]
+                            [lost, f"{value:#.3g}", f"{value * unit_mm:#.3g}", _straight(document, lost, unit_mm)]
                             for lost, value in spread.items()
                         ],
                     ),
@@ -64,12 +65,58 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
             folded("All terms of the objective", [table(["term", "value", "what it is"], list(_terms(terms)))]),
         ],
         [
-            (f"{grid} + {grid}", f"fibres on {size}"),
+            (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
             (holds, "design rules"),
-            (f"{spread[0] * pitch_mm:#.3g} mm", "ambiguity of the design"),
+            (f"{spread[0] * unit_mm:#.3g} mm", "ambiguity of the design"),
         ],
     )
     return [fibres]
+
+
+PAD = "morphology.json"
+Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
+"""Its name, the document that it has left, and what a report has to say of that."""
+
+
+def stage_pages(folder: Path, stages: Sequence[Stage]) -> tuple[list[PageSection], list[list[object]], list[str]]:
+    """What the documents in `folder` give to a report, as far as they are there.
+
+    Returns:
+        Parts of the page, rows of their provenance, and what does not belong together, which the first part tells too.
+
+    Raises:
+        InputError: a document is damaged.
+    """
+    sections: list[PageSection] = []
+    origins: list[list[object]] = []
+    strange: list[str] = []
+    for name, path, made_of in stages:
+        if path.exists():
+            document = read_json(path, f"padforge-{name}/1")
+            with as_written(path):
+                strange += _misfits(folder, name, document)
+                sections += made_of(folder, document)
+                origins.append(provenance_row(folder, name, document))
+    return [*([_misfits_section(strange)] if strange else []), *sections], origins, strange
+
+
+def _misfits(folder: Path, stage: str, document: Mapping[str, Any]) -> list[str]:
+    """What of a stage's result in `folder` is of another pad than the morphology.json there.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
+    """
+    made_by = document["provenance"]
+    made_of = made_by.get("inputs", {}).get(PAD) if stage != "design" else document.get("morphology_sha256")
+    if not isinstance(made_of, str) or not (folder / PAD).is_file() or unchanged(folder, {PAD: made_of}):
+        return []
+    return [f"{stage} ({made_by.get('command')}) is of another pad than the {PAD} here"]
+
+
+def _misfits_section(found: Sequence[str]) -> PageSection:
+    """What does not belong together, as `_misfits` tells it."""
+    advice = paragraph("Files of two pads lie in this folder. Do these stages again, or put the pads into two folders.")
+    return PageSection("Does not belong together", [advice, *(paragraph(each) for each in found)])
 
 
 def provenance_row(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
@@ -95,10 +142,10 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     )
 
 
-def _straight(document: Mapping[str, Any], lost: int, pitch_mm: float) -> str:
+def _straight(document: Mapping[str, Any], lost: int, unit_mm: float) -> str:
     """The ambiguity of straight fibres in mm; nothing where a search before this version left none."""
     value = document.get("straight", {}).get(f"ambiguity_lost_{lost}")
-    return "-" if value is None else f"{float(value) * pitch_mm:#.3g}"
+    return "-" if value is None else f"{float(value) * unit_mm:#.3g}"
 
 
 def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
@@ -136,10 +183,10 @@ def _terms(terms: Mapping[str, float]) -> Iterator[list[object]]:
 
 def _inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
     for name, digest in inputs.items():
-        here = folder / name
         if not isinstance(digest, str):
             yield f"{name}: {digest['command']}" if digest else name
-        elif here.is_file():
-            yield f"{name} {digest} ({'the one here' if sha256(here) == digest else 'not the one here'})"
+        elif Path(name).name == name and (folder / name).is_file():  # no name leads to files of others
+            here = "the one here" if unchanged(folder, {name: digest}) else "not the one here"
+            yield f"{name} {digest} ({here})"
         else:
             yield f"{name} {digest}"

@@ -24,6 +24,8 @@ from typing import Any, Self
 from design.common.errors import InputError
 
 HOST = "127.0.0.1"
+HTTP_PORT = 80
+"""Which browsers leave out of the name that they ask for."""
 """Only this machine is served: readings are nobody else's business, and nobody is asked for a password."""
 LEAST_PAUSE_S = 0.04
 """Between two messages to a browser: faster than eyes."""
@@ -197,7 +199,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _asked_here(self) -> bool:
         """Whether this machine was asked by its own name: no page from elsewhere gets at it by renaming it."""
         port = self.server.server_address[1]
-        return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}")
+        left_out = (HOST, "localhost") if port == HTTP_PORT else ()
+        return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}", *left_out)
 
     def _send_page(self) -> None:
         self.send_response(HTTPStatus.OK)

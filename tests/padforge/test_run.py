@@ -101,8 +101,9 @@ def test_running_again_gives_the_same_pad(chain):
     assert ((folder / "out/pad/morphology.json").read_bytes(), (folder / "out/pad/mould.stl").read_bytes()) == before
 
 
-def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain):
-    folder, _ = chain
+def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain, tmp_path):
+    """Whose mould and recording are of another pad than what was found so far, as the report then tells."""
+    folder = shutil.copytree(chain[0], tmp_path / "again")
     recording = folder / "out" / "pad" / "recording" / "readings.bin"
     before = recording.read_bytes()
     (folder / "long.toml").write_text(SMALL.replace("steps = 10", "steps = 1000000"))
@@ -121,6 +122,9 @@ def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain):
     watch.join()
     assert result.code == 130, result.out + result.err
     assert recording.read_bytes() == before
+    result = called("report", cwd=folder)
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert "fabrication (fabricate) is of another pad than the morphology.json here" in result.err
 
 
 def test_the_front_door_in_one_process(chain, tmp_path, monkeypatch, capsys):

@@ -146,7 +146,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
 
 
 def test_a_folder_that_holds_more_than_states_keeps_it(tmp_path):
-    (tmp_path / "search.json").write_text("{}")
+    (tmp_path / "search.json").write_text('{"format": "padforge-search/1"}')
     (tmp_path / "mine.txt").write_text("mine")
     (tmp_path / "start_of_mine.npz").write_text("mine as well")
     Checkpoints(tmp_path, {}).begin(resume=False)

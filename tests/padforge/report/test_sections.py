@@ -1,14 +1,16 @@
 """The report: one page that holds everything, lets nothing in, and is honest about files it cannot read."""
 
+import hashlib
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from markupsafe import escape
 
-from design.common.errors import InputError
+from design.common.errors import Fault, InputError
 from design.common.files import provenance
 from design.pad.morphology import Morphology
 from design.report.contact_section import contact_line
@@ -125,7 +127,33 @@ def test_a_study_of_lost_fibres_takes_the_place_of_the_calibration(pad: Path) ->
 def test_provenance_says_which_inputs_are_the_ones_here(pad: Path) -> None:
     assert "(the one here)" in write_report(pad).read_text()
     (pad / "morphology.json").write_text("{}")
-    assert "(not the one here)" in write_report(pad).read_text()
+    with pytest.raises(Fault, match=r"fabrication .* is of another pad"):
+        write_report(pad)
+    text = (pad / "report.html").read_text()
+    assert "(not the one here)" in text
+    assert text.index("Does not belong together") < text.index("Design rules"), "first thing on the page"
+
+
+def test_plans_of_another_pad_are_told(pad: Path) -> None:
+    document = json.loads((pad / "design.json").read_text())
+    digest = hashlib.sha256((pad / "morphology.json").read_bytes()).hexdigest()
+    for of, strange in ((digest, False), ("0" * 64, True)):
+        written(pad / "design.json", document | {"morphology_sha256": of})
+        with pytest.raises(Fault, match=r"design .* is of another pad") if strange else nullcontext():
+            write_report(pad)
+
+
+def test_no_name_in_a_document_leads_out_of_the_folder(pad: Path) -> None:
+    """Else a report would tell of any file whether it is the one that somebody has the digest of."""
+    outside = pad.parent / "secret.txt"
+    outside.write_text("secret")
+    document = json.loads((pad / "design.json").read_text())
+    digest = hashlib.sha256(b"secret").hexdigest()
+    document["provenance"]["inputs"] = {str(outside): digest, "../secret.txt": digest, "/dev/zero": digest}
+    (pad / "design.json").write_text(json.dumps(document))
+    text = write_report(pad).read_text()
+    assert text.count(digest) == 3
+    assert f"{digest} (" not in text
 
 
 @pytest.mark.parametrize("name", ["design", "fabrication", "calibration", "studies/drift"])

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from design.common.errors import InputError
+from sense.live import page_server
 from sense.live.page_server import HOST, LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
 
@@ -19,7 +20,7 @@ HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
 VIEW = {
     "title": HOSTILE,
     "middle_mm": [1.0, -2.0],
-    "half_mm": 20.0,
+    "half_mm": [20.0, 20.0],
     "pressed": True,
     "ended": "",
     "fibres": [{"swing": 0.5, "state": "sound"}, {"swing": -3.0, "state": "silent"}, {"swing": None, "state": HOSTILE}],
@@ -52,6 +53,12 @@ def told(page: LivePage) -> Iterator[Iterator[dict]]:
     with get(page, "/events") as response:
         lines = (line.decode() for line in response)
         yield (json.loads(line[6:]) for line in lines if line.startswith("data: "))
+
+
+def test_a_browser_leaves_the_port_of_http_out(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert get(page, "/", "localhost").status == 403
+    monkeypatch.setattr(page_server, "HTTP_PORT", port_of(page))
+    assert [get(page, "/", name).status for name in ("localhost", HOST, "elsewhere")] == [200, 200, 403]
 
 
 @pytest.mark.parametrize("name", ["live.html", "hand.html"])
