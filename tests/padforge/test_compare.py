@@ -1,0 +1,61 @@
+"""`padforge design compare`: which pad to make."""
+
+import json
+
+import pytest
+
+from design import Morphology
+from tests.padforge.program import called
+
+
+def test_pads_that_are_there_are_judged_as_they_are(tmp_path):
+    Morphology.straight((2, 3), (8.0, 15.0)).save(tmp_path / "plain.json")
+    Morphology.random(2, 3, seed=1).save(tmp_path / "bent.json")
+    result = called("design", "compare", "plain.json", "bent.json", "--out", "both", "--json", cwd=tmp_path)
+    assert result.code == 0, result.err
+    plain, bent = json.loads(result.out)["rows"]
+    assert (plain["name"], plain["fibres"], plain["crossings"]) == ("plain", [2, 3], 6)
+    assert plain["length_mm"] == pytest.approx(2 * 4 * 8 + 3 * 3 * 15)
+    assert plain["errors_mm"] == plain["straight_mm"] != bent["errors_mm"]
+    assert len(plain["errors_mm"]) == 4, "0 to 3 lost"
+    assert plain["mould_ml"] > 0
+    assert (tmp_path / "both" / "plain" / "mould.stl").exists()
+    assert (tmp_path / "both" / "comparison.png").stat().st_size > 10_000
+
+
+def test_values_in_turn_are_designed_each_in_its_folder(tmp_path):
+    (tmp_path / "pad.toml").write_text("[search]\nsteps = 2\nstarts = 1\nknots = 2\n[rules]\nenforce = false\n")
+    result = called(
+        "design", "compare", "--vary", "pad.grid=1,2", "--vary", "pad.pitch_mm=9,[8,12]", "--out", "c", cwd=tmp_path
+    )
+    assert result.code == 0, result.err
+    folders = sorted(path.name for path in (tmp_path / "c").iterdir() if path.is_dir())
+    assert folders == [
+        "grid-1-pitch_mm-8-x-12",
+        "grid-1-pitch_mm-9",
+        "grid-2-pitch_mm-8-x-12",
+        "grid-2-pitch_mm-9",
+    ]
+    assert "grid 2, pitch_mm 8 x 12" in result.out
+    assert "1 lost (mm)" in result.out
+    pad = Morphology.load(tmp_path / "c" / folders[2] / "morphology.json")
+    assert (pad.layout.counts, pad.pitch_mm) == ((2, 2), (8.0, 12.0))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((), "these are 1 pads to compare"),
+        (("--vary", "grid=3"), "SECTION.KEY=VALUE"),
+        (("--vary", "pad.grid=3,"), "these are 1 pads"),
+        (("--vary", "pad.grid=three,4"), "none of TOML"),
+        (("--vary", "pad.grid=0,4"), "greater than or equal to 1"),
+        (("--vary", "pads.grid=3,4"), "pads"),
+        (("--vary", "pad.grid=3,3"), "one of this name"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_before_a_search_begins(tmp_path, given, said):
+    result = called("design", "compare", *given, cwd=tmp_path)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert said in result.err
+    assert not list(tmp_path.iterdir())
