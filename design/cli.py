@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,6 +17,9 @@ from design.common.command_line import (
     show_result,
     spec_option,
 )
+
+if TYPE_CHECKING:
+    from design.report.comparison import Making
 
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 twin_option = click.option(
@@ -35,7 +39,7 @@ twin_option = click.option(
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Where presses are told apart.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="End with the best after S seconds.")
 @click.option("--resume", is_flag=True, help="Go on where a search into the same folder was broken off.")
-@click.option("--scheduler", metavar="ADDRESS", help="Run the starts on a Dask cluster.")
+@click.option("--scheduler", metavar="ADDRESS", help="Run the starts on a Dask cluster, which is trusted wholly.")
 @seed_option
 @out_option("out/pad")
 @json_option
@@ -117,9 +121,11 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     from design.criteria.rules import check_rules
     from design.pad.morphology import Morphology
 
-    from .settings import RulesSettings
+    from .settings import PadSettings, RulesSettings
 
-    found = check_rules(Morphology.load(morphology), load_spec(spec).section(RulesSettings))
+    pad, settings = Morphology.load(morphology), load_spec(spec)
+    size = settings.section(PadSettings, **pad.layout.settings)
+    found = check_rules(pad, settings.section(RulesSettings), size)
     lines = [str(violation) for violation in found] or ["all rules hold"]
     show_result({"violations": [asdict(violation) for violation in found]}, lines, as_json)
     context.exit(1 if found else 0)
@@ -148,10 +154,52 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     if twin is not None:
         settings = settings_for_twin(settings, twin, pad)
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
-    size = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm)
+    size = settings.section(PadSettings, **pad.layout.settings)
     asked = settings.section(Contact), search.lost, search.noise
-    terms = score_terms(pad, *asked, rules, size.sensed_mm)
+    terms = score_terms(pad, *asked, rules, size)
     if search.method == "error":
-        terms |= error_terms(expected_errors(pad, *asked, size.sensed_mm))
-    found = [asdict(violation) for violation in check_rules(pad, rules)]
+        terms |= error_terms(expected_errors(pad, *asked, size))
+    found = [asdict(violation) for violation in check_rules(pad, rules, size)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)
+
+
+def compare_command(making: "Making") -> click.Command:
+    """`padforge design compare`, by what it takes to make a pad: the front door knows who does."""
+
+    @click.command("compare")
+    @click.argument("sources", metavar="[SPEC|MORPHOLOGY]...", nargs=-1, type=click.Path(exists=True, path_type=Path))
+    @click.option(
+        "--vary", metavar="KEY=V,V", multiple=True, help="Values a setting takes in turn, such as pad.grid=3,4."
+    )
+    @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Seconds for each search.")
+    @seed_option
+    @out_option("out/comparison")
+    @json_option
+    @profile_option
+    def command(
+        sources: tuple[Path, ...],
+        vary: tuple[str, ...],
+        time_budget: float | None,
+        seed: int | None,
+        out: Path,
+        as_json: bool,
+    ) -> None:
+        """Which pad to make: a table and a figure of variants, by fibres, length, mould and error with fibres lost.
+
+        \b
+        padforge design compare --vary pad.grid=3,4,5 --vary search.knots=6,21
+        padforge design compare small.toml large.toml
+        padforge design compare out/pad/morphology.json published.mat
+
+        Every variant is designed into a folder of its own, with its mould; morphologies are taken as they are.
+        """
+        from design.common.files import claimed
+        from design.optimisers.search import SearchRun
+        from design.report.comparison import compare, comparison_lines, variants
+
+        pads = variants(sources, vary, load_spec)
+        with claimed(out):
+            document = compare(pads, out, SearchRun(time_budget=time_budget), seed, making)
+        show_result(document, [*comparison_lines(document), f"comparison -> {out / 'comparison.json'}"], as_json)
+
+    return command

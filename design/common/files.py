@@ -99,8 +99,8 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def read_json(path: Path, kind: str) -> dict[str, Any]:
-    """Read a JSON document whose `format` is `kind`, e.g. "padforge-morphology/1".
+def read_json(path: Path, *kinds: str) -> dict[str, Any]:
+    """Read a JSON document whose `format` is one of `kinds`, e.g. "padforge-morphology/1".
 
     Raises:
         InputError: the file is missing, is no JSON, or says another format.
@@ -111,8 +111,8 @@ def read_json(path: Path, kind: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file ({error})") from error
     found = document.get("format") if isinstance(document, dict) else None
-    if found != kind:
-        raise InputError(f"{path}: format is {shown(found)}, expected {kind!r}")
+    if found not in kinds:
+        raise InputError(f"{path}: format is {shown(found)}, expected {' or '.join(map(repr, kinds))}")
     return document
 
 

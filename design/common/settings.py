@@ -42,6 +42,11 @@ class Settings(BaseModel):
 AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
+def as_tuple(value: object) -> object:
+    """A list, as files have it, as the tuple that a frozen model holds; anything else as it is."""
+    return tuple(value) if isinstance(value, list) else value
+
+
 class Spec:
     """The content of a `pad.toml`: `spec.section(PadSettings)` is that section, validated, with defaults filled in.
 

@@ -26,8 +26,8 @@ def ambiguity(signals: Tensor, presses: Tensor, kept: Tensor, weight: Tensor, no
     """A of the module's formula, a scalar with gradient by the signals.
 
     Args:
-        signals: (2M, Q). presses: (Q, 2), grid units.
-        kept: (L, 2M), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
+        signals: (F, Q). presses: (Q, 2), grid units.
+        kept: (L, F), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
         noise: sigma of a signal, grid units, > 0.
     """
     scaled = kept.double()[:, None, :] * (signals.T.double() / (2 * noise))
@@ -40,14 +40,14 @@ def ambiguity(signals: Tensor, presses: Tensor, kept: Tensor, weight: Tensor, no
 
 
 def full_scale(signals: Tensor) -> float:
-    """Mean over the fibres that are touched at all of the largest of their signals (2M, Q); 1 if none is."""
+    """Mean over the fibres that are touched at all of the largest of their signals (F, Q); 1 if none is."""
     largest = signals.detach().amax(dim=1)
     touched = largest[largest > 0]
     return touched.mean().item() if len(touched) else 1.0
 
 
 def sharpness(signals: Tensor) -> Tensor:
-    """Mean |second difference| of signals (2M, Q) along presses in an order of neighbours, grid units.
+    """Mean |second difference| of signals (F, Q) along presses in an order of neighbours, grid units.
 
     The published term Z without the converter, which has no gradient.
     """

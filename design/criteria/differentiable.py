@@ -13,7 +13,7 @@ from design.pad.contact import note_reach, press_shape
 from design.pad.kernels.exact_gradient import signals_gradient
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
-from design.pad.kernels.press import family_strays
+from design.pad.kernels.press import Ends, family_strays
 from design.settings import Contact
 
 Array = NDArray[np.float64]
@@ -76,58 +76,63 @@ def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
     return torch.stack([at, value], dim=-1), slope
 
 
-def press_signals(travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact) -> Tensor:
+def press_signals(travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends) -> Tensor:
     """Signals of one pad with their analytic gradient: exact, but for a measured reach within the kernel's PRECISION.
 
     Args:
-        travel, cross, slope: (2M, n) float64 knots and slopes, held independent. presses: (Q, 2) in grid units.
+        travel, cross, slope: (F, n) float64 knots and slopes, held independent. presses: (Q, 2) in grid units.
+        ends: where the fibres end.
 
     Returns:
-        (2M, Q), with the default weight and length in grid units.
+        (F, Q), with the default weight and length in grid units.
     """
     kind = MeasuredSignals if contact.reach else ExactSignals
-    return kind.apply(travel, cross, slope, presses, contact)  # pyright: ignore[reportReturnType]
+    return kind.apply(travel, cross, slope, presses, contact, ends)  # pyright: ignore[reportReturnType]
 
 
 class ExactSignals(torch.autograd.Function):
     """The exact signals of one pad as a torch function of its knots and slopes: `press_signals` of a disc."""
 
     @staticmethod
-    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact) -> Tensor:
-        """Signals (2M, Q)."""
+    def forward(
+        ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends
+    ) -> Tensor:
+        """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
         shape = press_shape(contact)
-        strays, none = family_strays(v[None]), np.empty(0, np.int64)
-        ctx.inputs = (t, v, d, strays[0], presses, shape)
+        strays, none = family_strays(v[None], ends), np.empty(0, np.int64)
+        ctx.inputs = (t, v, d, strays[0], ends, presses, shape)
         out = np.zeros(len(presses) * len(t))
         begin, end = 0, len(presses)
-        visited = exact_signals(t[None], v[None], d[None], strays, presses, *shape, begin, end, none, none, out)
+        visited = exact_signals(t[None], v[None], d[None], strays, ends, presses, *shape, begin, end, none, none, out)
         if profiling.is_profiling():
-            note_reach(t[None], strays, presses, shape[1], visited)
+            note_reach(t[None], strays, ends, presses, shape[1], visited)
         return torch.from_numpy(out.reshape(-1, len(t)).T)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         """Gradient by travel, cross and slope."""
-        t, v, d, strays, presses, shape = ctx.inputs
-        found = signals_gradient(t, v, d, strays, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
-        return (*torch.from_numpy(found), None, None)
+        t, v, d, strays, ends, presses, shape = ctx.inputs
+        found = signals_gradient(t, v, d, strays, ends, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
+        return (*torch.from_numpy(found), None, None, None)
 
 
 class MeasuredSignals(torch.autograd.Function):
     """The signals of one pad under a measured reach, from elements laid once a call: `press_signals` of a reach."""
 
     @staticmethod
-    def forward(ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact) -> Tensor:
-        """Signals (2M, Q)."""
+    def forward(
+        ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends
+    ) -> Tensor:
+        """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
         _, extents, law = press_shape(contact)
-        elements = fibre_elements(t, v, d, presses, law.radius, spacing_of(contact.reach), law.length)
+        elements = fibre_elements(t, v, d, ends.horizontals, presses, law.radius, spacing_of(contact.reach), law.length)
         ctx.inputs = (t, v, d, elements, presses, law)
         out = np.empty((len(presses), len(t)))
         looked_at = element_signals(t, v, elements, presses, law.radius, law.profile, out)
         if profiling.is_profiling():
-            note_reach(t[None], family_strays(v[None]), presses, extents, looked_at)
+            note_reach(t[None], family_strays(v[None], ends), ends, presses, extents, looked_at)
         return torch.from_numpy(out.T)
 
     @staticmethod
@@ -136,4 +141,4 @@ class MeasuredSignals(torch.autograd.Function):
         t, v, d, elements, presses, law = ctx.inputs
         up = np.ascontiguousarray(upstream[0].numpy().T)
         found = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
-        return (*torch.from_numpy(found), None, None)
+        return (*torch.from_numpy(found), None, None, None)

@@ -22,7 +22,7 @@ def lost_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...
 
 
 def loss_masks(fibres: int, lost: int, most: int) -> Array:
-    """`lost_subsets` as masks (L, 2M): 1 for a fibre that works, 0 for a lost one."""
+    """`lost_subsets` as masks (L, F): 1 for a fibre that works, 0 for a lost one."""
     losses = lost_subsets(fibres, lost, most)
     kept = np.ones((len(losses), fibres))
     for row, loss in enumerate(losses):
@@ -37,7 +37,7 @@ def loss_shares(lost: int | tuple[float, ...]) -> tuple[float, ...]:
 
 
 def draw_losses(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> tuple[Array, Array]:
-    """Masks (L, 2M) of fibres that still work, and their weights (L,): DRAWS random losses of each size above 0.
+    """Masks (L, F) of fibres that still work, and their weights (L,): DRAWS random losses of each size above 0.
 
     Sizes of weight 0, and those that would leave no fibre, are left out.
     """

@@ -8,7 +8,7 @@ from design.pad.kernels.pchip import population_slopes, sample_curves
 from design.pad.kernels.published import information as kernels
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import Contact, between_fibres
 
 LEVELS = 4096
 """Levels of the published 12-bit converter."""
@@ -42,12 +42,13 @@ def disorder(knots: Array, samples: int = 2000) -> float:
     grows with `samples`; `disorder_area` is what it samples.
 
     Args:
-        knots: (2M, N+2, 2).
+        knots: (2M, N+2, 2) of a square pad.
 
     Returns:
         The sum, in grid units.
     """
-    return float(kernels.disorder(sample_curves(knots[None], samples)[0]))
+    grid = len(knots) // 2
+    return float(kernels.disorder(sample_curves(knots[None], grid, samples)[0], grid))
 
 
 def disorder_area(pad: Morphology) -> float:
@@ -56,8 +57,9 @@ def disorder_area(pad: Morphology) -> float:
     The sum over pairs i < j of a family of the integral of max(curve_i - curve_j, 0), exact on the PCHIP curves;
     `disorder` approaches it times (samples - 1) / (M + 1).
     """
-    travel, cross, _ = fibre_axes(pad)
-    return max(0.0, float(kernels.disorder_area(travel[0], cross[0], population_slopes(travel, cross)[0])))
+    travel, cross, ends, _ = fibre_axes(pad)
+    slopes = population_slopes(travel, cross)[0]
+    return max(0.0, float(kernels.disorder_area(travel[0], cross[0], slopes, ends.horizontals)))
 
 
 def idle_share(signals: Array, threshold: float = 0.0) -> float:
@@ -75,10 +77,11 @@ def idle_share(signals: Array, threshold: float = 0.0) -> float:
 def information(pad: Morphology, contact: Contact | None = None, noise: float = 1.0, side: int = 20) -> float:
     """Mutual information, in bits, between the place of a press and the pad's noisy signals: a lower bound.
 
-    The place is uniform over 1..M squared, each signal carries Gaussian noise of `noise` counts of a converter whose
-    LEVELS span the largest signal. The square is cut into side x side cells; within a cell signals are linear in the
-    place, so the signals of a cell are Gaussian with covariance C = sigma^2 I + J S J^T (J the signals' derivative, S
-    the spread of a place in its cell) and those of the pad a mixture. With D the Bhattacharyya distance,
+    The place is uniform between the outermost fibres, each signal carries Gaussian noise of `noise` counts of a
+    converter whose LEVELS span the largest signal. What is pressed is cut into side x side cells; within a cell signals
+    are linear in the place, so the signals of a cell are Gaussian with covariance C = sigma^2 I + J S J^T (J the
+    signals' derivative, S the spread of a place in its cell) and those of the pad a mixture. With D the
+    Bhattacharyya distance,
 
         I >= mean_a [ln det(C_a / sigma^2) / 2] - mean_a ln mean_b exp(-D_ab)    (in nats)
 
@@ -91,8 +94,9 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     Args:
         noise: converter counts, > 0. side: cells a side, at least 2.
     """
-    centres = (np.arange(side) + 0.5) / side * max(pad.grid - 1, 1) + (1 if pad.grid > 1 else 0.5)
-    places = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
+    low, high = (np.array(corner) for corner in between_fibres(pad.layout))
+    x, y = ((np.arange(side) + 0.5) / side * (high - low)[axis] + low[axis] for axis in (0, 1))
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     step = 1e-4
     around = (places[:, None] + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
     found = signals(pad, around, contact).reshape(len(places), 5, -1)
@@ -100,8 +104,9 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
         return 0.0
     sigma = noise * found.max() / LEVELS
     mean = found[:, 0] / sigma
-    cell = (centres[1] - centres[0]) / np.sqrt(12)
-    spread = cell / (2 * step * sigma) * (found[:, 1::2] - found[:, 2::2]).transpose(0, 2, 1)  # (Q, 2M, 2)
+    cell = np.array([x[1] - x[0], y[1] - y[0]]) / np.sqrt(12)
+    slope = (found[:, 1::2] - found[:, 2::2]).transpose(0, 2, 1)
+    spread = cell / (2 * step * sigma) * slope  # (Q, F, 2)
     own = np.linalg.slogdet(np.eye(2) + np.einsum("aki,akj->aij", spread, spread))[1]
     blocks = [_mean_exponential(mean, spread, own, part) for part in np.array_split(np.arange(len(mean)), side)]
     return float((own.mean() / 2 - np.log(np.concatenate(blocks)).mean()) / np.log(2))

@@ -6,32 +6,42 @@ the finished curves (`rules`); these are what leads there. A rule whose limit ca
 
 import math
 from dataclasses import dataclass
+from itertools import combinations, product
 
+import numpy as np
+import shapely
 import torch
 from torch import Tensor
 
 from design.common.errors import InputError
-from design.settings import PadSettings, RulesSettings
+from design.pad.courses.keep_out import keep_outs
+from design.settings import Layout, PadSettings, RulesSettings
 
 from .differentiable import pchip_sample, span_samples
 
 PER_SPAN = 12
 ORDER_PER_UNIT = 40
 BLUR = 0.1  # standard deviation of the mollified crossing count, grid units
+LEAST_CLEARANCE = 0.1  # from keep-outs, grid units, of which what comes nearer is a share
 MOST_PAIRS = 10**8  # of samples that are compared at once: some GB
 
 
 @dataclass(frozen=True)
 class SampledCurves:
-    """Fibres sampled densely: places (2M, P, 2) along their travel and cross axes, slopes and arc lengths (2M, P)."""
+    """Fibres sampled densely: places (F, P, 2) along their travel and cross axes, slopes and arc lengths (F, P)."""
 
     place: Tensor
     slope: Tensor
     arc: Tensor
 
     @property
+    def travelled(self) -> Tensor:
+        """How far fibres run along their travel axes, on average."""
+        return self.place[:, -1, 0].detach().mean()
+
+    @property
     def share(self) -> Tensor:
-        """(2M, P) arc length that belongs to each sample, without gradient."""
+        """(F, P) arc length that belongs to each sample, without gradient."""
         step = self.arc.detach().diff(dim=1) / 2
         return torch.nn.functional.pad(step, (1, 0)) + torch.nn.functional.pad(step, (0, 1))
 
@@ -46,59 +56,68 @@ def penalties(
     """A penalty by name of each rule that may be broken, scalars with gradient by the knots.
 
     Args:
-        travel, cross: (2M, N+2) coordinates of the knots, grid units.
+        travel, cross: (F, N+2) coordinates of the knots, grid units.
         margin: factor on the limits, so that a curve whose penalty is 0 also passes the exact check.
 
     Raises:
         InputError: so many fibres, of so many knots, that comparing their samples would not fit into memory.
     """
-    pitch = pad.pitch_mm
+    unit, layout = pad.layout.unit_mm, pad.layout
     place, slope = span_samples(travel, cross, PER_SPAN)
     step = torch.linalg.vector_norm(place.diff(dim=1), dim=-1)
     fibres = SampledCurves(place, slope, torch.nn.functional.pad(step.cumsum(dim=1), (1, 0)))
-    radius, gap = margin * rules.min_bend_radius_mm / pitch, margin * rules.min_gap_mm / pitch
+    radius, gap = margin * rules.min_bend_radius_mm / unit, margin * rules.min_gap_mm / unit
     found = {}
     if radius > 0:
-        found["min_bend_radius_mm"] = _bend(fibres, radius, rules.min_bend_radius_mm / pitch / 2)
-    if gap > 0 and pad.grid > 1:
-        found["min_gap_mm"] = _gap(fibres, gap)
+        around = rules.min_bend_radius_mm / 2 / (pad.bent_radius_mm or math.inf)
+        found["min_bend_radius_mm"] = _bend(fibres, radius, rules.min_bend_radius_mm / unit / 2, around)
+    if gap > 0 and max(layout.counts) > 1:
+        found["min_gap_mm"] = _gap(fibres, gap, layout)
     if gap > radius:  # else fibres that bend by the rule keep their folds apart
         found["folds"] = _folds(fibres, gap)
-    if pad.grid > 1:
+    if max(layout.counts) > 1:
         if rules.same_family_crossings == 0:
-            found["same_family_crossings"] = _disorder(travel, cross, max(gap, 0.01))
+            found["same_family_crossings"] = _disorder(travel, cross, max(gap, 0.01), layout)
         else:
-            found["same_family_crossings"] = _too_many(_family_crossings(fibres), rules.same_family_crossings / margin)
-    if rules.max_crossings is not None or rules.min_crossing_angle_deg > 0:
+            found["same_family_crossings"] = _too_many(
+                _family_crossings(fibres, layout), rules.same_family_crossings / margin
+            )
+    if min(layout.counts) and (rules.max_crossings is not None or rules.min_crossing_angle_deg > 0):
         limit = math.radians(margin * rules.min_crossing_angle_deg)
-        count, flat = _crossings(fibres, limit)
+        count, flat = _crossings(fibres, limit, layout)
         if rules.max_crossings is not None:
             found["max_crossings"] = _too_many(count, rules.max_crossings / margin)
         if limit > 0:
-            found["min_crossing_angle_deg"] = flat / pad.grid
+            found["min_crossing_angle_deg"] = flat / (layout.fibres / 2)
     if rules.border_mm > 0:
-        found["border_mm"] = _hugging(fibres, rules.border_mm / pitch)
-    found["max_length_mm"] = torch.relu(fibres.arc[:, -1] * pitch * margin / rules.max_length_mm - 1).mean()
+        found["border_mm"] = _hugging(fibres, rules.border_mm / unit)
+    if pad.keep_out_mm:
+        found["keep_out_mm"] = _intruding(fibres, pad, margin * rules.keep_out_mm / unit)
+    found["max_length_mm"] = torch.relu(fibres.arc[:, -1] * unit * margin / rules.max_length_mm - 1).mean()
     return found
 
 
-def _bend(fibres: SampledCurves, radius: float, window: float) -> Tensor:
-    """How much more than window / radius a fibre turns within `window` of arc, as a share of that angle."""
+def _bend(fibres: SampledCurves, radius: float, window: float, around: float) -> Tensor:
+    """How much more than window / radius a fibre turns within `window` of arc, as a share of that angle.
+
+    Where the pad is worn bent it turns by `around` more at right angles to that, as a fibre does that runs along x.
+    """
     turned = torch.atan(fibres.slope).diff(dim=1).abs().cumsum(dim=1)
     turned = torch.nn.functional.pad(turned, (1, 0))
     until = fibres.arc + window
     after = torch.searchsorted(fibres.arc.detach(), until.detach()).clamp(1, until.shape[1] - 1)
     a0, a1, t0, t1 = (x.gather(1, i) for x in (fibres.arc, turned) for i in (after - 1, after))
     angle = t0 + ((until - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
+    if around > 0:
+        angle = torch.sqrt(angle**2 + around**2)
     over = torch.relu(angle * radius / window - 1)
-    return (over * fibres.share).sum(dim=1).mean() / fibres.place[0, -1, 0].detach()
+    return (over * fibres.share).sum(dim=1).mean() / fibres.travelled
 
 
-def _gap(fibres: SampledCurves, gap: float) -> Tensor:
+def _gap(fibres: SampledCurves, gap: float, layout: Layout) -> Tensor:
     """How much nearer than `gap` neighbours in a family come, as a share of it."""
-    grid = len(fibres.place) // 2
-    _require_room(2 * grid, fibres.arc.shape[1])
-    below = [f for f in range(2 * grid) if f % grid < grid - 1]
+    _require_room(layout.fibres, fibres.arc.shape[1])
+    below = [f for rows in layout.families for f in range(rows.start, rows.stop - 1)]
     lower, upper = fibres.take(below), fibres.take([f + 1 for f in below])
     distances = torch.cdist(lower.place.detach().float(), upper.place.detach().float())
     near = [_near(lower.place, upper, distances, gap), _near(upper.place, lower, distances.mT, gap)]
@@ -136,32 +155,33 @@ def _closeness(near: Tensor, gap: float) -> Tensor:
     return (close + 10 * close**2).sum()
 
 
-def _disorder(travel: Tensor, cross: Tensor, least: float) -> Tensor:
+def _disorder(travel: Tensor, cross: Tensor, least: float, layout: Layout) -> Tensor:
     """How much less than `least` a fibre lies above its lower neighbour in the family, as a share of it."""
-    grid = len(travel) // 2
-    at = torch.linspace(0, grid + 1, ORDER_PER_UNIT * (grid + 1) + 1, dtype=torch.float64)
-    above = pchip_sample(travel, cross, at)[0].unflatten(0, (2, grid)).diff(dim=1)
-    return _closeness(above, least) / above.numel()
+    above = []
+    for rows, extent in zip(layout.families, layout.extent, strict=True):
+        at = torch.linspace(0, extent, math.ceil(ORDER_PER_UNIT * extent) + 1, dtype=torch.float64)
+        if rows.stop - rows.start > 1:
+            above.append(pchip_sample(travel[rows], cross[rows], at)[0].diff(dim=0).flatten())
+    apart = torch.cat(above)
+    return _closeness(apart, least) / apart.numel()
 
 
 def _too_many(count: Tensor, limit: float) -> Tensor:
     return torch.relu(count - limit) / max(1.0, limit)
 
 
-def _family_crossings(fibres: SampledCurves) -> Tensor:
+def _family_crossings(fibres: SampledCurves, layout: Layout) -> Tensor:
     """Soft number of crossings within the families."""
-    grid = len(fibres.place) // 2
-    _require_room(grid * (grid - 1), fibres.arc.shape[1])
-    pairs = [(f, g) for f in range(2 * grid) for g in range(f + 1, grid * (f // grid + 1))]
+    pairs = [pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2)]
+    _require_room(len(pairs), fibres.arc.shape[1])
     first, second = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
     return _mollified(first, second, 0.0)[0]
 
 
-def _crossings(fibres: SampledCurves, limit: float) -> tuple[Tensor, Tensor]:
+def _crossings(fibres: SampledCurves, limit: float, layout: Layout) -> tuple[Tensor, Tensor]:
     """Soft number of horizontal x vertical crossings, and of those flatter than `limit` radians, by how much."""
-    grid = len(fibres.place) // 2
-    _require_room(grid**2, fibres.arc.shape[1])
-    pairs = [(f, g) for f in range(grid) for g in range(grid, 2 * grid)]
+    pairs = list(product(*(range(rows.start, rows.stop) for rows in layout.families)))
+    _require_room(len(pairs), fibres.arc.shape[1])
     horizontal, vertical = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
     return _mollified(horizontal, vertical.flip(-1), limit)
 
@@ -194,5 +214,28 @@ def _require_room(fibres: int, samples: int) -> None:
 def _hugging(fibres: SampledCurves, zone: float) -> Tensor:
     """How steeper than 45 degrees fibres run in the `zone` by the wall they come from."""
     travel = fibres.place[..., 0].detach()
-    edge = (travel < zone) | (travel > travel[0, -1] - zone)
-    return (torch.relu(fibres.slope.abs() - 1) * edge * fibres.share).sum(dim=1).mean() / travel[0, -1]
+    edge = (travel < zone) | (travel > travel[:, -1:] - zone)
+    return (torch.relu(fibres.slope.abs() - 1) * edge * fibres.share).sum(dim=1).mean() / fibres.travelled
+
+
+def _intruding(fibres: SampledCurves, pad: PadSettings, clearance: float) -> Tensor:
+    """How much nearer than `clearance` to a keep-out fibres come, or how deep inside, as a share of it."""
+    layout = pad.layout
+    place = torch.cat([fibres.place[: layout.horizontals], fibres.place[layout.horizontals :].flip(-1)]).flatten(0, 1)
+    known = place.detach().numpy()
+    within, total = max(clearance, LEAST_CLEARANCE), fibres.place.new_zeros(())
+    for polygon in keep_outs(pad):
+        edge, (left, low, right, high) = polygon.exterior, polygon.bounds
+        beside = (known < (left - within, low - within)) | (known > (right + within, high + within))
+        near = np.flatnonzero(~beside.any(axis=1))
+        points = np.asarray(shapely.points(known[near]))
+        close = shapely.distance(polygon, points) < within
+        near, points = near[close], points[close]
+        if not len(near):
+            continue
+        nearest = shapely.line_interpolate_point(edge, shapely.line_locate_point(edge, points))
+        away = place[torch.from_numpy(near)] - torch.tensor(shapely.get_coordinates(nearest))
+        outward = 1 - 2 * torch.from_numpy(shapely.contains(polygon, points).astype(float))
+        signed = outward * torch.linalg.vector_norm(away + 1e-12, dim=-1)
+        total = total + torch.relu(1 - signed / within).sum()
+    return total / fibres.arc.numel()

@@ -12,7 +12,7 @@ from design.common.settings import or_default
 from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
 from design.pad.kernels.published.information import published_terms as terms_kernel
 from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, Contact
+from design.settings import PUBLISHED_CONTACT, Contact, Counts, Layout, between_fibres
 
 from .information import LEVELS
 
@@ -35,9 +35,9 @@ class PublishedTerms:
 
 
 @lru_cache(maxsize=16)
-def published_presses(grid: int, side: int = 7) -> NDArray[np.float64]:
+def published_presses(fibres: Counts | Layout, side: int = 7) -> NDArray[np.float64]:
     """The (side^2, 2) presses the published search samples: a serpentine over 1..M, jittered by U(0, 2/49)."""
-    places = boustrophedon(grid, side, jitter=2 / 49)
+    places = boustrophedon(between_fibres(Layout.of(fibres)), side, jitter=2 / 49)
     places.setflags(write=False)
     return places
 
@@ -48,25 +48,29 @@ def published_terms(
     presses: ArrayLike | None = None,
     samples: int = 2000,
     weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
+    layout: Layout | None = None,
 ) -> list[PublishedTerms]:
     """Terms of formula (5), as the published code computes them, for every pad of a population.
 
     Args:
-        pads: a morphology, or knots (P, 2M, N+2, 2) of a population.
+        pads: a morphology, or knots (P, F, N+2, 2) of a population.
         presses: (Q, 2) in an order of neighbours; the 49 published ones if None.
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
+        layout: of a population's fibres; as many horizontals as verticals, a unit apart, if None.
     """
     alpha, beta, gamma = _weights(weights)
-    travel, cross, _ = fibre_axes(pads)
+    travel, cross, ends, _ = fibre_axes(pads, layout)
     samples = as_samples(samples, travel.shape[1])
-    grid = travel.shape[1] // 2
-    places = as_presses(published_presses(grid) if presses is None else presses)[0]
+    if presses is None:
+        layout = pads.layout if isinstance(pads, Morphology) else layout
+        presses = published_presses(layout or ends.horizontals)
+    places = as_presses(presses)[0]
     shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT))
     found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:
-        terms_kernel(travel, cross, places, shape, samples, LEVELS, begin, end, found)
+        terms_kernel(travel, cross, ends.horizontals, places, shape, samples, LEVELS, begin, end, found)
 
     in_chunks(work, len(travel), grain=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]

@@ -9,11 +9,13 @@ import numpy as np
 import shapely
 
 from design.common.errors import instance
-from design.pad.courses.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
+from design.common.settings import or_default
+from design.pad.courses.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, traced_curve
 from design.pad.courses.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
+from design.pad.courses.keep_out import keep_outs
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import RulesSettings
+from design.settings import Layout, PadSettings, RulesSettings
 
 _TOLERANCE_MM = 1e-3
 _FOLD_TOLERANCE = 1e-4  # of the gap where that is more: all points within a gap of each other are compared
@@ -31,7 +33,7 @@ class Violation:
 
     Attributes:
         rule: the setting's name in `[rules]`.
-        fibres: the fibres concerned, 1..2M (horizontals bottom to top, then verticals left to right); none where the
+        fibres: the fibres concerned, 1.. (horizontals bottom to top, then verticals left to right); none where the
             finding is about the whole pad.
         measured, limit: what was found and what is allowed, mm (or degrees, or a count).
         place_mm: where, from the pad's centre; None where the finding has no single place.
@@ -49,12 +51,15 @@ class Violation:
         return f"{self.rule}: {names}{place}: {_amount(self.measured)}, limit {_amount(self.limit)}"
 
 
-def check_rules(pad: Morphology, rules: RulesSettings) -> list[Violation]:
+def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None = None) -> list[Violation]:
     """Every rule of `[rules]` that `pad` breaks, worst place per fibre or pair of fibres.
+
+    `size` says what there is to keep off and what the pad is worn on; its layout is the pad's whatever it says of that.
 
     - `min_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left and
       right added up; the radius found is R / 2 divided by the greatest such angle. So a bend that keeps on is as wide
-      as R, while a kink of up to half a radian (29 degrees) passes where R / 2 around it is straight.
+      as R, while a kink of up to half a radian (29 degrees) passes where R / 2 around it is straight. Where the pad is
+      worn bent, the angle is that in space (`rolled_turns`).
     - `min_gap_mm` g: two fibres of a family keep the distance g; and so do any two points of one fibre that lie at
       least pi g / 2 apart along it, which is half a turn around a circle of diameter g.
     - `same_family_crossings`: the number of places at which fibres of one family meet, in the whole pad.
@@ -62,47 +67,54 @@ def check_rules(pad: Morphology, rules: RulesSettings) -> list[Violation]:
     - `min_crossing_angle_deg`: the angle, 0 to 90, between the tangents where a horizontal meets a vertical; 0 where
       they run on each other, and next to 0 where they touch.
     - `border_mm`: the distance of every fibre to the two sides of the pad that it runs along.
+    - `keep_out_mm`: the distance of every fibre to the polygons `keep_out_mm` of `[pad]`; 0 in them.
     - `max_length_mm`: the arc length of a fibre.
 
     Distances are right to twice the 1e-3 mm to which curves are flattened, those of a fibre to itself to 2e-4 g if that
     is more; bend radii below R to 0.5 %.
     """
     pad, rules = instance("pad", pad, Morphology), instance("rules", rules, RulesSettings)
-    lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.pitch_mm)]
+    lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.unit_mm)]
+    size = or_default("size", size, PadSettings).of(pad.layout)
     return [
-        *tight_bends(pad, rules.min_bend_radius_mm),
-        *_gaps(lines, rules.min_gap_mm),
+        *tight_bends(pad, rules.min_bend_radius_mm, size.bent_radius_mm),
+        *_gaps(lines, pad.layout, rules.min_gap_mm),
         *_folds(pad, lines, rules.min_gap_mm),
         *_crossings(pad, rules),
         *_borders(pad, lines, rules.border_mm),
+        *_keep_outs(pad, lines, size, rules.keep_out_mm),
         *_lengths(pad, rules.max_length_mm),
     ]
 
 
-def tight_bends(pad: Morphology, limit: float) -> list[Violation]:
-    """The tightest bend of every fibre that breaks `min_bend_radius_mm` = `limit`."""
+def tight_bends(pad: Morphology, limit: float, bent_radius_mm: float | None = None) -> list[Violation]:
+    """The tightest bend of every fibre that breaks `min_bend_radius_mm` = `limit`, on the cylinder it is worn on."""
     if limit == 0:
         return []
-    window = min(limit / 2, pad.size_mm)  # no fibre is shorter than the pad
+    window = min(limit / 2, *pad.layout.size_mm)  # no fibre is shorter than the pad
     angle = window / limit
     spans, slopes = beziers(pad), slope_beziers(pad)
     turned = np.abs(np.diff(extreme_headings(slopes))).sum(axis=1)
+    around = 0.0 if bent_radius_mm is None else window / bent_radius_mm  # most that it turns so, in a window
     found = []
-    for fibre in np.flatnonzero(turned > angle):
+    for fibre in np.flatnonzero(turned + around > angle):
         # An end of the window that falls between two points is off by less than the turn from one to the other.
         points, headings = traced_curve(spans[fibre], slopes[fibre], step=max(angle / 200, _FINEST_TURN))
-        radius, place = bend_radius(pad.to_mm(points), headings, window)
+        points = pad.to_mm(points)
+        across = pad.layout.family(int(fibre)) * np.pi / 2
+        rolled = 0.0 if bent_radius_mm is None else rolled_turns(points, headings - across, bent_radius_mm)
+        radius, place = bend_radius(points, headings, window, rolled)
         if radius < limit:
             found.append(Violation("min_bend_radius_mm", (int(fibre) + 1,), radius, limit, _place(place)))
     return found
 
 
-def _gaps(lines: list[Array], limit: float) -> list[Violation]:
+def _gaps(lines: list[Array], layout: Layout, limit: float) -> list[Violation]:
     shapes = np.array([shapely.LineString(line) for line in lines])
     shapely.prepare(shapes)  # a tenth of the time where fibres are tangled
-    grid = len(shapes) // 2
     found = []
-    for offset, family in ((0, shapes[:grid]), (grid, shapes[grid:])):
+    for rows in layout.families:
+        offset, family = rows.start, shapes[rows]
         near = shapely.STRtree(family).query(family, predicate="dwithin", distance=limit).T
         for first, second in sorted((int(i), int(j)) for i, j in near if i < j):
             between = shapely.shortest_line(family[first], family[second])
@@ -118,7 +130,7 @@ def _folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]
     if limit == 0:
         return []
     if _FOLD_TOLERANCE * limit > _TOLERANCE_MM:
-        lines = [pad.to_mm(points) for points in flatten(pad, _FOLD_TOLERANCE * limit / pad.pitch_mm)]
+        lines = [pad.to_mm(points) for points in flatten(pad, _FOLD_TOLERANCE * limit / pad.unit_mm)]
     found = []
     for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
         fold = fold_gap(lines[fibre], limit)
@@ -130,8 +142,9 @@ def _folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]
 def _crossings(pad: Morphology, rules: RulesSettings) -> list[Violation]:
     most, least_angle = rules.max_crossings, rules.min_crossing_angle_deg
     met = crossings(pad, _CROSSING_TOLERANCE, across=most is not None or least_angle > 0)
-    across = [c for c in met if c.first < pad.grid <= c.second]
-    same = [c for c in met if (c.first < pad.grid) == (c.second < pad.grid)]
+    horizontals = pad.layout.horizontals
+    across = [c for c in met if c.first < horizontals <= c.second]
+    same = [c for c in met if (c.first < horizontals) == (c.second < horizontals)]
     found = []
     if len(same) > rules.same_family_crossings:
         count, limit = len(same), rules.same_family_crossings
@@ -155,16 +168,35 @@ def _angles(pad: Morphology, across: list[Crossing], limit: float) -> list[Viola
 def _borders(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
     found = []
     for fibre, line in enumerate(lines):
-        cross = line[:, 1] if fibre < pad.grid else line[:, 0]
-        distance = pad.size_mm / 2 - np.abs(cross)
+        across = 1 - pad.layout.family(fibre)
+        distance = pad.layout.size_mm[across] / 2 - np.abs(line[:, across])
         worst = int(np.argmin(distance))
         if distance[worst] < limit:
             found.append(Violation("border_mm", (fibre + 1,), float(distance[worst]), limit, _place(line[worst])))
     return found
 
 
+def _keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, limit: float) -> list[Violation]:
+    """The place of every fibre that is nearest to each polygon, or the middle of the longest way through it."""
+    found = []
+    for polygon in shapely.transform(keep_outs(size), pad.to_mm):
+        for fibre, line in enumerate(lines):
+            curve = shapely.LineString(line)
+            between = shapely.shortest_line(curve, polygon)
+            inside = curve.intersection(polygon)
+            if not inside.is_empty:
+                longest = max(shapely.get_parts(inside), key=lambda part: part.length)
+                place = longest.interpolate(0.5, normalized=True)
+                found.append(Violation("keep_out_mm", (fibre + 1,), 0.0, limit, (place.x, place.y)))
+            elif between.length < limit:
+                found.append(
+                    Violation("keep_out_mm", (fibre + 1,), between.length, limit, _place(np.array(between.coords[0])))
+                )
+    return found
+
+
 def _lengths(pad: Morphology, limit: float) -> list[Violation]:
-    long = lengths(pad) * pad.pitch_mm
+    long = lengths(pad) * pad.unit_mm
     return [Violation("max_length_mm", (int(f) + 1,), float(long[f]), limit) for f in np.flatnonzero(long > limit)]
 
 

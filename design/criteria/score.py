@@ -6,6 +6,8 @@ from dataclasses import asdict
 from design.common.errors import InputError, instance
 from design.common.settings import or_default
 from design.pad.contact import boustrophedon, lattice, signals
+from design.pad.courses.keep_out import outside
+from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import (
     NOISE,
@@ -14,8 +16,6 @@ from design.settings import (
     PadSettings,
     RulesSettings,
     SearchSettings,
-    Sensed,
-    sensed_rectangle,
 )
 
 from .fibre_loss import loss_masks, loss_shares
@@ -28,28 +28,41 @@ MOST_PAIRS = 2**29
 
 
 def ambiguities(
-    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, sensed_mm: Sensed = "beyond"
+    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
     """Localisation ambiguity (formula of `ambiguity`) with 0, 1, ... fibres lost, grid units, on a grid of presses.
 
     Args:
         lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
-        sensed_mm: what is pressed (`PadSettings`).
+        size: says what is pressed.
     """
     import torch
 
     from .ambiguity import ambiguity, full_scale
 
-    presses = lattice(sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm), SIDE)
+    presses = free_presses(size)
     found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
     places = torch.tensor(presses, dtype=torch.float32)
-    fibres = 2 * pad.grid
+    fibres = len(pad.knots)
     spread = []
     for k in range(min(len(loss_shares(lost)), fibres)):
         kept = torch.tensor(loss_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)
         equal = torch.full((len(kept),), 1 / len(kept))
         spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
     return spread
+
+
+def free_presses(size: PadSettings) -> Array:
+    """(Q, 2) up to SIDE x SIDE places over what is pressed, grid units, that lie in no keep-out.
+
+    Raises:
+        InputError: there is none.
+    """
+    presses = lattice(size.sensed, SIDE)
+    presses = presses[outside(presses, size)]
+    if not len(presses):
+        raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
+    return presses
 
 
 def ambiguity_terms(spread: Sequence[float]) -> dict[str, float]:
@@ -63,7 +76,7 @@ def score(
     lost: int | tuple[float, ...] = 3,
     noise: float = NOISE,
     rules: RulesSettings | None = None,
-    sensed_mm: Sensed = "beyond",
+    size: PadSettings | None = None,
 ) -> dict[str, float]:
     """Every term of a pad, by name.
 
@@ -73,8 +86,8 @@ def score(
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
     (`published_objective`), of the published contact where `contact` is a measured one.
 
-    Presses are where `sensed_mm` says (`PadSettings`), those of the information and of the published terms between the
-    outermost fibres, as published.
+    Presses are where `size` says, whose layout is the pad's whatever it says of that; those of the information and of
+    the published terms between the outermost fibres, as published.
 
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.
@@ -82,12 +95,12 @@ def score(
     from .penalties import PER_SPAN
 
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
-    size = PadSettings(grid=instance("pad", pad, Morphology).grid, pitch_mm=pad.pitch_mm, sensed_mm=sensed_mm)
+    size = or_default("size", size, PadSettings).of(instance("pad", pad, Morphology).layout)
     asked = SearchSettings(lost=lost, noise=noise)
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:
         raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
-    return all_terms(pad, ambiguities(pad, contact, asked.lost, asked.noise, sensed_mm), contact, rules, size)
+    return all_terms(pad, ambiguities(pad, contact, asked.lost, asked.noise, size), contact, rules, size)
 
 
 def all_terms(
@@ -101,7 +114,7 @@ def all_terms(
     from .ambiguity import sharpness
     from .penalties import penalties
 
-    serpentine = boustrophedon(pad.grid, 32, 5 / 49, rectangle=size.sensed)
+    serpentine = boustrophedon(size.sensed, 32, 5 / 49)
     found = signals(pad, serpentine, contact)
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     broken = penalties(travel, cross, size, rules)

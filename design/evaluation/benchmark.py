@@ -32,7 +32,7 @@ def trials() -> Iterator[harness.BenchTrial]:
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
             trial = PressSets.of(pad, 32, 2000, 0, partial(signals, pad))
-            losses = lost_subsets(2 * pad.grid, LOST, SETS)
+            losses = lost_subsets(len(pad.knots), LOST, SETS)
             judge = partial(_judge, trial, losses)
             yield harness.BenchTrial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)
             yield harness.BenchTrial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)

@@ -55,7 +55,7 @@ def errors_by_contact(
     seed = whole("seed", seed, 0, 2**64 - 1)
     fibres = len(pad.knots)
     losses = [lost_subsets(fibres, lost, SUBSETS) for lost in range(min(LOST, fibres - 1) + 1)]
-    pads = {"designed": pad, "straight": Morphology.straight(pad.grid, pad.pitch_mm)}
+    pads = {"designed": pad, "straight": Morphology.straight(pad.layout)}
     return [
         ContactErrors(called, name, tuple(_sets(each, contact, sensed_mm, seed).loss_errors(losses, HIDDEN)))
         for called, contact in contacts.items()

@@ -24,7 +24,7 @@ from design.criteria.fibre_loss import loss_masks, loss_shares
 from design.pad.contact import signals as exact_signals
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import Contact, Rectangle, Sensed, sensed_rectangle
+from design.settings import Contact, PadSettings, Rectangle
 
 SIDE, WINDOW = 14, 5.0
 """Presses along a side of a lattice, and the longest side, grid units: presses further apart are seldom confused."""
@@ -39,21 +39,20 @@ LEAST = 1e-8
 
 
 def expected_errors(
-    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, sensed_mm: Sensed = "beyond"
+    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
     """Expected error (formula of this module) with 0, 1, ... fibres lost, grid units, always by the same presses.
 
     Args:
         lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
-        sensed_mm: what is pressed (`PadSettings`).
+        size: says what is pressed.
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
-    rectangle = sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm)
     levels = range(min(len(loss_shares(lost)), fibres))
     masks = [torch.tensor(loss_masks(fibres, k, MOST_LOSSES)) for k in levels]
     errors = np.zeros((PAIRS, len(masks)))
     for pair in errors:
-        places, step = two_lattices(rectangle, rng)
+        places, step = two_lattices(size.sensed, rng)
         found = torch.tensor(exact_signals(pad, places, contact).T)
         white = torch.tensor(rng.standard_normal(found.shape))
         given = found / full_scale(found), torch.tensor(places), torch.tensor(step)
@@ -102,10 +101,10 @@ def expected_error(
     """Mean of G + C of the module's formula over losses, a scalar in grid units with gradient by the signals.
 
     Args:
-        signals: (2M, 2Q) in full scales, for the presses of two lattices of Q = side^2 one after the other.
+        signals: (F, 2Q) in full scales, for the presses of two lattices of Q = side^2 one after the other.
         places: (2Q, 2), grid units. step: (2,) between neighbours of a lattice, grid units.
-        kept: (L, 2M), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
-        noise: (2M, 2Q) standard normal. sigma: of the noise, in full scales, > 0.
+        kept: (L, F), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
+        noise: (F, 2Q) standard normal. sigma: of the noise, in full scales, > 0.
     """
     found, where = signals.T.double(), places.double()
     count = len(found) // 2
@@ -117,7 +116,7 @@ def expected_error(
 
 
 def _rates(signals: Tensor, step: Tensor) -> Tensor:
-    """(P, 2M, 2) by how much signals (Q, 2M) on a lattice change by x and y, by differences over each of its cells."""
+    """(P, F, 2) by how much signals (Q, F) on a lattice change by x and y, by differences over each of its cells."""
     side = math.isqrt(len(signals))
     a, b, c, d = (
         signals.view(side, side, -1)[rows, columns]
@@ -129,14 +128,14 @@ def _rates(signals: Tensor, step: Tensor) -> Tensor:
 
 
 def _bound(rates: Tensor, kept: Tensor, size: Tensor) -> Tensor:
-    """(L,) C for rates (P, 2M, 2) in units of the noise."""
+    """(L,) C for rates (P, F, 2) in units of the noise."""
     known = torch.einsum("lk,qki,qkj->lqij", kept, rates, rates) + torch.diag(12 / size**2)
     trace = known[..., 0, 0] + known[..., 1, 1]
     return (trace / (known[..., 0, 0] * known[..., 1, 1] - known[..., 0, 1] ** 2)).sqrt().mean(dim=1)
 
 
 def _regression(noisy: Tensor, places: Tensor, count: int) -> Tensor:
-    """(L,) G for noisy signals (L, 2Q, 2M): the first `count` presses are learnt, the others asked for."""
+    """(L,) G for noisy signals (L, 2Q, F): the first `count` presses are learnt, the others asked for."""
     learnt, asked = noisy[:, :count], noisy[:, count:]
     known = torch.exp(_squares(learnt, learnt) / (-2 * WIDTH**2)) + RIDGE * torch.eye(count, dtype=noisy.dtype)
     weights = torch.cholesky_solve(places[:count].expand(len(noisy), -1, -1), torch.linalg.cholesky(known))

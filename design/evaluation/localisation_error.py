@@ -14,8 +14,8 @@ from design.common.settings import or_default
 from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import boustrophedon, signals
 from design.pad.knots import Array
-from design.pad.morphology import MOST_GRID, Morphology
-from design.settings import PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from design.pad.morphology import Morphology
+from design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 from .levenberg_marquardt import Network, best_device, fit_many
 
@@ -79,10 +79,10 @@ def localisation_error(
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
     test, hidden = whole("test", test, 1, MOST_PRESSES), whole("hidden", hidden, 1, 1000)
     seed, contact = whole("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    fibres = 2 * instance("pad", pad, Morphology).grid
+    fibres = len(instance("pad", pad, Morphology).knots)
     if not isinstance(lost, Sequence) or isinstance(lost, str):
         raise InputError(f"lost is {shown(lost)}, expected numbers of lost fibres")
-    levels = [number for number in lost if whole("lost", number, 0, 2 * MOST_GRID) < fibres]
+    levels = [number for number in lost if whole("lost", number, 0, 2 * MOST_FIBRES) < fibres]
     sets = [math.comb(fibres, number) for number in levels]
     if subsets is not None:
         sets = [min(all_of_them, whole("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]
@@ -128,9 +128,8 @@ class PressSets:
         Args:
             answer: gives the signals (Q, C) for places (Q, 2) in grid units.
         """
-        rectangle = sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm)
-        learned = training_presses(pad.grid, side, seed, rectangle)
-        fresh = fresh_presses(pad.grid, test, seed, rectangle)
+        rectangle = sensed_rectangle(pad.layout, sensed_mm)
+        learned, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
         return cls(learned, answer(learned), fresh, answer(fresh), seed)
 
     def loss_errors(self, losses: Sequence[Sequence[Loss]], hidden: int) -> list[LossError]:
@@ -171,14 +170,13 @@ class PressSets:
         return np.setdiff1d(np.arange(self.recorded.shape[1]), loss)
 
 
-def training_presses(grid: int, side: int, seed: int, rectangle: Rectangle | None = None) -> Array:
-    """(side^2, 2) presses of a jittered serpentine over a rectangle, grid units: between the fibres if None."""
+def training_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
+    """(side^2, 2) presses of a jittered serpentine over a rectangle, grid units."""
     jitter_seed = int(np.random.default_rng([0, seed]).integers(2**32))
-    rectangle = rectangle or sensed_rectangle(grid, 1.0, "fibres")
-    return boustrophedon(grid, side, JITTER, jitter_seed, rectangle)
+    return boustrophedon(rectangle, side, JITTER, jitter_seed)
 
 
-def fresh_presses(grid: int, count: int, seed: int, rectangle: Rectangle | None = None) -> Array:
-    """(count, 2) presses drawn uniformly over a rectangle, grid units: between the fibres if None."""
-    low, high = rectangle or sensed_rectangle(grid, 1.0, "fibres")
+def fresh_presses(rectangle: Rectangle, count: int, seed: int) -> Array:
+    """(count, 2) presses drawn uniformly over a rectangle, grid units."""
+    low, high = rectangle
     return np.random.default_rng([1, seed]).uniform(low, high, (count, 2))

@@ -39,9 +39,11 @@ class GeneticSearch:
         search, origin = problem.search, problem.origin
         self.step, self.objective = 0, math.inf
         self._history: list[tuple[int, float]] = []
-        self._generations, self._pitch_mm = search.generations, problem.pad.pitch_mm
+        self._generations = search.generations
         self._problem = _PublishedProblem(problem)
-        sampling = _FirstGeneration(None if origin is None else refine(origin.knots, search.knots)[:, 1:-1])
+        sampling = _FirstGeneration(
+            None if origin is None else refine(origin.knots, search.knots, problem.pad.layout)[:, 1:-1]
+        )
         self._algorithm: Any = GA(pop_size=search.population, sampling=sampling, repair=_InOrder())
         self._algorithm.setup(self._problem, termination=NoTermination(), seed=search.seed)
         self._algorithm.pop = Population.empty()
@@ -71,7 +73,7 @@ class GeneticSearch:
         """The best pad so far; there is one once the first generation is done."""
         # Survivors are the best of parents and offspring, so the best pad ever is among them.
         x, objective = self._algorithm.pop.get("X", "F")
-        return Morphology(self._problem.fibres(x[objective.argmin()][None])[0], self._pitch_mm)
+        return Morphology.of_layout(self._problem.fibres(x[objective.argmin()][None])[0], self._problem.layout)
 
     def state(self) -> State:
         """All that the next generations depend on, as arrays.
@@ -102,21 +104,26 @@ class GeneticSearch:
 
 
 class _PublishedProblem(PymooProblem):
-    """4 M N free coordinates within the pad, one objective, evaluated a whole generation at a time."""
+    """2 F N free coordinates within the pad, one objective, evaluated a whole generation at a time."""
 
     def __init__(self, problem: SearchProblem) -> None:
-        grid = problem.pad.grid
-        self.shape = (2 * grid, problem.search.knots, 2)
-        self.limits = MARGIN, grid + 1 - MARGIN
+        self.layout = problem.pad.layout
+        self.shape = (self.layout.fibres, problem.search.knots, 2)
+        least, most = (
+            np.broadcast_to(each, self.shape).ravel() for each in (MARGIN, np.array(self.layout.extent) - MARGIN)
+        )
         self.contact = problem.contacts[0]
-        super().__init__(n_var=int(np.prod(self.shape)), n_obj=1, xl=self.limits[0], xu=self.limits[1])
+        self.limits = least, most
+        super().__init__(n_var=len(least), n_obj=1, xl=least, xu=most)
 
     def fibres(self, x: Array) -> Array:
-        """(P, 2M, N+2, 2) knots of a generation x (P, 4MN)."""
-        return assemble(x.reshape(-1, *self.shape))
+        """(P, F, N+2, 2) knots of a generation x (P, 2FN)."""
+        return assemble(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
-        out["F"] = np.array([[terms.objective] for terms in published_terms(self.fibres(x), self.contact)])
+        out["F"] = np.array(
+            [[terms.objective] for terms in published_terms(self.fibres(x), self.contact, layout=self.layout)]
+        )
 
 
 class _FirstGeneration(FloatRandomSampling):
@@ -126,7 +133,7 @@ class _FirstGeneration(FloatRandomSampling):
     have, that most generations go into setting that right (the C of formula (5)).
 
     Args:
-        origin: (2M, N, 2) inner knots of one pad, the others being scattered about them; None to scatter the cross
+        origin: (F, N, 2) inner knots of one pad, the others being scattered about them; None to scatter the cross
             coordinates about each fibre's own level.
     """
 
@@ -140,10 +147,10 @@ class _FirstGeneration(FloatRandomSampling):
         x = super()._do(problem, n_samples, random_state=random_state)
         near = x[: n_samples // 2].reshape(-1, *problem.shape)  # a view
         if self.origin is None:
-            grid = problem.shape[0] // 2
-            level = np.arange(1, grid + 1)[:, None]
-            for cross in (near[:, :grid, :, 1], near[:, grid:, :, 0]):
-                cross[:] = random_state.normal(level, AROUND_LEVEL, cross.shape)
+            level = problem.layout.levels[:, None]
+            for family, rows in enumerate(problem.layout.families):
+                cross = near[:, rows, :, 1 - family]
+                cross[:] = random_state.normal(level[rows], AROUND_LEVEL, cross.shape)
         else:
             near[:] = random_state.normal(self.origin, AROUND_ORIGIN, near.shape)
             near[0] = self.origin
@@ -159,4 +166,4 @@ class _InOrder(Repair):
 
     def _do(self, problem: _PublishedProblem, X: Array, **kwargs: object) -> Array:
         inner = problem.fibres(X)[..., 1:-1, :]
-        return np.clip(inner, *problem.limits).reshape(X.shape)
+        return np.clip(inner.reshape(X.shape), *problem.limits)

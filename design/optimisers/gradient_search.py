@@ -20,9 +20,9 @@ from design.criteria.ambiguity import ambiguity, full_scale, sharpness
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
-from design.criteria.rules import check_rules
 from design.evaluation.expected_error import SIDE, balanced, cells, expected_error, two_lattices
 from design.pad.contact import boustrophedon, signals
+from design.pad.courses.keep_out import outside
 from design.pad.morphology import Morphology
 from design.settings import Rectangle
 
@@ -41,7 +41,7 @@ REPAIR_RATE, REPAIR_FASTER, REPAIR_FASTEST = 0.002, 1.15, 0.01  # gentle at firs
 
 SignalsAt = Callable[[NDArray[np.float64]], Tensor]
 Measure = Callable[[SignalsAt, float], Tensor]
-"""What a step minimises, by the signals (2M, Q) at presses (Q, 2) and the noise, share of full scale."""
+"""What a step minimises, by the signals (F, Q) at presses (Q, 2) and the noise, share of full scale."""
 
 
 class GradientSearch:
@@ -64,14 +64,14 @@ class GradientSearch:
         if state is None:
             nearly = search.method == "error" and problem.origin is None
             course = (
-                nearly_straight(pad.grid, search.knots, self.rng)
+                nearly_straight(pad, rules, search.knots, self.rng)
                 if nearly
                 else first_course(pad, rules, search.knots, problem.origin, start, self.rng)
             )
-            self.fibres = Fibres.through(course, border_of(pad, rules))
+            self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
             # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
-            presses = boustrophedon(pad.grid, SCALE_SIDE, rectangle=pad.sensed)
-            self.scale = full_scale(torch.tensor(signals(self.fibres.knots()[None], presses, problem.contacts[0])[0].T))
+            presses = boustrophedon(pad.sensed, SCALE_SIDE)
+            self.scale = full_scale(torch.tensor(signals(self.morphology(), presses, problem.contacts[0]).T))
             self._optimiser = self._adam()
         else:
             self._restore(state)
@@ -93,7 +93,7 @@ class GradientSearch:
 
     def morphology(self) -> Morphology:
         """The fibres as they are."""
-        return Morphology(self.fibres.knots(), self.problem.pad.pitch_mm)
+        return Morphology.of_layout(self.fibres.knots(), self.fibres.layout)
 
     def state(self) -> State:
         """Everything the rest of the search depends on, as arrays."""
@@ -114,7 +114,9 @@ class GradientSearch:
 
     def _restore(self, state: State) -> None:
         floor, border, self.scale = state["fixed"].tolist()
-        self.fibres = Fibres(torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border)
+        self.fibres = Fibres(
+            self.problem.pad.layout, torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border
+        )
         step, self.objective = state["progress"].tolist()
         self.step, self.done = int(step), bool(state["done"])
         self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
@@ -184,10 +186,12 @@ class GradientSearch:
         measure = self._expected_error() if search.method == "error" else self._ambiguity()
         total = torch.zeros((), device=search.device)
         for contact in self.problem.contacts:
-            total = total + measure(partial(press_signals, travel, cross, slope, contact=contact), noise)
+            total = total + measure(
+                partial(press_signals, travel, cross, slope, contact=contact, ends=self.fibres.ends), noise
+            )
             if search.sharpness > 0:
-                serpentine = boustrophedon(pad.grid, SIDE, rectangle=pad.sensed)
-                in_order = press_signals(travel, cross, slope, serpentine, contact)
+                serpentine = boustrophedon(pad.sensed, SIDE)
+                in_order = press_signals(travel, cross, slope, serpentine, contact, self.fibres.ends)
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
 
@@ -195,7 +199,9 @@ class GradientSearch:
         """The ambiguity on presses and losses drawn once for all contacts of a step."""
         search, pad = self.problem.search, self.problem.pad
         places = stratified(pad.sensed, self.rng)
-        kept, weight = draw_losses(2 * pad.grid, loss_shares(search.lost), self.rng)
+        free = places[outside(places, pad)]
+        places = free if len(free) else places  # a keep-out may take up the whole part that is looked at
+        kept, weight = draw_losses(pad.layout.fibres, loss_shares(search.lost), self.rng)
         there, losses, shares = (
             torch.tensor(x, dtype=torch.float32, device=search.device) for x in (places, kept, weight)
         )
@@ -214,8 +220,8 @@ class GradientSearch:
         search, pad = self.problem.search, self.problem.pad
         own = self.step / search.steps
         places, step = two_lattices(pad.sensed, self.rng)
-        kept, weight = draw_losses(2 * pad.grid, balanced(loss_shares(search.lost)), self.rng)
-        white = self.rng.standard_normal((2 * pad.grid, len(places)))
+        kept, weight = draw_losses(pad.layout.fibres, balanced(loss_shares(search.lost)), self.rng)
+        white = self.rng.standard_normal((pad.layout.fibres, len(places)))
         there, apart, losses, shares, heard = (
             torch.tensor(x, device=search.device) for x in (places, step, kept, weight, white)
         )
@@ -228,8 +234,7 @@ class GradientSearch:
         return measure
 
     def _broken(self) -> bool:
-        rules = self.problem.rules
-        return rules.enforce and bool(check_rules(self.morphology(), rules))
+        return bool(self.problem.broken(self.morphology()))
 
 
 def stratified(rectangle: Rectangle, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -5,9 +5,10 @@ import torch
 from torch import Tensor
 
 from design.pad.courses.curves import refine
-from design.pad.knots import MARGIN, Array, assemble
+from design.pad.courses.passing import passing, straight_course
+from design.pad.knots import MARGIN, Array, assemble, axes, kernel_ends
 from design.pad.morphology import Morphology
-from design.settings import PadSettings, RulesSettings
+from design.settings import Layout, PadSettings, RulesSettings
 
 KNOTS_PER_TURN = 3  # before, at and after: a turn of given radius needs its shoulders
 STRAIGHT_START = 3  # the last of the default's: zigzags more often lead to the better pad
@@ -20,111 +21,120 @@ class Fibres:
     Travel coordinates are running sums of a softmax with a floor under every span, cross coordinates a sigmoid.
 
     Attributes:
-        spans: (2M, N+1) logits of the spans. cross: (2M, N) logits of the cross coordinates; leaves with gradient.
+        layout: where they end.
+        spans: (F, N+1) logits of the spans. cross: (F, N) logits of the cross coordinates; leaves with gradient.
         floor: least span, grid units. border: least cross distance of a knot to the border, grid units.
     """
 
-    def __init__(self, spans: Tensor, cross: Tensor, floor: float, border: float) -> None:
+    def __init__(self, layout: Layout, spans: Tensor, cross: Tensor, floor: float, border: float) -> None:
+        self.layout, self.floor, self.border = layout, floor, border
         self.spans, self.cross = (x.detach().clone().requires_grad_() for x in (spans, cross))
-        self.floor, self.border = floor, border
-        grid = len(spans) // 2
-        self.extent = float(grid + 1)
-        self.level = torch.arange(1, grid + 1, dtype=torch.float64).repeat(2)[:, None]
+        self.ends = kernel_ends(layout)
+        along, across = _sides(layout)
+        self._along, self._across, self._level = (
+            torch.tensor(each)[:, None] for each in (along, across, layout.levels)
+        )
 
     @classmethod
-    def through(cls, knots: Array, border: float) -> "Fibres":
-        """Variables of the fibres through knots (2M, N+2, 2); knots within `border` of the border are moved off."""
-        grid, count = len(knots) // 2, knots.shape[1] - 1
-        extent = grid + 1.0
-        travel = np.concatenate([knots[:grid, :, 0], knots[grid:, :, 1]])
-        across = np.concatenate([knots[:grid, 1:-1, 1], knots[grid:, 1:-1, 0]])
+    def through(cls, knots: Array, layout: Layout, border: float) -> "Fibres":
+        """Variables of the fibres through knots (F, N+2, 2); knots within `border` of the border are moved off."""
+        travel, across = (axis[0] for axis in axes(knots[None], layout.horizontals))
         width = np.diff(travel, axis=1)
-        floor = min(0.1 * extent / count, 0.5 * float(width.min()))
-        unit = np.clip((across - border) / (extent - 2 * border), 0.005, 0.995)
-        return cls(torch.tensor(np.log(width - floor)), torch.tensor(np.log(unit / (1 - unit))), floor, border)
+        floor = min(0.1 * min(layout.extent) / (knots.shape[1] - 1), 0.5 * float(width.min()))
+        unit = np.clip((across[:, 1:-1] - border) / (_sides(layout)[1][:, None] - 2 * border), 0.005, 0.995)
+        spans, cross = np.log(width - floor), np.log(unit / (1 - unit))
+        return cls(layout, torch.tensor(spans), torch.tensor(cross), floor, border)
 
     def axes(self) -> tuple[Tensor, Tensor]:
-        """Travel and cross coordinates of all knots, ends included, both (2M, N+2)."""
+        """Travel and cross coordinates of all knots, ends included, both (F, N+2)."""
         count = self.spans.shape[1]
-        width = self.floor + (self.extent - count * self.floor) * self.spans.softmax(dim=1)
+        width = self.floor + (self._along - count * self.floor) * self.spans.softmax(dim=1)
         start = torch.zeros_like(width[:, :1])
-        travel = torch.cat([start, width.cumsum(dim=1)[:, :-1], start + self.extent], dim=1)
-        cross = self.border + (self.extent - 2 * self.border) * self.cross.sigmoid()
-        return travel, torch.cat([self.level, cross, self.level], dim=1)
+        travel = torch.cat([start, width.cumsum(dim=1)[:, :-1], start + self._along], dim=1)
+        cross = self.border + (self._across - 2 * self.border) * self.cross.sigmoid()
+        return travel, torch.cat([self._level, cross, self._level], dim=1)
 
     def knots(self) -> Array:
-        """(2M, N+2, 2) knots as `Morphology` holds them."""
+        """(F, N+2, 2) knots as `Morphology` holds them."""
         with torch.no_grad():
             travel, cross = (x.numpy() for x in self.axes())
-        grid = len(travel) // 2
         inner = np.stack([travel, cross], axis=-1)[:, 1:-1]
-        inner[grid:] = inner[grid:, :, ::-1]
-        return assemble(inner)
+        inner[self.layout.horizontals :] = inner[self.layout.horizontals :, :, ::-1]
+        return assemble(inner, self.layout)
+
+
+def _sides(layout: Layout) -> tuple[Array, Array]:
+    """(F,) length of the pad along each fibre, and across it, grid units."""
+    along = np.repeat(layout.extent, layout.counts)
+    return along, np.repeat(layout.extent[::-1], layout.counts)
 
 
 def border_of(pad: PadSettings, rules: RulesSettings) -> float:
     """Least cross distance of a knot to the border, grid units."""
-    wanted = rules.border_mm / pad.pitch_mm if rules.enforce else 0.0
-    return min(max(MARGIN, wanted), WIDEST_BORDER * (pad.grid + 1))
+    wanted = rules.border_mm / pad.layout.unit_mm if rules.enforce else 0.0
+    return min(max(MARGIN, wanted), WIDEST_BORDER * min(pad.layout.extent))
 
 
 def first_course(
     pad: PadSettings, rules: RulesSettings, knots: int, origin: Morphology | None, start: int, rng: np.random.Generator
 ) -> Array:
-    """Knots (2M, N+2, 2) a start of the search begins with.
+    """Knots (F, N+2, 2) a start of the search begins with.
 
     Without an origin each start has its own zigzag, but start 3, which has straight fibres. With one, start 0 has its
     very course, later ones have it with knots moved by a tenth of a grid unit or so. So are those of straight fibres:
-    where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no gradient to follow.
+    where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no gradient to follow. Both pass by
+    keep-outs.
     """
-    if origin is None and start == STRAIGHT_START:
-        origin = Morphology.straight(pad.grid)
-    if origin is None:
-        return _zigzag(pad, rules, knots, rng)
-    refined = refine(origin.knots, knots)
-    if start == 0 and len(origin.knots[0]) > 2:
+    layout = pad.layout
+    if origin is None and start != STRAIGHT_START:
+        return passing(_zigzag(layout, rules, knots, rng), pad, rules)
+    refined = straight_course(pad, rules, knots) if origin is None else refine(origin.knots, knots, layout)
+    if origin is not None and start == 0 and len(origin.knots[0]) > 2:
         return refined
     inner = refined[:, 1:-1] + 0.1 * rng.standard_normal(refined[:, 1:-1].shape)
-    return assemble(np.clip(inner, MARGIN, pad.grid + 1 - MARGIN))
+    return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
 
 
-def nearly_straight(grid: int, knots: int, rng: np.random.Generator) -> Array:
-    """Knots (2M, N+2, 2) of straight fibres, moved crosswise by a tenth of a grid unit or so."""
-    course = refine(Morphology.straight(grid).knots, knots)
+def nearly_straight(pad: PadSettings, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
+    """Knots (F, N+2, 2) of straight fibres, moved crosswise by a tenth of a grid unit or so."""
+    layout, course = pad.layout, straight_course(pad, rules, knots)
     crosswise = 0.1 * rng.standard_normal(course[:, 1:-1, 0].shape)
     inner = course[:, 1:-1].copy()
-    inner[:grid, :, 1] += crosswise[:grid]
-    inner[grid:, :, 0] += crosswise[grid:]
-    return assemble(np.clip(inner, MARGIN, grid + 1 - MARGIN))
+    for axis, rows in enumerate(layout.families):
+        inner[rows, :, 1 - axis] += crosswise[rows]
+    return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
 
 
-def _zigzag(pad: PadSettings, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
+def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
     """A random zigzag each family runs side by side: nothing crosses within a family, and every turn is round.
 
     PCHIP has slope 0 at a turn, so that one knot alone bends sharper the higher the flanks; with shoulders
     beside it the flanks may be as steep as they like.
     """
-    grid, extent = pad.grid, pad.grid + 1.0
-    radius = rules.min_bend_radius_mm / pad.pitch_mm if rules.enforce else 0.0
-    most = max(1, int(extent / (4 * radius))) if radius > 0 else knots
+    radius = rules.min_bend_radius_mm / layout.unit_mm if rules.enforce else 0.0
     per_turn = KNOTS_PER_TURN if radius > 0 and knots >= 2 * KNOTS_PER_TURN else 1
+    along = [extent for extent, count in zip(layout.extent, layout.counts, strict=True) if count]
+    most = max(1, int(min(along) / (4 * radius))) if radius > 0 else knots
     turns = max(1, min(knots // per_turn, most))
-    pitch = extent / (turns + 1)
-    shoulder = float(np.clip(0.8 * radius, 0.1 * pitch, 0.25 * pitch))
-    level = np.arange(1.0, grid + 1)[:, None]
     fibres = []
-    for _ in range(2):
+    for axis, rows in enumerate(layout.families):
+        width, pitch, level = layout.extent[1 - axis], layout.extent[axis] / (turns + 1), layout.levels[rows, None]
+        shoulder = float(np.clip(0.8 * radius, 0.1 * pitch, 0.25 * pitch))
         along = pitch * (np.arange(1, turns + 1) + 0.12 * rng.standard_normal(turns))
         side = np.where(np.arange(turns) % 2 == 0, 1, -1) * rng.choice([-1, 1])
         swing = 0.6 * side * rng.uniform(0.5, 1.2, turns)
-        peak = extent / 2 + 0.7 * (level - extent / 2) + swing + 0.1 * rng.standard_normal((grid, turns))
+        short = min(1.0, layout.extent[axis] / width)  # fibres shorter than the pad is wide have less room to turn
+        towards = width / 2 + (1 - 0.3 * short) * (level - width / 2)
+        peak = towards + short * swing + 0.1 * rng.standard_normal((len(level), turns))
         peak = np.sort(peak, axis=0)
-        turn = np.sort(along + 0.02 * rng.standard_normal((grid, turns)), axis=1)
+        turn = np.sort(along + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
         whole = np.concatenate([level, peak, level], axis=1)
         drop = np.clip(0.12 * np.stack([peak - whole[:, :-2], peak - whole[:, 2:]]), -0.1, 0.1)
         parts = [(turn - shoulder, peak - drop[0]), (turn, peak), (turn + shoulder, peak - drop[1])]
         chosen = parts if per_turn == KNOTS_PER_TURN else parts[1:2]
-        travel, cross = (np.stack([part[i] for part in chosen], axis=-1).reshape(grid, -1) for i in (0, 1))
-        fibres.append(np.stack([travel, cross] if len(fibres) == 0 else [cross, travel], axis=-1))
-    inner = np.clip(np.concatenate(fibres), 0.02, extent - 0.02)
-    return refine(assemble(inner), knots)
+        travel, cross = (
+            np.stack([part[i] for part in chosen], axis=-1).reshape(len(level), turns * len(chosen)) for i in (0, 1)
+        )
+        fibres.append(np.stack([travel, cross] if axis == 0 else [cross, travel], axis=-1))
+    inner = np.clip(np.concatenate(fibres), 0.02, np.array(layout.extent) - 0.02)
+    return refine(assemble(inner, layout), knots, layout)

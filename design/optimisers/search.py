@@ -6,13 +6,10 @@ nothing of that changes what it finds.
 """
 
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,27 +19,26 @@ import numpy as np
 from design.common import profiling
 from design.common.checkpoints import Checkpoints, State
 from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import MOST_VALUES, InputError, instance, real, shown
+from design.common.errors import InputError, instance, real, shown
 from design.common.errors import path as as_path
 from design.common.settings import or_default
 from design.criteria.fibre_loss import loss_shares
-from design.criteria.rules import Violation, check_rules
+from design.criteria.rules import Violation
 from design.criteria.score import all_terms, ambiguities, ambiguity_terms
 from design.evaluation.expected_error import balanced, error_terms, expected_errors
-from design.pad.courses.curves import refine
+from design.pad.courses.passing import straight_course
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-from .problem import SearchProblem
+from .problem import SearchProblem, posed
 from .start import StartSlice, advance_start, finish
+from .stopping import Stop, stopped_by_interrupt
 
 SearchListener = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
 
 MOST_SECONDS = 1e9
 """Longest time budget: some thirty years."""
-RESERVE = 0.15  # share of a time budget kept for repairing
-MENDING_S = 3.0  # of repair after Ctrl-C
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class SearchRun:
 
     Attributes:
         report: hears of each start's progress, in the caller's thread.
-        keep_in: folder for the states of the starts; removed when the search completes.
+        keep_in: folder for the states of the starts; `Checkpoints.clear` removes them once what was found is kept.
         resume: whether to go on from the states in `keep_in`.
         time_budget: seconds after which the search ends with the best so far; None for no end.
         executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None.
@@ -119,7 +115,7 @@ def search(
     resumed; only a time budget or Ctrl-C that cuts a search short changes what it finds.
 
     Args:
-        origin: morphology to start from, of the pad's grid and at most `settings.knots` knots a fibre; random if None.
+        origin: morphology to start from, of the pad's layout, of at most `settings.knots` knots; random if None.
         run: whom it tells, what it keeps, how long it may take and on what it runs; on this machine to its end if None.
 
     Raises:
@@ -128,18 +124,18 @@ def search(
     begin = time.perf_counter()
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
     contact = or_default("contact", contact, Contact, settings.usual_contact)
-    problem = _problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
+    problem = posed(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
     run = SearchRun() if run is None else instance("run", run, SearchRun)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
     states = checkpoints.begin(run.resume) if checkpoints else {}
-    stop = _Stop(begin, run.time_budget)
+    stop = Stop(begin, run.time_budget)
     kept = sum(bool(state["done"]) for state in states.values())
     profiling.looked_at("starts", len(problem.starts) - kept, len(problem.starts))
-    with profiling.stage("search"), _stopped_by_interrupt(stop), one_torch_thread():
+    with profiling.stage("search"), stopped_by_interrupt(stop), one_torch_thread():
         _advance(problem, states, stop, run, checkpoints)
         found = _candidates(problem, states, stop)
     with profiling.stage("check and score"):
-        straight = _Judged(_straight(problem), problem)
+        straight = _Judged(_straight(problem, stop), problem)
         known = [] if origin is None else [_Judged(origin, problem)]
         if problem.search.method != "genetic":  # the published method is left as it was published
             known.append(straight)
@@ -147,80 +143,12 @@ def search(
         located = best.terms()
         spread = [value for name, value in located.items() if name.startswith("ambiguity")]
         terms = located | all_terms(best.pad, spread, problem.contacts[0], problem.rules, problem.pad)
-    if checkpoints and not stop.reason:
-        checkpoints.clear()
     told = problem.rules.enforce, _history(problem, states), time.perf_counter() - begin, stop.reason
     return SearchResult(best.pad, terms, best.broken, straight.terms(), *told)
 
 
-def _problem(
-    pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None
-) -> SearchProblem:
-    if settings.device == "cuda":
-        import torch
-
-        if not torch.cuda.is_available():
-            raise InputError("device is 'cuda', but no such device is found; allowed here is 'cpu'")
-    if settings.method == "genetic":
-        # Offspring are compared with all pads of the generation, and all their knots are held several times over.
-        room = settings.population * max(settings.population, 4 * pad.grid * settings.knots)
-        if room > MOST_VALUES // 4:
-            raise InputError(
-                f"population is {settings.population}: that takes {room} numbers for {2 * pad.grid} fibres of "
-                f"{settings.knots} knots, allowed are {MOST_VALUES // 4}"
-            )
-    if not any(loss_shares(settings.lost)[: 2 * pad.grid]):
-        raise InputError(f"lost is {settings.lost}, allowed is what leaves some of the {2 * pad.grid} fibres")
-    if origin is not None:
-        instance("origin", origin, Morphology)
-        knots = origin.knots.shape[1] - 2
-        if origin.grid != pad.grid:
-            raise InputError(
-                f"the morphology to start from has grid {origin.grid}, allowed is that of the pad, {pad.grid}"
-            )
-        if knots > settings.knots:
-            raise InputError(
-                f"knots is {settings.knots}, allowed is at least the {knots} of the morphology to start from"
-            )
-    return SearchProblem(pad, (contact, *settings.contacts), settings, rules, origin)
-
-
-class _Stop:
-    """Whether to go on: until Ctrl-C or a deadline of `time.perf_counter`."""
-
-    def __init__(self, begin: float, time_budget: float | None) -> None:
-        self.deadline = None if time_budget is None else begin + (1 - RESERVE) * time_budget
-        self.end = None if time_budget is None else begin + time_budget
-        self.reason = ""
-
-    def interrupt(self) -> None:
-        self.reason = "interrupted"
-
-    def mend_until(self) -> float:
-        """When to end the repair of the best so far."""
-        return self.end if self.reason == "out of time" and self.end else time.perf_counter() + MENDING_S
-
-    def __bool__(self) -> bool:
-        if not self.reason and self.deadline is not None and time.perf_counter() > self.deadline:
-            self.reason = "out of time"
-        return bool(self.reason)
-
-
-@contextmanager
-def _stopped_by_interrupt(stop: _Stop) -> Iterator[None]:
-    """Let Ctrl-C set `stop` instead of tearing down threads; outside the main thread, where none arrives, nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, lambda number, frame: stop.interrupt())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def _advance(
-    problem: SearchProblem, states: dict[int, State], stop: _Stop, run: SearchRun, checkpoints: Checkpoints | None
+    problem: SearchProblem, states: dict[int, State], stop: Stop, run: SearchRun, checkpoints: Checkpoints | None
 ) -> None:
     """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
 
@@ -232,14 +160,15 @@ def _advance(
     def next_slice(start: int, reached: StartSlice) -> Callable[[], StartSlice] | None:
         return None if reached.done or stop else partial(advance_start, problem, start, reached.state)
 
-    for start, reached in run_tasks(first_slices(), run.executor, then=next_slice):
+    given_up = partial(stop.given_up, elsewhere=run.executor is not None)
+    for start, reached in run_tasks(first_slices(), run.executor, then=next_slice, given_up=given_up):
         states[start] = reached.state
         if checkpoints:
             checkpoints.save(start, reached.state)
         run.report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
 
 
-def _candidates(problem: SearchProblem, states: dict[int, State], stop: _Stop) -> list[Morphology]:
+def _candidates(problem: SearchProblem, states: dict[int, State], stop: Stop) -> list[Morphology]:
     """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
     if not states:
         return [finish(problem, 0, None)]
@@ -256,10 +185,10 @@ class _Judged:
 
     def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
         self._problem, self.pad = problem, pad
-        self.broken: list[Violation] = check_rules(pad, problem.rules) if problem.rules.enforce else []
+        self.broken: list[Violation] = problem.broken(pad)
         measure = expected_errors if problem.search.method == "error" else ambiguities
-        asked, sensed_mm = (problem.search.lost, problem.search.noise), problem.pad.sensed_mm
-        self.spread = [measure(pad, contact, *asked, sensed_mm) for contact in problem.contacts]
+        asked = problem.search.lost, problem.search.noise, problem.pad
+        self.spread = [measure(pad, contact, *asked) for contact in problem.contacts]
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -274,7 +203,7 @@ class _Judged:
         if self._problem.search.method != "error":
             return self.spread[0]
         search, contact = self._problem.search, self._problem.contacts[0]
-        return ambiguities(self.pad, contact, search.lost, search.noise, self._problem.pad.sensed_mm)
+        return ambiguities(self.pad, contact, search.lost, search.noise, self._problem.pad)
 
     def terms(self) -> dict[str, float]:
         """Ambiguities, and expected errors where they are minimised, by name."""
@@ -282,10 +211,14 @@ class _Judged:
         return ambiguity_terms(self._ambiguities()) | expected
 
 
-def _straight(problem: SearchProblem) -> Morphology:
-    """Straight fibres with as many knots as those that are searched."""
-    knots = Morphology.straight(problem.pad.grid).knots
-    return Morphology(refine(knots, problem.search.knots), problem.pad.pitch_mm)
+def _straight(problem: SearchProblem, stop: Stop) -> Morphology:
+    """Straight fibres with as many knots as those that are searched, but for bows around keep-outs, as mended."""
+    size, search = problem.pad, problem.search
+    pad = Morphology.of_layout(straight_course(size, problem.rules, search.knots), size.layout)
+    if not size.keep_out_mm or not problem.broken(pad):
+        return pad
+    from_it = replace(problem, search=search.model_copy(update={"method": "descent"}), origin=pad)
+    return finish(from_it, 0, None, stop.mend_until() if stop else math.inf)
 
 
 def _name(problem: SearchProblem, start: int) -> str:

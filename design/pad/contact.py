@@ -16,9 +16,9 @@ from design.pad.kernels import press
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.published.sampled_signals import quantized_signals
-from design.settings import PUBLISHED_CONTACT, Contact, Rectangle
+from design.settings import PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
-from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes
+from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes, kernel_ends, layout_of
 from .morphology import Morphology
 
 if TYPE_CHECKING:
@@ -36,13 +36,13 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     The boundary belongs to the press: a straight fibre that runs along an edge counts with its whole length there.
 
     Args:
-        pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
+        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M.
         presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, whose signals add; where their
             shapes overlap a fibre counts once for each.
         contact: shape, weight and length; PUBLISHED_CONTACT if None.
 
     Returns:
-        (Q, 2M) signals, or (..., Q, 2M) for a population; with the default weight and length in grid units. Uniform
+        (Q, F) signals, or (..., Q, F) for a population; with the default weight and length in grid units. Uniform
         Manhattan signals are a closed form between roots found to rounding, others Gauss-Kronrod integrals to 1e-11.
 
     Raises:
@@ -53,12 +53,12 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
 
 def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
     """`signals`, and the number of spans that were looked at for them."""
-    travel, cross, batch = fibre_axes(pad)
+    travel, cross, ends, batch = fibre_axes(pad)
     flat, places = as_presses(presses, several=True)
     fibres = travel.shape[1]
     require_room(len(travel) * len(flat) * fibres)
     out = np.zeros(len(travel) * len(flat) * fibres)
-    visited = _run_exact(travel, cross, press.family_strays(cross), flat, contact, _NONE, _NONE, out)
+    visited = _run_exact(travel, cross, ends, flat, contact, _NONE, _NONE, out)
     return _summed(out, (*batch, *places, fibres)), visited
 
 
@@ -69,13 +69,13 @@ def require_room(values: int) -> None:
 
 
 def _summed(signals: Array, shape: tuple[int, ...]) -> Array:
-    """Signals in the shape (..., Q, C, 2M), summed over the C presses that were made at once."""
+    """Signals in the shape (..., Q, C, F), summed over the C presses that were made at once."""
     whole = signals.reshape(shape)
     return whole[..., 0, :] if shape[-2] == 1 else whole.sum(axis=-2)
 
 
 def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
-    """`signals` of one pad as a sparse (Q, 2M) matrix: time and memory follow what is touched, not the pad's size.
+    """`signals` of one pad as a sparse (Q, F) matrix: time and memory follow what is touched, not the pad's size.
 
     Args:
         pad, contact: as in `signals`. presses: (Q, 2) centres in grid units.
@@ -83,13 +83,13 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     from scipy.sparse import csr_array
 
     contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
-    places, strays = as_presses(presses)[0], press.family_strays(cross)
-    starts = press.count_touched(strays[0], places, press_shape(contact)[1], pad.grid)
+    travel, cross, ends, _ = fibre_axes(instance("pad", pad, Morphology))
+    places, strays = as_presses(presses)[0], press.family_strays(cross, ends)
+    starts = press.count_touched(strays[0], places, press_shape(contact)[1], ends)
     require_room(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
-    _run_exact(travel, cross, strays, places, contact, starts, fibre, signal)
-    found = csr_array((signal, fibre, starts), shape=(len(places), 2 * pad.grid))
+    _run_exact(travel, cross, ends, places, contact, starts, fibre, signal)
+    found = csr_array((signal, fibre, starts), shape=(len(places), len(pad.knots)))
     found.eliminate_zeros()
     return found
 
@@ -98,42 +98,57 @@ _NONE = np.empty(0, np.int64)
 
 
 def _run_exact(
-    travel: Array, cross: Array, strays: Array, places: Array, contact: Contact, starts: Ints, fibre: Ints, out: Array
+    travel: Array,
+    cross: Array,
+    ends: press.Ends,
+    places: Array,
+    contact: Contact,
+    starts: Ints,
+    fibre: Ints,
+    out: Array,
 ) -> int:
     """`exact_signals` over the cores."""
-    slope, shape = population_slopes(travel, cross), press_shape(contact)
+    slope, shape, strays = population_slopes(travel, cross), press_shape(contact), press.family_strays(cross, ends)
 
     def work(begin: int, end: int) -> int:
-        return exact_signals(travel, cross, slope, strays, places, *shape, begin, end, starts, fibre, out)
+        return exact_signals(travel, cross, slope, strays, ends, places, *shape, begin, end, starts, fibre, out)
 
     visited = sum(in_chunks(work, len(travel) * len(places), grain=2000))
     if profiling.is_profiling():
-        note_reach(travel, strays, places, shape[1], visited)
+        note_reach(travel, strays, ends, places, shape[1], visited)
     return visited
 
 
-def note_reach(travel: Array, strays: Array, places: Array, reach: Array, visited: int) -> None:
+def note_reach(travel: Array, strays: Array, ends: press.Ends, places: Array, reach: Array, visited: int) -> None:
     """Tell the profile how many fibres and spans were looked at, press by press."""
     pads, fibres, knots = travel.shape
-    within = sum(int(press.count_touched(each, places, reach, fibres // 2)[-1]) for each in strays)
+    within = sum(int(press.count_touched(each, places, reach, ends)[-1]) for each in strays)
     profiling.looked_at("fibres, press by press", within, pads * len(places) * fibres)
     profiling.looked_at("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
 
 
-def fibre_axes(pad: Morphology | Array) -> tuple[Array, Array, tuple[int, ...]]:
-    """Travel and cross coordinates (P, 2M, n) of a pad or a population, and the population's own shape.
+def fibre_axes(
+    pad: Morphology | Array, layout: Layout | None = None
+) -> tuple[Array, Array, press.Ends, tuple[int, ...]]:
+    """Travel and cross coordinates (P, F, n) of a pad or a population, where fibres end, and the population's shape.
+
+    Args:
+        pad: a morphology; or knots (..., F, N+2, 2), and their layout: that of a square pad if None.
 
     Raises:
-        InputError: knots that are no (..., 2M, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
+        InputError: knots that are no (..., F, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
     """
     knots = pad.knots if isinstance(pad, Morphology) else reals("knots", pad, FARTHEST)
-    if knots.ndim < 3 or knots.shape[-1] != 2 or knots.shape[-2] < 2 or knots.shape[-3] % 2 or not knots.shape[-3]:
+    layout = pad.layout if isinstance(pad, Morphology) else layout
+    fibres = knots.shape[-3] if knots.ndim >= 3 else 0
+    if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
         raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
+    ends = kernel_ends(layout_of(fibres, layout))
     # in C order, else the kernels would be compiled anew for the order of a caller's array, which takes many seconds
-    travel, cross = axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]))
+    travel, cross = axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
     if not isinstance(pad, Morphology) and not (np.diff(travel) >= LEAST_SPAN).all():
         raise InputError(f"knots do not ascend by {LEAST_SPAN:g} or more along the travel axis")
-    return travel, cross, knots.shape[:-3]
+    return travel, cross, ends, knots.shape[:-3]
 
 
 def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, press.Law]:
@@ -151,13 +166,13 @@ def signals_quantized(
     """Signals by the published rule: segments of a sampled fibre count whole if they start inside the press.
 
     Args:
-        pad: a morphology, or knots (..., 2M, N+2, 2) of a population.
+        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M.
         presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, as in `signals`.
         contact: shape and weight; PUBLISHED_CONTACT if None.
         samples: points per fibre, uniform along the travel axis, at least 2 (published: 2000).
 
     Returns:
-        (Q, 2M) signals, or (..., Q, 2M) for a population; with the default weight and length in grid units.
+        (Q, F) signals, or (..., Q, F) for a population; with the default weight and length in grid units.
 
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
@@ -170,14 +185,14 @@ def quantized_and_samples(
 ) -> tuple[Array, int]:
     """`signals_quantized`, and the number of samples that were looked at for them."""
     shape = press_shape(contact)
-    travel, cross, batch = fibre_axes(pad)
+    travel, cross, ends, batch = fibre_axes(pad)
     samples = as_samples(samples, travel.shape[1])
     places, shape_of_presses = as_presses(presses, several=True)
     require_room(len(travel) * len(places) * travel.shape[1])
     out = np.zeros((len(travel), len(places), travel.shape[1]))
 
     def work(begin: int, end: int) -> int:
-        return quantized_signals(travel, cross, places, shape, samples, begin, end, out)
+        return quantized_signals(travel, cross, ends.horizontals, places, shape, samples, begin, end, out)
 
     looked_at = sum(in_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
     return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
@@ -202,21 +217,19 @@ def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[
     return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
 
 
-def boustrophedon(
-    grid: int, side: int, jitter: float = 0.0, seed: int = 214, rectangle: Rectangle | None = None
-) -> Array:
+def boustrophedon(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
     """A serpentine of side x side presses, each moved by U(0, jitter) along both axes.
 
     Args:
-        grid: M. side: presses per row and rows, Q = side^2. jitter: grid units.
+        rectangle: over which, as `sensed_rectangle` and `between_fibres` give it.
+        side: presses per row and rows, Q = side^2. jitter: grid units.
         seed: of numpy's legacy RandomState, by which the published values are stated.
-        rectangle: over which, as `sensed_rectangle` gives it; 1..M both ways, as published, if None.
 
     Returns:
         (Q, 2) presses; x runs forth on even rows and back on odd ones, so that neighbours in order are neighbours
         in place.
     """
-    rows = lattice(rectangle or ((1, 1), (grid, grid)), side).reshape(side, side, 2)
+    rows = lattice(rectangle, side).reshape(side, side, 2)
     rows[1::2] = rows[1::2, ::-1]
     places = rows.reshape(-1, 2)
     return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter

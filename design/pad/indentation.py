@@ -98,11 +98,11 @@ class Indenter:
             return 2 * d**2 / (np.pi * self._flank)
         return 2 * self.radius * d
 
-    def force_n(self, depths: ArrayLike, pitch_mm: float, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> Array:
-        """Force in newton, of the shape of `depths`, on a pad whose grid unit is `pitch_mm`."""
-        pitch_mm = real("pitch_mm", pitch_mm, 0.1, 1000)
+    def force_n(self, depths: ArrayLike, unit_mm: float, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> Array:
+        """Force in newton, of the shape of `depths`, on a pad whose grid unit is `unit_mm`."""
+        unit_mm = real("unit_mm", unit_mm, 0.1, 1000)
         reduced_modulus_kpa = real("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
-        return self.force(depths) * pitch_mm**2 * reduced_modulus_kpa * 1e-3  # kPa mm^2 = 1e-3 N
+        return self.force(depths) * unit_mm**2 * reduced_modulus_kpa * 1e-3  # kPa mm^2 = 1e-3 N
 
     @property
     def _flank(self) -> float:
@@ -134,7 +134,7 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
         presses: (Q, 2) places of the indenter's axis, grid units. depths: (Q,) depths, or one for all, grid units.
 
     Returns:
-        (Q, 2M) lengthenings in grid units, within 3e-5 of themselves (measured against adaptive quadrature).
+        (Q, F) lengthenings in grid units, within 3e-5 of themselves (measured against adaptive quadrature).
 
     Raises:
         InputError: presses or depths of the wrong shape, not finite, or deeper than the indenter allows.
@@ -146,7 +146,7 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
     deep = np.broadcast_to(deep, len(places))
     a = np.where(deep < SHALLOWEST, 0, instance("indenter", indenter, Indenter).contact_radius(deep))
     steepness = _steepness(indenter, deep, a)
-    travel, cross, _ = fibre_axes(instance("pad", pad, Morphology))
+    travel, cross, ends, _ = fibre_axes(instance("pad", pad, Morphology))
     require_room(len(places) * travel.shape[1])
     slope = population_slopes(travel, cross)[0]
     out = np.zeros((len(places), travel.shape[1]))
@@ -154,7 +154,7 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
 
     def work(begin: int, end: int) -> None:
         shape = _SHAPES[indenter.shape]
-        lengthenings(travel[0], cross[0], slope, places, a, steepness, floor, shape, begin, end, out)
+        lengthenings(travel[0], cross[0], slope, ends.horizontals, places, a, steepness, floor, shape, begin, end, out)
 
     in_chunks(work, len(places), grain=50)
     return out

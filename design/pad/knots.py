@@ -1,9 +1,14 @@
-"""Knots: the points that fibres run through, as plain arrays (..., 2M, N+2, 2) in grid units."""
+"""Knots: the points that fibres run through, as plain arrays (..., H + V, N+2, 2) in grid units.
+
+Where no layout is told, arrays are those of a square pad of one pitch: as many horizontals as verticals, a unit apart.
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from design.common.errors import InputError, reals
+from design.pad.kernels.press import Ends
+from design.settings import Layout
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -16,26 +21,46 @@ MARGIN = 1e-3
 """Least distance of a free knot to the pad's edge, grid units, as in the published optimiser."""
 
 
-def assemble(inner: Array) -> Array:
+def layout_of(fibres: int, layout: Layout | None = None) -> Layout:
+    """The layout of so many fibres: that told, or where none is that of a square pad of one pitch.
+
+    Raises:
+        InputError: fibres of another number than those of the layout, or none, or not of two equal families.
+    """
+    if layout is None:
+        if fibres % 2 or not fibres:
+            raise InputError(f"these are {fibres} fibres, expected 2 M: as many horizontals as verticals")
+        return Layout.of(fibres // 2)
+    if fibres != layout.fibres:
+        raise InputError(f"these are {fibres} fibres, expected {layout}")
+    return layout
+
+
+def kernel_ends(layout: Layout) -> Ends:
+    """Where its fibres end, as kernels take it."""
+    return Ends(*layout.counts, *layout.spacing[::-1])
+
+
+def assemble(inner: Array, layout: Layout | None = None) -> Array:
     """Whole fibres from free knots: sort along the travel axis, keep knots apart, add the fixed ends.
 
     Args:
-        inner: (..., 2M, N, 2) knots in any order, grid units within 0..M+1.
+        inner: (..., F, N, 2) knots in any order, grid units on the pad.
+        layout: of the F fibres; a square one if None.
 
     Returns:
-        (..., 2M, N+2, 2) knots that satisfy `Morphology`. Knots at the same travel coordinate are moved apart by
+        (..., F, N+2, 2) knots that satisfy `Morphology`. Knots at the same travel coordinate are moved apart by
         the least step that keeps the curve a graph (1e-9 grid units, far below any printer).
     """
-    grid = inner.shape[-3] // 2
+    layout = layout_of(inner.shape[-3], layout)
     knots = np.empty((*inner.shape[:-2], inner.shape[-2] + 2, 2))
-    order = np.arange(1, grid + 1)
-    for family, (travel, cross) in enumerate(((0, 1), (1, 0))):
-        rows = slice(family * grid, (family + 1) * grid)
+    for travel, rows in enumerate(layout.families):
+        cross = 1 - travel
         fibres = inner[..., rows, :, :]
         rank = np.argsort(fibres[..., travel], axis=-1, kind="stable")[..., None]
         knots[..., rows, 1:-1, :] = np.take_along_axis(fibres, rank, axis=-2)
-        knots[..., rows, 0, travel], knots[..., rows, -1, travel] = 0, grid + 1
-        knots[..., rows, 0, cross] = knots[..., rows, -1, cross] = order
+        knots[..., rows, 0, travel], knots[..., rows, -1, travel] = 0, layout.extent[travel]
+        knots[..., rows, 0, cross] = knots[..., rows, -1, cross] = layout.levels[rows]
         _separate(knots[..., rows, :, travel])
     return knots
 
@@ -64,10 +89,10 @@ def of_parameters(parameters: ArrayLike) -> Array:
     return assemble(columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2))
 
 
-def axes(knots: Array) -> tuple[Array, Array]:
-    """Travel and cross coordinates (P, 2M, n) of knots (P, 2M, n, 2)."""
-    grid = knots.shape[1] // 2
+def axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
+    """Travel and cross coordinates (P, F, n) of knots (P, F, n, 2), of which so many, from the first, run along x."""
     travel, cross = (
-        np.concatenate([knots[:, :grid, :, axis], knots[:, grid:, :, 1 - axis]], axis=1) for axis in (0, 1)
+        np.concatenate([knots[:, :horizontals, :, axis], knots[:, horizontals:, :, 1 - axis]], axis=1)
+        for axis in (0, 1)
     )
     return travel, cross

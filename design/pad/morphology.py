@@ -1,7 +1,8 @@
 """The morphology of a pad: the knots its fibres run through.
 
-A pad of M x M grid units carries 2M fibres in two families. Horizontal fibre i is a curve y(x) from (0, i) to
-(M+1, i), vertical fibre i a curve x(y) from (i, 0) to (i, M+1), i = 1..M; between knots both are PCHIP curves.
+A pad of V + 1 by H + 1 pitches carries fibres in two families. Horizontal fibre i is a curve y(x) from (0, i) to
+(V+1, i), i = 1..H, vertical fibre i a curve x(y) from (i, 0) to (i, H+1), i = 1..V, in pitches; between knots both are
+PCHIP curves. Places are in grid units, equally long both ways: the pitch, or where there are two their geometric mean.
 """
 
 import json
@@ -13,16 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from design.common.errors import InputError, mapping, real, reals, shown, whole
+from design.common.errors import InputError, mapping, reals, shown, whole
 from design.common.errors import path as as_path
 from design.common.files import read_json, write_json
+from design.settings import MOST_FIBRES, Counts, Layout, Pitch
 
-from .knots import FARTHEST, LEAST_SPAN, MARGIN, Array, assemble, of_parameters
+from .knots import FARTHEST, LEAST_SPAN, MARGIN, Array, assemble
+from .knots import of_parameters as knots_of_parameters
 
-FORMAT = "padforge-morphology/1"
+SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"
+"""Of a square pad of one pitch, which every version reads, and of any other one."""
 
-MOST_GRID = 1024
-"""Most fibres of a family of a pad that is made of tiles."""
 MOST_KNOTS = 2**22
 """Most knots of a pad, over all its fibres."""
 
@@ -32,25 +34,38 @@ class Morphology:
     """The fibres of a pad.
 
     Attributes:
-        knots: (2M, N+2, 2) x and y in grid units, 0..M+1: horizontals bottom to top, then verticals left to right;
-            each fibre's knots ascend along its travel axis (x for horizontals, y for verticals), its ends are fixed.
-        pitch_mm: distance of neighbouring fibre ends, mm.
+        knots: (H + V, N+2, 2) x and y in grid units from the pad's corner: horizontals bottom to top, then verticals
+            left to right; each fibre's knots ascend along its travel axis (x for horizontals, y for verticals), its
+            ends are fixed.
+        pitch_mm: distance of neighbouring fibre ends, mm; two, along x and along y, where they differ.
         provenance: where the morphology came from; free JSON.
+        fibres: (H, V), as many horizontals as verticals if None.
 
     Raises:
         InputError: knots of the wrong shape, not finite, outside the pad, not ascending, or with ends moved.
     """
 
     knots: Array
-    pitch_mm: float = 11.25
+    pitch_mm: Pitch = 11.25
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    fibres: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         knots = reals("knots", self.knots)
-        _validate(knots)
+        if knots.ndim != 3 or knots.shape[2] != 2 or knots.shape[0] < 1 or knots.shape[1] < 2:
+            raise InputError(f"knots have shape {knots.shape}, expected (H + V, N + 2, 2)")
+        if self.fibres is None and len(knots) % 2:
+            raise InputError(f"knots have shape {knots.shape}, expected (2 M, N + 2, 2), or fibres that are told")
+        half = len(knots) // 2
+        layout = Layout.of((half, half) if self.fibres is None else self.fibres, self.pitch_mm)
+        _validate(knots, layout)
+        if not layout.is_square:
+            knots = _kept(knots, layout)
         knots.setflags(write=False)
         object.__setattr__(self, "knots", knots)
-        object.__setattr__(self, "pitch_mm", real("pitch_mm", self.pitch_mm, 0.1, 1000))
+        object.__setattr__(self, "pitch_mm", layout.pitch_mm)
+        object.__setattr__(self, "fibres", layout.counts)
+        object.__setattr__(self, "layout", layout)
         try:
             json.dumps(dict(mapping("provenance", self.provenance)), allow_nan=False)
         except (TypeError, ValueError, RecursionError) as error:
@@ -59,41 +74,57 @@ class Morphology:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Morphology):
             return NotImplemented
-        return self.pitch_mm == other.pitch_mm and np.array_equal(self.knots, other.knots)
+        return self.layout == other.layout and np.array_equal(self.knots, other.knots)
 
     __hash__ = None  # type: ignore[assignment]
 
+    layout: Layout = field(init=False, repr=False, compare=False)
+    """Where its fibres end."""
+
     @property
     def grid(self) -> int:
-        """M, the number of fibres per family."""
-        return len(self.knots) // 2
+        """M of a pad of M + M fibres.
+
+        Raises:
+            InputError: a pad of any other.
+        """
+        horizontals, verticals = self.layout.counts
+        if horizontals != verticals:
+            raise InputError(f"the pad has {horizontals} + {verticals} fibres, expected as many of either family")
+        return horizontals
 
     @property
-    def size_mm(self) -> float:
-        """Side of the square pad from fibre end to fibre end, mm."""
-        return (self.grid + 1) * self.pitch_mm
+    def unit_mm(self) -> float:
+        """A grid unit, mm."""
+        return self.layout.unit_mm
 
     @classmethod
-    def straight(cls, grid: int, pitch_mm: float = 11.25) -> "Morphology":
-        """The square grid: M straight fibres per family, N = 0."""
-        grid, _ = _counts(grid, 0)
-        return cls(assemble(np.empty((2 * grid, 0, 2))), pitch_mm)
+    def straight(cls, fibres: Counts | Layout, pitch_mm: Pitch = 11.25) -> "Morphology":
+        """Straight fibres, N = 0: M of either family, or (H, V), or those of a layout, whose pitch counts."""
+        layout = Layout.of(fibres, pitch_mm)
+        return cls.of_layout(assemble(np.empty((layout.fibres, 0, 2)), layout), layout)
+
+    @classmethod
+    def of_layout(cls, knots: Array, layout: Layout, provenance: Mapping[str, Any] | None = None) -> "Morphology":
+        """Of knots (H + V, N+2, 2) in grid units, whose ends lie as the layout says."""
+        return cls(knots, layout.pitch_mm, provenance or {}, layout.counts)
 
     @classmethod
     def random(
-        cls, grid: int, knots: int, seed: int | np.random.Generator = 0, pitch_mm: float = 11.25
+        cls, fibres: Counts | Layout, knots: int, seed: int | np.random.Generator = 0, pitch_mm: Pitch = 11.25
     ) -> "Morphology":
-        """Knots drawn uniformly over the pad, as the published search starts from."""
-        grid, knots = _counts(grid, knots)
+        """Knots drawn uniformly over the pad, as the published search starts from; fibres as `straight` takes them."""
+        layout = Layout.of(fibres, pitch_mm)
+        knots = _knot_count(layout, knots)
         known = seed if isinstance(seed, np.random.Generator) else whole("seed", seed, 0, 2**64 - 1)
         rng = np.random.default_rng(known)
-        inner = rng.uniform(MARGIN, grid + 1 - MARGIN, (2 * grid, knots, 2))
-        return cls(assemble(inner), pitch_mm)
+        inner = rng.uniform(MARGIN, np.array(layout.extent) - MARGIN, (layout.fibres, knots, 2))
+        return cls.of_layout(assemble(inner, layout), layout)
 
     @classmethod
-    def from_parameters(cls, parameters: ArrayLike, pitch_mm: float = 11.25) -> "Morphology":
+    def from_parameters(cls, parameters: ArrayLike, pitch_mm: Pitch = 11.25) -> "Morphology":
         """From the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals, their y."""
-        return cls(of_parameters(parameters), pitch_mm)
+        return cls(knots_of_parameters(parameters), pitch_mm)
 
     def tiled(self, times: int) -> "Morphology":
         """A pad of M `times` fibres a family, this one's course repeated over its surface, times x times.
@@ -101,10 +132,12 @@ class Morphology:
         A tile of M + 1 grid units along a fibre is compressed to M, so that fibre ends stay one unit apart throughout.
 
         Raises:
-            InputError: not a whole number of times, or more fibres than MOST_GRID.
+            InputError: not a whole number of times, too many fibres, or a pad that is not square or of two pitches.
         """
-        times = whole("times", times, 1, MOST_GRID // self.grid)
-        _counts(self.grid * times, times * (self.knots.shape[1] - 1) + 1)
+        if not self.layout.is_square:
+            raise InputError(f"a pad of {self.layout} is no tile, expected M + M fibres of one pitch")
+        times = whole("times", times, 1, MOST_FIBRES // self.grid)
+        _knot_count(Layout.of(self.grid * times), times * (self.knots.shape[1] - 1) + 1)
         grid, size = self.grid, self.grid * times
         out = np.empty((2 * size, times * (self.knots.shape[1] - 1) + 3, 2))
         for family in (0, 1):
@@ -136,7 +169,7 @@ class Morphology:
                 return cls(read_knots(path), PITCH_MM)
             except InputError as error:
                 raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-        document = read_json(path, FORMAT)
+        document = read_json(path, SQUARE_FORMAT, FORMAT)
         try:
             return cls.of_document(document)
         except InputError as error:
@@ -151,26 +184,28 @@ class Morphology:
         """
         try:
             knots = np.array(document["knots"], dtype=np.float64)
-            pad = cls(knots, float(document["pitch_mm"]), document.get("provenance", {}))
+            square = document.get("format", SQUARE_FORMAT) == SQUARE_FORMAT
+            fibres = _fibres_of(document, len(knots)) if square else document["fibres"]
+            layout = Layout.of(fibres, document["pitch_mm"])
+            if not square:
+                knots = _from_pitches(knots, layout)
+            return cls.of_layout(knots, layout, document.get("provenance", {}))
         except InputError:
             raise
         except (KeyError, TypeError, OverflowError) as error:
             raise InputError(f"no valid morphology ({error!r})") from error
         except ValueError as error:
             raise InputError(error) from error
-        if document.get("grid", pad.grid) != pad.grid:
-            raise InputError(f"grid is {document['grid']}, but there are {len(knots)} fibres")
-        return pad
 
     def document(self) -> dict[str, Any]:
-        """All of it as JSON."""
-        return {
-            "format": FORMAT,
-            "grid": self.grid,
-            "pitch_mm": self.pitch_mm,
-            "knots": self.knots.tolist(),
-            "provenance": dict(self.provenance),
-        }
+        """All of it as JSON: knots in pitches, those along x for x and those along y for y."""
+        if self.layout.is_square:
+            kind, knots = {"format": SQUARE_FORMAT, "grid": self.grid, "pitch_mm": self.pitch_mm}, self.knots
+        else:
+            pitch = [self.layout.pitch_x_mm, self.layout.pitch_y_mm]
+            kind = {"format": FORMAT, "fibres": list(self.layout.counts), "pitch_mm": pitch}
+            knots = _in_pitches(self.knots, self.layout)
+        return {**kind, "knots": knots.tolist(), "provenance": dict(self.provenance)}
 
     def save(self, path: str | Path) -> None:
         """Write a `morphology.json`, atomically; reading it back gives the same knots to the last bit."""
@@ -178,29 +213,70 @@ class Morphology:
 
     def to_mm(self, places: ArrayLike) -> Array:
         """Grid units to mm with the origin at the pad's centre, the frame presses are recorded in."""
-        return (reals("places", places, FARTHEST) - (self.grid + 1) / 2) * self.pitch_mm
+        return (_as_places("places", places) - self._middle) * self.unit_mm
 
     def to_grid(self, places_mm: ArrayLike) -> Array:
         """mm from the pad's centre to grid units."""
-        return reals("places_mm", places_mm, FARTHEST) / self.pitch_mm + (self.grid + 1) / 2
+        return _as_places("places_mm", places_mm) / self.unit_mm + self._middle
+
+    @property
+    def _middle(self) -> Array:
+        return np.array(self.layout.extent) / 2
 
 
-def _counts(grid: int, knots: int) -> tuple[int, int]:
-    """Fibres of a family and inner knots of a fibre, as far as there may be so many."""
-    grid = whole("grid", grid, 1, MOST_GRID)
-    return grid, whole("knots", knots, 0, MOST_KNOTS // (2 * grid) - 2)
+def _as_places(name: str, values: ArrayLike) -> Array:
+    """(..., 2) places, none of them too."""
+    places = reals(name, values, FARTHEST)
+    if places.shape == (0,):
+        return places.reshape(0, 2)
+    if places.shape[-1:] != (2,):
+        raise InputError(f"{name} have shape {places.shape}, expected (..., 2)")
+    return places
 
 
-def _validate(knots: Array) -> None:
-    if knots.ndim != 3 or knots.shape[2] != 2 or knots.shape[0] < 2 or knots.shape[0] % 2 or knots.shape[1] < 2:
-        raise InputError(f"knots have shape {knots.shape}, expected (2 M, N + 2, 2)")
-    grid = len(knots) // 2
-    _counts(grid, knots.shape[1] - 2)
-    if knots.min() < 0 or knots.max() > grid + 1:
-        worst = knots.min() if knots.min() < 0 else knots.max()
-        raise InputError(f"a knot lies at {worst:g}, allowed is 0 to {grid + 1} grid units")
-    for family, name in enumerate(("horizontal", "vertical")):
-        fibres = knots[family * grid : (family + 1) * grid]
+def _knot_count(layout: Layout, knots: int) -> int:
+    """Inner knots of a fibre, as far as there may be so many."""
+    return whole("knots", knots, 0, MOST_KNOTS // layout.fibres - 2)
+
+
+def _fibres_of(document: Mapping[str, Any], count: int) -> tuple[int, int]:
+    """(H, V) of a square pad of that many fibres."""
+    if count % 2 or document.get("grid", count // 2) != count // 2:
+        raise InputError(f"grid is {document.get('grid')}, but there are {count} fibres")
+    return count // 2, count // 2
+
+
+def _kept(knots: Array, layout: Layout) -> Array:
+    """Knots as they are once written and read, which is by a rounding error beside those in grid units at most."""
+    return _from_pitches(_in_pitches(knots, layout), layout)
+
+
+def _in_pitches(knots: Array, layout: Layout) -> Array:
+    """Knots in pitches of those in grid units; what lies on the pad's edge, and every end, is of whole pitches."""
+    pitches = np.where(knots == layout.extent, [layout.verticals + 1, layout.horizontals + 1], knots / layout.spacing)
+    for family, rows in enumerate(layout.families):
+        pitches[rows][:, [0, -1], 1 - family] = np.arange(1, layout.counts[family] + 1)[:, None]
+    return pitches
+
+
+def _from_pitches(knots: Array, layout: Layout) -> Array:
+    """Knots in grid units of those in pitches."""
+    if knots.ndim != 3 or knots.shape[2] != 2:
+        raise InputError(f"knots have shape {knots.shape}, expected (H + V, N + 2, 2)")
+    return knots * layout.spacing
+
+
+def _validate(knots: Array, layout: Layout) -> None:
+    if len(knots) != layout.fibres:
+        raise InputError(f"knots have shape {knots.shape}, expected {layout.fibres} fibres: {layout}")
+    _knot_count(layout, knots.shape[1] - 2)
+    for axis, most in enumerate(layout.extent):
+        places = knots[..., axis]
+        if places.min() < 0 or places.max() > most:
+            worst = places.min() if places.min() < 0 else places.max()
+            raise InputError(f"a knot lies at {'xy'[axis]} = {worst:g}, allowed is 0 to {most:g} grid units")
+    for family, (rows, name) in enumerate(zip(layout.families, ("horizontal", "vertical"), strict=True)):
+        fibres = knots[rows]
         travel, cross = fibres[..., family], fibres[..., 1 - family]
         near = (np.diff(travel, axis=1) < LEAST_SPAN).any(axis=1)
         if near.any():
@@ -208,6 +284,9 @@ def _validate(knots: Array) -> None:
             raise InputError(
                 f"{name} fibre {fibre}: knots do not ascend by {LEAST_SPAN:g} or more along its travel axis"
             )
-        ends = np.stack([travel[:, 0], travel[:, -1] - grid - 1])
-        if ends.any() or (cross[:, [0, -1]] != np.arange(1, grid + 1)[:, None]).any():
-            raise InputError(f"{name} fibres must run from (0, i) to ({grid + 1}, i) along their travel axis, i = 1..M")
+        moved = np.stack([travel[:, 0], travel[:, -1] - layout.extent[family]])
+        if moved.any() or (cross[:, [0, -1]] != layout.levels[rows, None]).any():
+            raise InputError(
+                f"{name} fibres must run from (0, i) to ({layout.extent[family]:g}, i) along their travel axis, "
+                "i = 1..M, in pitches"
+            )

@@ -173,14 +173,14 @@ class Twin:
         mapping("provenance", self.provenance)
         self.contact()
 
-    def contact(self, pitch_mm: float | None = None) -> Contact:
-        """The measured contact, on a pad of that pitch; of the twin's own if None."""
-        pitch_mm = self.morphology.pitch_mm if pitch_mm is None else pitch_mm
-        points = zip((self.distance_mm / pitch_mm).tolist(), self.weight.tolist(), strict=True)
+    def contact(self, unit_mm: float | None = None) -> Contact:
+        """The measured contact, on a pad of that grid unit; of the twin's own if None."""
+        unit_mm = self.morphology.unit_mm if unit_mm is None else unit_mm
+        points = zip((self.distance_mm / unit_mm).tolist(), self.weight.tolist(), strict=True)
         return Contact(reach=tuple(points), length="euclidean")
 
     def laid_signals(self, places_mm: ArrayLike) -> Array:
-        """(Q, 2M) what the fibres as laid signal for presses at (Q, 2) mm as the arm counts, grid units.
+        """(Q, F) what the fibres as laid signal for presses at (Q, 2) mm as the arm counts, grid units.
 
         0 for a fibre that no channel reads. Summed over elements of at most LONGEST, within some 1e-4 of the integral.
         """

@@ -28,12 +28,12 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     from design.evaluation.contacts_believed import NOISE, contacts_in_question, errors_by_contact
 
     settings = spec.section(SearchSettings, seed=seed)
-    size = spec.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm)
+    size = spec.section(PadSettings, **pad.layout.settings)
     believed = spec.section(Contact) if spec.given(Contact) else settings.usual_contact
     with stage("contacts"):
         found = errors_by_contact(pad, contacts_in_question(believed), size.sensed_mm, settings.seed)
     rows = [
-        {"contact": each.contact, "pad": each.pad, "errors_mm": [pad.pitch_mm * error.mean for error in each.errors]}
+        {"contact": each.contact, "pad": each.pad, "errors_mm": [pad.unit_mm * error.mean for error in each.errors]}
         for each in found
     ]
     made_by = provenance("padforge run", settings.seed, [out / "morphology.json"], packages=("torch",))

@@ -4,10 +4,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from design.common.checkpoints import Checkpoints
 from design.common.command_line import progress
 from design.common.errors import InputError
 from design.common.figures import save_figure
-from design.common.files import provenance, write_json
+from design.common.files import provenance, sha256, staged, write_json
 from design.common.profiling import stage
 from design.criteria.rules import check_rules
 from design.optimisers.search import SearchResult, SearchRun, search
@@ -45,7 +46,7 @@ def run_search(
     pad, contact, rules = spec.section(PadSettings), spec.section(Contact), spec.section(RulesSettings)
     begin = None
     if origin == "straight":
-        begin = Morphology.straight(pad.grid, pad.pitch_mm)
+        begin = Morphology.straight(pad.layout)
     elif origin != "random":
         begin, inputs = Morphology.load(origin), [*inputs, Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
@@ -57,7 +58,6 @@ def run_search(
     made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
     used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     made_by["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}
-    Morphology(result.morphology.knots, pad.pitch_mm, made_by).save(out / "morphology.json")
     document = {
         "format": "padforge-design/1",
         "terms": result.terms,
@@ -68,11 +68,15 @@ def run_search(
         "stopped": result.stopped,
         "provenance": made_by,
     }
-    with stage("figures"):
-        figure = draw_plan(result.morphology, contact, result.violations)
-        save_figure(figure, out / "design.svg")
-        save_figure(figure, out / "design.png")
-    write_json(out / "design.json", document)
+    with stage("figures"), staged(out) as together:
+        Morphology.of_layout(result.morphology.knots, pad.layout, made_by).save(together / "morphology.json")
+        document["morphology_sha256"] = sha256(together / "morphology.json")
+        figure = draw_plan(result.morphology, contact, result.violations, pad.keep_out_mm)
+        save_figure(figure, together / "design.svg")
+        save_figure(figure, together / "design.png")
+        write_json(together / "design.json", document)
+    if not result.stopped:
+        Checkpoints(out / "search", {}).clear()
     return document, result
 
 
@@ -84,7 +88,9 @@ def write_plan(spec: "Spec", pad: Morphology, path: Path) -> None:
     """
     if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
-    save_figure(draw_plan(pad, spec.section(Contact), check_rules(pad, spec.section(RulesSettings))), path)
+    size = spec.section(PadSettings, **pad.layout.settings)
+    broken = check_rules(pad, spec.section(RulesSettings), size)
+    save_figure(draw_plan(pad, spec.section(Contact), broken, size.keep_out_mm), path)
 
 
 def search_lines(result: SearchResult, out: Path) -> list[str]:

@@ -12,39 +12,48 @@ from design.criteria.rules import Violation
 from design.pad.courses.curves import crossings, flatten
 from design.pad.morphology import Morphology
 from design.settings import Contact
+from design.settings import Polygon as Corners
 
 
-def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation] = ()) -> Figure:
+def draw_plan(
+    pad: Morphology, contact: Contact, violations: Sequence[Violation] = (), keep_out_mm: Sequence[Corners] = ()
+) -> Figure:
     """The plan as a matplotlib figure; axes in mm from the pad's centre.
 
-    Same-family crossings are ringed, places of broken rules crossed out in red, the contact drawn at the centre.
+    Same-family crossings are ringed, places of broken rules crossed out in red, keep-outs hatched, the contact drawn
+    at the centre.
     """
     pad, contact = instance("pad", pad, Morphology), instance("contact", contact, Contact)
     if not isinstance(violations, Sequence) or not all(isinstance(found, Violation) for found in violations):
         raise InputError(f"violations is {shown(violations)}, expected what check_rules found")
-    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    width, height = (side / 2 for side in pad.layout.size_mm)
+    half, longer = max(width, height), 6.4 / max(width, height)
+    figure = Figure(figsize=(max(longer * width, 4.8), max(longer * height, 2.4)), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
-    half = pad.size_mm / 2
-    axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor=PAPER, edgecolor=FAINT))
+    axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT))
+    for corners in keep_out_mm:
+        axes.add_patch(Polygon(np.array(corners), facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
     for fibre, points in enumerate(flatten(pad, 1e-3)):
-        horizontal = fibre < pad.grid
+        horizontal = not pad.layout.family(fibre)
         x, y = pad.to_mm(points).T
         axes.plot(x, y, color=HORIZONTAL if horizontal else VERTICAL, linewidth=1.6, solid_capstyle="round")
         ha, va, dx, dy = ("left", "center", 0.02, 0) if horizontal else ("center", "bottom", 0, 0.02)
         color = HORIZONTAL if horizontal else VERTICAL
         axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
-    places = [(pad.to_mm(c.place), (c.first < pad.grid) == (c.second < pad.grid)) for c in crossings(pad)]
+    places = [(pad.to_mm(c.place), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)]
     for same, size, color in ((False, 10, INK), (True, 40, ALARM)):
         chosen = np.array([place for place, family in places if family == same]).reshape(-1, 2)
         axes.scatter(*chosen.T, s=size, facecolor="none" if same else color, edgecolor=color, linewidth=0.8, zorder=3)
-    axes.add_patch(_contact_shape(contact, pad.pitch_mm))
+    axes.add_patch(_contact_shape(contact, pad.unit_mm))
     broken = np.array([v.place_mm for v in violations if v.place_mm is not None]).reshape(-1, 2)
     axes.scatter(*broken.T, marker="x", s=50, color=ALARM, linewidth=1.8, zorder=4)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", xlim=(-1.08 * half, 1.08 * half), ylim=(-1.08 * half, 1.08 * half))
+    beside = 0.08 * half
+    limits = {"xlim": (-width - beside, width + beside), "ylim": (-height - beside, height + beside)}
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", **limits)
     axes.spines[["top", "right"]].set_visible(False)
     across = sum(not family for _, family in places)
     axes.set_title(
-        f"{pad.grid} + {pad.grid} fibres, pitch {pad.pitch_mm:g} mm, {len(places)} crossings"
+        f"{pad.layout}, {len(places)} crossings"
         + (f", {len(places) - across} within a family" if len(places) > across else "")
         + (f", {len(violations)} rules broken" if violations else ""),
         fontsize=10,
@@ -53,8 +62,8 @@ def draw_plan(pad: Morphology, contact: Contact, violations: Sequence[Violation]
     return figure
 
 
-def _contact_shape(contact: Contact, pitch_mm: float) -> Circle | Polygon:
-    radius = (_half_width(contact.reach) if contact.reach else contact.radius) * pitch_mm
+def _contact_shape(contact: Contact, unit_mm: float) -> Circle | Polygon:
+    radius = (_half_width(contact.reach) if contact.reach else contact.radius) * unit_mm
     if contact.reach or contact.sides is None:
         return Circle((0, 0), radius, color=INK, alpha=0.15, linewidth=0)
     angle = 2 * np.pi * np.arange(contact.sides) / contact.sides

@@ -25,7 +25,7 @@ def test_straight_fibres_are_told_beside_what_was_found(tmp_path, monkeypatch):
     (tmp_path / "pad.toml").write_text(QUICK)
     told = CliRunner().invoke(design, [], catch_exceptions=False).output.splitlines()
     document = json.loads((tmp_path / "out/pad/design.json").read_text())
-    straight = ambiguities(Morphology.straight(2), Contact(), 1, SearchSettings().noise)
+    straight = ambiguities(Morphology.straight(2), Contact(), 1, SearchSettings().noise, PadSettings(grid=2))
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
     assert set(document["straight"]) == {name for name in document["terms"] if name.startswith("ambiguity")}
     assert told[1].startswith(
@@ -67,7 +67,7 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(tmp_path, monkeypatch, 
     assert (used["pad"]["grid"], used["pad"]["pitch_mm"], used["pad"]["sensed_mm"]) == (2, 10, [18, 30])
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
-    asked = {"lost": 1, "noise": 0.03, "sensed_mm": (18, 30)}
+    asked = {"lost": 1, "noise": 0.03, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
     expected = error_terms(expected_errors(pad, known.contact(), **asked))
     assert document["terms"] == pytest.approx(score(pad, known.contact(), **asked) | expected, rel=1e-9)
     scored = CliRunner().invoke(design, ["score", "out/pad/morphology.json", "--twin", str(twin)])
@@ -103,7 +103,7 @@ def test_a_search_for_a_twin_is_resumed(tmp_path, monkeypatch, twin):
     ("stated", "said"),
     [
         ("[contact]\nradius = 0.9\n", r"pad\.toml: \[contact\] is given beside .*twin\.json.*; leave one out"),
-        ("[pad]\ngrid = 4\n", r"pad\.toml: \[pad\] grid: got 4, but .*twin\.json is of grid 2"),
+        ("[pad]\ngrid = 4\n", r"pad\.toml: \[pad\] asks for 4 \+ 4 fibres, .*, but .*twin\.json is of a pad of 2 \+ 2"),
         ("[pad]\ngrid = 0\n", r"grid"),
     ],
 )

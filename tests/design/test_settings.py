@@ -23,6 +23,7 @@ from design.pad.kernels.press import profile_of, profile_weights
 from design.settings import (
     MEASURED_REACH,
     PUBLISHED_CONTACT,
+    Layout,
     PadSettings,
     RulesSettings,
     SearchSettings,
@@ -105,9 +106,14 @@ def test_a_missing_file_is_refused(tmp_path):
 def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     assert PadSettings().model_dump() == {
         "grid": 4,
+        "horizontals": "grid",
+        "verticals": "grid",
         "pitch_mm": 11.25,
         "deep_family": "horizontal",
+        "leads": "edges",
         "sensed_mm": "beyond",
+        "keep_out_mm": (),
+        "bent_radius_mm": "flat",
     }
     published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "reach": ()}
     assert PUBLISHED_CONTACT.model_dump() == published
@@ -120,6 +126,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
         "max_crossings": "any",
         "min_crossing_angle_deg": 0.0,
         "border_mm": 2.0,
+        "keep_out_mm": 1.5,
         "max_length_mm": 500.0,
     }
     search = SearchSettings().model_dump()
@@ -149,9 +156,9 @@ def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):
 
 
 def test_what_is_pressed_lies_about_the_middle_of_the_pad():
-    assert sensed_rectangle(4, 11.25) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
-    assert sensed_rectangle(4, 11.25, "fibres") == ((1, 1), (4, 4))
-    assert sensed_rectangle(1, 11.25, "fibres") == ((0.5, 0.5), (1.5, 1.5))
+    assert sensed_rectangle(Layout.of(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
+    assert sensed_rectangle(Layout.of(4), "fibres") == ((1, 1), (4, 4))
+    assert sensed_rectangle(Layout.of(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
     assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
     again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
@@ -162,6 +169,44 @@ def test_what_is_pressed_is_no_larger_than_the_pad():
     expected = r"pad\.toml: \[pad\] sensed_mm: got \[31, 5\], .*the pad itself is 30 mm wide and high"
     with pytest.raises(InputError, match=expected):
         spec.section(PadSettings)
+
+
+@pytest.mark.parametrize(
+    ("pad", "message"),
+    [
+        ({"horizontals": 0, "verticals": 0}, "horizontals and verticals are both 0, allowed is one fibre or more"),
+        ({"horizontals": -1}, r"\[pad\] horizontals: got -1"),
+        ({"verticals": 257}, r"\[pad\] verticals: got 257"),
+        ({"pitch_mm": 0}, r"\[pad\] pitch_mm.*: got 0"),
+        (
+            {"pitch_mm": [8, 0]},
+            r"\[pad\] pitch_mm: got .8, 0., .*allowed is 0.1 to 1000, or .along x, along y.",
+        ),
+        ({"pitch_mm": [8, 9, 10]}, r"\[pad\] pitch_mm"),
+        ({"horizontals": 2, "pitch_mm": [8, 15], "sensed_mm": [40, 46]}, "the pad itself is 45 mm high"),
+        ({"keep_out_mm": [[0, 0], [1, 1]]}, r"\[pad\] keep_out_mm"),
+        ({"keep_out_mm": [[[0, 0], [1, 1]]]}, r"\[pad\] keep_out_mm: .*polygon 1 has 2 corners"),
+        ({"keep_out_mm": "hole"}, r"\[pad\] keep_out_mm"),
+        ({"bent_radius_mm": 0.5}, r"\[pad\] bent_radius_mm.*: got 0.5"),
+        ({"bent_radius_mm": "round"}, r"\[pad\] bent_radius_mm.*: got 'round'"),
+    ],
+)
+def test_rectangles_that_are_none_are_refused_in_one_line(pad, message):
+    with pytest.raises(InputError, match=message) as refused:
+        Spec({"pad": pad}, "pad.toml").section(PadSettings)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_rectangle_is_stated_and_written_and_is_what_was_stated():
+    pad = {"horizontals": 3, "verticals": 6, "pitch_mm": [8, 15], "bent_radius_mm": 40}
+    hole = {"keep_out_mm": [[[0, 0], [4, 0], [0, 4]]]}
+    stated = Spec({"pad": pad | hole}).section(PadSettings)
+    assert stated.layout == Layout(3, 6, 8.0, 15.0)
+    assert stated.sensed == sensed_rectangle(stated.layout)
+    assert Spec(tomllib.loads(commented_toml({"pad": PadSettings}, {"pad": stated}))).section(PadSettings) == stated
+    assert PadSettings.model_validate_json(stated.model_dump_json()) == stated
+    assert stated.of(Layout.of(4)).layout == Layout.of(4)
+    assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
 
 
 def test_a_contact_given_by_its_shape_is_of_the_published_kind():

@@ -55,7 +55,21 @@ def traced_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array
     return cubic(spans[span], at - span), heading
 
 
-def bend_radius(points: Array, headings: Array, window: float) -> tuple[float, Array]:
+def rolled_turns(points: Array, from_axis: Array, radius: float) -> Array:
+    """(n - 1,) radians by which a curve turns away from its plane, from point to point, once that is rolled up.
+
+    A plane that is rolled up on a cylinder about y stays as long everywhere. A line on it at the angle a to x is then
+    curved out of the plane by cos(a)^2 / `radius` (Euler's formula: 1 / radius about the cylinder, 0 along it), beside
+    its curvature 1 / r in the plane; the two stand at right angles, so that it is curved by their root sum of squares.
+
+    Args:
+        points: (n, 2) so near that their headings hardly differ. from_axis: (n,) angle to the x axis there.
+    """
+    curved = np.cos(from_axis) ** 2 / radius
+    return (curved[1:] + curved[:-1]) / 2 * np.hypot(*np.diff(points, axis=0).T)
+
+
+def bend_radius(points: Array, headings: Array, window: float, rolled: Array | float = 0.0) -> tuple[float, Array]:
     """Least bend radius of a curve, and the place (2,) in the middle of that bend.
 
     The radius is `window` divided by the greatest angle the curve turns, left and right added up, in a stretch of that
@@ -68,10 +82,11 @@ def bend_radius(points: Array, headings: Array, window: float) -> tuple[float, A
     Args:
         points: (n, 2) on the curve, so near that chords measure its length; a corner is a point given twice.
         headings: (n,) of the tangents there, unwrapped.
+        rolled: (n - 1,) what it turns out of the plane from point to point: `rolled_turns`.
     """
     arc = _arc(points)
     window = min(window, arc[-1])
-    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(headings)))])
+    turned = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(headings), rolled))])
     # A corner at either end of a window counts: a window starts before the turn at its first point (`turned` there,
     # or at the first of two equal points), and `interp` takes the last of equal arcs.
     ahead = np.interp(arc + window, arc, turned) - turned

@@ -11,13 +11,14 @@ from design.common.errors import InputError, instance, real
 from design.pad.kernels.pchip import pchip_slopes
 from design.pad.knots import Array, assemble
 from design.pad.morphology import Morphology
+from design.settings import Layout
 
 MOST_POINTS = 10**7
 """Most points the curves of a pad are flattened to."""
 
 
 def slopes(pad: Morphology) -> Array:
-    """(2M, N+2) PCHIP slope of the cross coordinate at each knot, per unit of travel."""
+    """(F, N+2) PCHIP slope of the cross coordinate at each knot, per unit of travel."""
     out = np.empty(pad.knots.shape[:2])
     for fibre, (t, v) in enumerate(_travel_and_cross(pad)):
         pchip_slopes(t, v, out[fibre])
@@ -25,11 +26,11 @@ def slopes(pad: Morphology) -> Array:
 
 
 def beziers(pad: Morphology) -> Array:
-    """(2M, N+1, 4, 2) Bezier control points of every span: a PCHIP span is exactly one cubic Bezier segment."""
+    """(F, N+1, 4, 2) Bezier control points of every span: a PCHIP span is exactly one cubic Bezier segment."""
     d = slopes(pad)
     spans = np.empty((len(pad.knots), pad.knots.shape[1] - 1, 4, 2))
     for fibre, (t, v) in enumerate(_travel_and_cross(pad)):
-        travel = 0 if fibre < pad.grid else 1
+        travel = pad.layout.family(fibre)
         third = np.diff(t) / 3
         spans[fibre, :, :, travel] = np.stack([t[:-1], t[:-1] + third, t[1:] - third, t[1:]], axis=1)
         rise = np.stack([v[:-1], v[:-1] + third * d[fibre, :-1], v[1:] - third * d[fibre, 1:], v[1:]], axis=1)
@@ -38,7 +39,7 @@ def beziers(pad: Morphology) -> Array:
 
 
 def slope_beziers(pad: Morphology) -> Array:
-    """(2M, N+1, 3) Bezier coefficients of every span's slope, cross per travel: a quadratic in the span's parameter."""
+    """(F, N+1, 3) Bezier coefficients of every span's slope, cross per travel: a quadratic in the span's parameter."""
     d = slopes(pad)
     inner = np.empty((len(d), d.shape[1] - 1))
     for fibre, (t, v) in enumerate(_travel_and_cross(pad)):
@@ -83,7 +84,7 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
 
 
 def lengths(pad: Morphology) -> Array:
-    """(2M,) arc length of every fibre in grid units, to about 1e-5 where knots nearly coincide."""
+    """(F,) arc length of every fibre in grid units, to about 1e-5 where knots nearly coincide."""
     nodes, weights = np.polynomial.legendre.leggauss(32)
     u = ((nodes + 1) / 2)[:, None]
     derivative = 3 * np.diff(beziers(pad), axis=2)[:, :, :, None, :]
@@ -93,7 +94,7 @@ def lengths(pad: Morphology) -> Array:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Two fibres that meet: their indices (0..2M-1, first < second) and the place (x, y) in grid units."""
+    """Two fibres that meet: their indices (0..F-1, first < second) and the place (x, y) in grid units."""
 
     first: int
     second: int
@@ -109,7 +110,8 @@ def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> 
     instance("across", across, bool)
     lines = np.array([shapely.LineString(points) for points in flatten(pad, tolerance)])
     first, second = shapely.STRtree(lines).query(lines)
-    wanted = (first < second) & (across | ((first < pad.grid) == (second < pad.grid)))
+    horizontals = pad.layout.horizontals
+    wanted = (first < second) & (across | ((first < horizontals) == (second < horizontals)))
     first, second = first[wanted], second[wanted]
     shared = shapely.intersection(lines[first], lines[second])
     parts, pair = shapely.get_parts(shared, return_index=True)
@@ -138,7 +140,7 @@ def crossing_angles(pad: Morphology, across: Sequence[Crossing]) -> Array:
 
 def _slopes_at(pad: Morphology, fibre: NDArray[np.int_], travel: Array) -> Array:
     """Slope of each fibre (n,) at its own travel coordinate (n,)."""
-    knots = np.where((fibre < pad.grid)[:, None], pad.knots[fibre, :, 0], pad.knots[fibre, :, 1])
+    knots = np.where((fibre < pad.layout.horizontals)[:, None], pad.knots[fibre, :, 0], pad.knots[fibre, :, 1])
     span = np.clip((knots <= travel[:, None]).sum(axis=1) - 1, 0, knots.shape[1] - 2)
     row = np.arange(len(fibre))
     u = (travel - knots[row, span]) / (knots[row, span + 1] - knots[row, span])
@@ -147,22 +149,21 @@ def _slopes_at(pad: Morphology, fibre: NDArray[np.int_], travel: Array) -> Array
 
 def _travel_and_cross(pad: Morphology) -> list[tuple[Array, Array]]:
     """Travel and cross coordinates of every fibre, contiguous."""
-    axes = [0] * pad.grid + [1] * pad.grid
+    axes = [pad.layout.family(fibre) for fibre in range(len(pad.knots))]
     return [(knots[:, a].copy(), knots[:, 1 - a].copy()) for knots, a in zip(pad.knots, axes, strict=True)]
 
 
-def refine(knots: Array, count: int) -> Array:
+def refine(knots: Array, count: int, layout: Layout) -> Array:
     """Knots with `count` inner ones a fibre: more are put on the curve, in the middle of the longest spans.
 
     Args:
-        knots: (2M, n, 2) with n - 2 <= count.
+        knots: (F, n, 2) with n - 2 <= count. layout: of the F fibres.
     """
     from scipy.interpolate import PchipInterpolator
 
-    grid = len(knots) // 2
     fibres = []
     for fibre, line in enumerate(knots):
-        axis = 0 if fibre < grid else 1
+        axis = layout.family(fibre)
         travel = line[:, axis]
         curve = PchipInterpolator(travel, line[:, 1 - axis])
         while len(travel) < count + 2:
@@ -170,4 +171,4 @@ def refine(knots: Array, count: int) -> Array:
             travel = np.insert(travel, longest + 1, travel[longest : longest + 2].mean())
         cross = curve(travel)
         fibres.append(np.stack([travel, cross] if axis == 0 else [cross, travel], axis=-1))
-    return assemble(np.array(fibres)[:, 1:-1])
+    return assemble(np.array(fibres)[:, 1:-1], layout)

@@ -151,20 +151,20 @@ def signals_gradient(
     cross: Any,
     slope: Any,
     strays: Any,
+    ends: Any,
     presses: Any,
     upstream: Any,
     chains: tuple[Any, Any],
     reach: Any,
     law: Any,
 ) -> Any:
-    """Gradient (3, 2M, n) of sum(upstream * signals) by knots' travel and cross coordinates and slopes, one pad.
+    """Gradient (3, F, n) of sum(upstream * signals) by knots' travel and cross coordinates and slopes, one pad.
 
     Args:
-        travel, cross, slope: (2M, n), held independent. strays: (2,). presses: (Q, 2). upstream: (Q, 2M).
+        travel, cross, slope: (F, n), held independent. strays: (2,). ends: `Ends`. presses: (Q, 2). upstream: (Q, F).
         law: of any weight but PROFILE, whose gradient `measured_signals` has.
     """
     fibres, n = travel.shape
-    grid = fibres // 2
     out = np.zeros((3, fibres, n))
     change = np.empty(6)
     work = np.empty(6), np.empty((6, 2)), np.empty((6, 2))
@@ -175,8 +175,8 @@ def signals_gradient(
             shape = in_frame((chains, reach, law), family)
             tolerance = 4 * EPS * (abs(cv) + law.radius)
             low, high = cv + reach[family, 2] - tolerance, cv + reach[family, 3] + tolerance
-            first, last = touched_range(cv, reach[family], strays[family], grid)
-            for f in range(family * grid + first, family * grid + last):
+            first, last = touched_range(cv, reach[family], strays[family], ends, family)
+            for f in range(first, last):
                 t, v, d = travel[f], cross[f], slope[f]
                 j = max(np.searchsorted(t, ct + reach[family, 0], side="right") - 1, 0)
                 while j < n - 1 and t[j] < ct + reach[family, 1]:

@@ -238,6 +238,7 @@ def exact_signals(
     cross: Any,
     slope: Any,
     strays: Any,
+    ends: Any,
     presses: Any,
     chains: tuple[Any, Any],
     reach: Any,
@@ -251,14 +252,13 @@ def exact_signals(
     """Signals of pads for presses, only of fibres a press can touch; returns how many spans were looked at.
 
     Args:
-        travel, cross, slope: (P, 2M, n) knots and slopes. strays: (P, 2) of `family_strays`.
+        travel, cross, slope: (P, F, n) knots and slopes. strays: (P, 2) of `family_strays`. ends: `Ends`.
         presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
         chains: two (3, B), reach: (2, 5): the shape in the frame of each family. law: a `Law`.
         starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
-            `signal`; or empty for dense signals (P Q 2M,), zeros before.
+            `signal`; or empty for dense signals (P Q F,), zeros before.
     """
     fibres = travel.shape[1]
-    grid = fibres // 2
     span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     visited = 0
     for index in range(begin, end):
@@ -267,8 +267,8 @@ def exact_signals(
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
             shape = in_frame((chains, reach, law), family)
-            first, last = touched_range(cv, reach[family], strays[p, family], grid)
-            for f in range(family * grid + first, family * grid + last):
+            first, last = touched_range(cv, reach[family], strays[p, family], ends, family)
+            for f in range(first, last):
                 t, v, d = travel[p, f], cross[p, f], slope[p, f]
                 value, spans = fibre_signal(t, v, d, ct, cv, shape, span, scratch)
                 visited += spans

@@ -159,6 +159,7 @@ def lengthenings(
     travel: Any,
     cross: Any,
     slope: Any,
+    horizontals: int,
     presses: Any,
     contact_radius: Any,
     steepness: Any,
@@ -168,10 +169,10 @@ def lengthenings(
     end: int,
     out: Any,
 ) -> None:
-    """Lengthening of every fibre of one pad for presses begin..end, into out (Q, 2M), zeros before.
+    """Lengthening of every fibre of one pad for presses begin..end, into out (Q, F), zeros before.
 
     Args:
-        travel, cross, slope: (2M, n) knots and slopes. presses: (Q, 2) x and y.
+        travel, cross, slope: (F, n) knots and slopes. horizontals: how many of them. presses: (Q, 2) x and y.
         contact_radius: (Q,) a; 0 for no press.
         steepness: (Q,) what scales dw/dr: of a sphere the slope at the edge a / R, of a cone that of its flank, of a
             flat punch 2 d / (pi a).
@@ -184,7 +185,7 @@ def lengthenings(
         if a == 0:
             continue
         for f in range(fibres):
-            family = 0 if f < fibres // 2 else 1
+            family = 0 if f < horizontals else 1
             ct, cv = presses[q, family], presses[q, 1 - family]
             t, v, d = travel[f], cross[f], slope[f]
             for j in range(knots - 1):

@@ -32,11 +32,13 @@ class Elements(NamedTuple):
     """Fibres cut into elements, E of them in the order of fibres and their travel.
 
     Attributes:
-        starts: (2M, n) the first element of each span, and behind them of the next fibre.
+        horizontals: how many of the fibres, from the first, travel along x.
+        starts: (F, n) the first element of each span, and behind them of the next fibre.
         travel, cross, length: (E,) where they lie and how long they are, grid units.
         share, weight: (E,) where on its span each lies, 0..1, and the share of the span that it stands for.
     """
 
+    horizontals: int
     starts: Any
     travel: Array
     cross: Array
@@ -78,23 +80,24 @@ def _pieces(h: float, rise: float, d0: float, d1: float, spacing: float) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fibre_elements(travel: Any, cross: Any, slope: Any, presses: Any, end: float, spacing: float, length: int) -> Any:
+def fibre_elements(
+    travel: Any, cross: Any, slope: Any, horizontals: int, presses: Any, end: float, spacing: float, length: int
+) -> Any:
     """`Elements` of one pad's spans, those that none of the presses can reach left out.
 
     Args:
-        travel, cross, slope: (2M, n) knots and slopes. presses: (Q, 2), at least one. end: of the reach.
-        spacing: of `spacing_of`.
+        travel, cross, slope: (F, n) knots and slopes. horizontals: how many of them. presses: (Q, 2), at least one.
+        end: of the reach. spacing: of `spacing_of`.
         length: MANHATTAN or EUCLIDEAN.
     """
     fibres, n = travel.shape
-    grid = fibres // 2
     low, high = np.empty(2), np.empty(2)
     for axis in range(2):
         low[axis], high[axis] = presses[:, axis].min() - end, presses[:, axis].max() + end
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
     total = 0
     for f in range(fibres):
-        along = f // grid
+        along = 0 if f < horizontals else 1
         for j in range(n - 1):
             starts[f, j] = total
             t0, t1, v0, v1 = travel[f, j], travel[f, j + 1], cross[f, j], cross[f, j + 1]
@@ -118,7 +121,7 @@ def fibre_elements(travel: Any, cross: Any, slope: Any, presses: Any, end: float
                     out[0, k], out[1, k] = travel[f, j] + h * s, v0 + s * (a1 + s * (a2 + s * a3))
                     out[2, k], out[3, k], out[4, k] = weight * run, s, weight
                     k += 1
-    return Elements(starts, out[0], out[1], out[2], out[3], out[4])
+    return Elements(horizontals, starts, out[0], out[1], out[2], out[3], out[4])
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,15 +143,15 @@ def _piece(square: float, profile: Any, piece: int) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def element_signals(travel: Any, cross: Any, elements: Any, presses: Any, end: float, profile: Any, out: Any) -> int:
-    """Signals of one pad for presses (Q, 2) into out (Q, 2M); returns how many spans were looked at.
+    """Signals of one pad for presses (Q, 2) into out (Q, F); returns how many spans were looked at.
 
     Args:
-        travel, cross: (2M, n) knots. elements: of `fibre_elements`. end, profile: of the reach.
+        travel, cross: (F, n) knots. elements: of `fibre_elements`. end, profile: of the reach.
     """
     fibres, n = travel.shape
     looked_at, piece = 0, 0
     for f in range(fibres):
-        t, v, first, along = travel[f], cross[f], elements.starts[f], f // (fibres // 2)
+        t, v, first, along = travel[f], cross[f], elements.starts[f], 0 if f < elements.horizontals else 1
         bottom, top = v.min() - end, v.max() + end
         for q in range(len(presses)):
             ct, cv, total = presses[q, along], presses[q, 1 - along], 0.0
@@ -176,7 +179,7 @@ def _gains(
     fibres, n = travel.shape
     piece = 0
     for f in range(fibres):
-        t, v, first, along = travel[f], cross[f], elements.starts[f], f // (fibres // 2)
+        t, v, first, along = travel[f], cross[f], elements.starts[f], 0 if f < elements.horizontals else 1
         bottom, top = v.min() - end, v.max() + end
         for q in range(len(presses)):
             ct, cv, up = presses[q, along], presses[q, 1 - along], upstream[q, f]
@@ -208,11 +211,11 @@ def elements_gradient(
     profile: Any,
     length: int,
 ) -> Any:
-    """Gradient (3, 2M, n) of sum(upstream * signals) by knots' travel and cross coordinates and slopes, one pad.
+    """Gradient (3, F, n) of sum(upstream * signals) by knots' travel and cross coordinates and slopes, one pad.
 
     Args:
         travel, cross, slope, presses, end, length: as `fibre_elements` takes them, which gave `elements`.
-        upstream: (Q, 2M). profile: of the reach.
+        upstream: (Q, F). profile: of the reach.
     """
     fibres, n = travel.shape
     out, gains = np.zeros((3, fibres, n)), np.zeros((3, len(elements.length)))

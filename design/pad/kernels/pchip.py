@@ -58,21 +58,21 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_curves(knots: Any, samples: int) -> Any:
-    """Cross coordinates (P, 2M, samples) of the fibres `knots` (P, 2M, N+2, 2), uniform along the travel axis."""
+def sample_curves(knots: Any, horizontals: int, samples: int) -> Any:
+    """Cross coordinates (P, F, samples) of the fibres `knots` (P, F, N+2, 2), uniform along the travel axis."""
     population, fibres = knots.shape[:2]
-    step = (fibres // 2 + 1) / (samples - 1)
     out = np.empty((population, fibres, samples))
     for index in range(population * fibres):
         p, f = index // fibres, index % fibres
-        travel = 0 if f < fibres // 2 else 1
-        pchip_sample(knots[p, f, :, travel].copy(), knots[p, f, :, 1 - travel].copy(), step, out[p, f])
+        travel = 0 if f < horizontals else 1
+        t = knots[p, f, :, travel].copy()
+        pchip_sample(t, knots[p, f, :, 1 - travel].copy(), t[-1] / (samples - 1), out[p, f])
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def population_slopes(travel: Any, cross: Any) -> Any:
-    """Slopes (P, 2M, n) of the PCHIP curves through knots `travel`, `cross`, both (P, 2M, n)."""
+    """Slopes (P, F, n) of the PCHIP curves through knots `travel`, `cross`, both (P, F, n)."""
     out = np.empty_like(cross)
     for p in range(len(travel)):
         for f in range(travel.shape[1]):

@@ -19,6 +19,19 @@ MANHATTAN, EUCLIDEAN = 0, 1
 NO_PROFILE = np.empty((0, 5))
 
 
+class Ends(NamedTuple):
+    """Where fibres end: horizontal i (from 0) at the height (i + 1) apart_y, vertical i at (i + 1) apart_x.
+
+    Attributes:
+        horizontals, verticals: how many there are of each family. apart_y, apart_x: grid units.
+    """
+
+    horizontals: int
+    verticals: int
+    apart_y: float
+    apart_x: float
+
+
 class Law(NamedTuple):
     """What a fibre element in a press counts.
 
@@ -119,37 +132,47 @@ def in_frame(shape: Any, family: int) -> Any:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def family_strays(cross: Any) -> Any:
-    """(P, 2) how far the fibres of each family stray from their own level, from knots' cross (P, 2M, n)."""
+def family_strays(cross: Any, ends: Any) -> Any:
+    """(P, 2) how far the fibres of each family stray from their own level, from knots' cross (P, F, n)."""
     population, fibres, _ = cross.shape
-    grid = fibres // 2
     out = np.zeros((population, 2))
     for p in range(population):
         for f in range(fibres):
-            level = f % grid + 1
-            out[p, f // grid] = max(out[p, f // grid], level - cross[p, f].min(), cross[p, f].max() - level)
+            family, first, _, apart = family_of(f, ends)
+            level = (f - first + 1) * apart
+            out[p, family] = max(out[p, family], level - cross[p, f].min(), cross[p, f].max() - level)
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def touched_range(cv: float, reach: Any, stray: float, grid: int) -> tuple[int, int]:
-    """Fibres [first, end) of a family, by index, that a press at cross coordinate cv can touch.
-
-    Fibre i (from 0) keeps to level i + 1 within the family's stray.
-    """
-    slack = 8 * EPS * (abs(cv) + reach[3])  # a fibre on the boundary is touched, whichever way rounding goes
-    first = min(max(math.ceil(cv + reach[2] - stray - slack) - 1, 0.0), float(grid))
-    end = min(max(math.floor(cv + reach[3] + stray + slack), 0.0), float(grid))
-    return int(first), int(end)
+def family_of(fibre: int, ends: Any) -> tuple[int, int, int, float]:
+    """Family of a fibre, 0 or 1, its first fibre and the one behind its last, and how far apart their ends are."""
+    if fibre < ends.horizontals:
+        return 0, 0, ends.horizontals, ends.apart_y
+    return 1, ends.horizontals, ends.horizontals + ends.verticals, ends.apart_x
 
 
 @njit(cache=True, error_model="numpy")
-def count_touched(strays: Any, presses: Any, reach: Any, grid: int) -> Any:
+def touched_range(cv: float, reach: Any, stray: float, ends: Any, family: int) -> tuple[int, int]:
+    """Fibres [first, end) of a family that a press at cross coordinate cv can touch, by index among all fibres.
+
+    Fibre i of the family (from 0) keeps to level (i + 1) apart within the family's stray.
+    """
+    before = 0 if family == 0 else ends.horizontals
+    count, apart = (ends.horizontals, ends.apart_y) if family == 0 else (ends.verticals, ends.apart_x)
+    slack = 8 * EPS * (abs(cv) + reach[3])  # a fibre on the boundary is touched, whichever way rounding goes
+    first = min(max(math.ceil((cv + reach[2] - stray - slack) / apart) - 1, 0.0), float(count))
+    end = min(max(math.floor((cv + reach[3] + stray + slack) / apart), 0.0), float(count))
+    return before + int(first), before + int(end)
+
+
+@njit(cache=True, error_model="numpy")
+def count_touched(strays: Any, presses: Any, reach: Any, ends: Any) -> Any:
     """(Q + 1,) running number of fibres that presses (Q, 2) can touch on one pad with strays (2,)."""
     starts = np.zeros(len(presses) + 1, np.int64)
     for q in range(len(presses)):
         starts[q + 1] = starts[q]
         for family in range(2):
-            first, end = touched_range(presses[q, 1 - family], reach[family], strays[family], grid)
+            first, end = touched_range(presses[q, 1 - family], reach[family], strays[family], ends, family)
             starts[q + 1] += max(end - first, 0)
     return starts

@@ -50,11 +50,12 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
     if places.ndim != 2 or places.shape[1] != 2:
         raise InputError(f"loc_all has shape {content['loc_all'].shape}, expected (Q, 2)")
     samples = whole("fineness", int(settings["fineness"].item()), 2, MOST_SAMPLES)
-    travel, cross = axes(knots[None])
+    horizontals = len(knots) // 2
+    travel, cross = axes(knots[None], horizontals)
     misfits = []
     for weight in (UNIFORM, INVERSE_SQUARE):
         found = np.zeros((1, len(places), len(knots)))
         shape = (*frames(contact.radius, contact.sides), Law(contact.radius, weight, MANHATTAN))
-        quantized_signals(travel, cross, places, shape, samples, 0, len(knots), found)
+        quantized_signals(travel, cross, horizontals, places, shape, samples, 0, len(knots), found)
         misfits.append(float(np.abs(found[0] - expected).max()))
     return min(misfits)

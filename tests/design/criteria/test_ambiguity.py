@@ -10,7 +10,7 @@ from design import Morphology, signals
 from design.criteria.ambiguity import ambiguity, full_scale, sharpness
 from design.criteria.fibre_loss import draw_losses, loss_shares, lost_subsets
 from design.criteria.score import ambiguities
-from design.settings import PUBLISHED_CONTACT
+from design.settings import PUBLISHED_CONTACT, PadSettings
 
 PAIR = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
 ALL = torch.ones(1, 3), torch.ones(1)
@@ -103,6 +103,7 @@ def test_sharpness_is_the_mean_second_difference():
 def test_the_score_holds_the_ambiguity_of_every_number_of_losses():
     """On the module's own grid of presses, each mask of losses counted alike."""
     pad, contact, noise = Morphology.random(2, 3, seed=0), PUBLISHED_CONTACT, 0.07
+    size = PadSettings(grid=2)
     line = np.linspace(0.5, 2.5, 20)
     presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     found = torch.tensor(signals(pad, presses, contact).T)
@@ -111,5 +112,5 @@ def test_the_score_holds_the_ambiguity_of_every_number_of_losses():
     for masks in (np.ones((1, 4)), 1 - np.eye(4)):
         weight = torch.full((len(masks),), 1 / len(masks), dtype=torch.float64)
         expected.append(ambiguity(found, torch.tensor(presses), torch.tensor(masks), weight, sigma).item())
-    assert ambiguities(pad, contact, 1, noise) == pytest.approx(expected, rel=1e-3)
-    assert len(ambiguities(pad, contact, 9, noise)) == 4
+    assert ambiguities(pad, contact, 1, noise, size) == pytest.approx(expected, rel=1e-3)
+    assert len(ambiguities(pad, contact, 9, noise, size)) == 4

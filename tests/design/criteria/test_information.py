@@ -19,6 +19,9 @@ from design.criteria.information import (
 )
 from design.criteria.published_objective import published_presses, published_terms
 from design.pad.contact import boustrophedon
+from design.settings import Layout, between_fibres
+
+BETWEEN = between_fibres(Layout.of(4))
 
 
 def test_rows_that_all_differ_reach_the_ceiling():
@@ -80,7 +83,7 @@ def test_the_objective_is_the_sum_of_its_terms_for_each_pad_of_a_population():
 
 
 def test_published_presses_cover_the_grid():
-    places = published_presses(4)
+    places = published_presses(Layout.of(4))
     assert places.shape == (49, 2)
     assert places.min() >= 1
     assert places.max() <= 4 + 2 / 49
@@ -106,7 +109,7 @@ def test_disorder_area_of_a_known_bump():
 @pytest.mark.parametrize(("name", "share"), [("square_grid_cir", 0.70), ("5para_dis", 0.58)])
 def test_idle_share_of_the_published_pads(published, name, share):
     """Table III of the paper: 70 % and 57 % in simulation."""
-    places = boustrophedon(4, 32, 5 / 49)
+    places = boustrophedon(BETWEEN, 32, 5 / 49)
     assert idle_share(signals(Morphology.load(published / f"{name}.mat"), places)) == pytest.approx(share, abs=0.01)
 
 

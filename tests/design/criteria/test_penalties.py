@@ -17,7 +17,7 @@ NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0
 
 
 def axes(pad):
-    travel, cross, _ = fibre_axes(pad)
+    travel, cross = fibre_axes(pad)[:2]
     return torch.tensor(travel[0], requires_grad=True), torch.tensor(cross[0], requires_grad=True)
 
 
@@ -131,7 +131,7 @@ def test_a_fibre_too_long_costs_the_share_by_which_it_is(margin):
     limit = NONE.model_copy(update={"max_length_mm": 45.0})
     assert found(Morphology.straight(4), limit, margin)["max_length_mm"] == pytest.approx(1.25 * margin - 1)
     pad = bent(3.0)
-    over = lengths(pad)[0] * pad.pitch_mm / 57.0 - 1
+    over = lengths(pad)[0] * pad.unit_mm / 57.0 - 1
     limit = NONE.model_copy(update={"max_length_mm": 57.0})
     assert found(pad, limit)["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
 
@@ -166,7 +166,7 @@ def test_a_bend_costs_what_its_windows_turn_too_far(margin):
     for fibre in range(8):
         arc, heading, _, _ = dense(pad, fibre)
         turned = np.append(0, np.abs(np.diff(heading)).cumsum())
-        window = limit_mm / pad.pitch_mm / 2
+        window = limit_mm / pad.unit_mm / 2
         over = (np.interp(arc + window, arc, turned) - turned) * margin * 2 - 1
         expected += np.trapezoid(np.maximum(over, 0), arc) / (pad.grid + 1) / 8
     rules = NONE.model_copy(update={"min_bend_radius_mm": limit_mm})
@@ -177,7 +177,7 @@ def test_a_bend_costs_what_its_windows_turn_too_far(margin):
 def test_a_fibre_steep_beside_its_wall_costs_by_how_steep_and_how_long(cross, travel, fibre):
     pad, zone_mm = bent(cross, travel, fibre), 9.0
     arc, _, slope, at = dense(pad, fibre)
-    beside = (at < zone_mm / pad.pitch_mm) | (at > pad.grid + 1 - zone_mm / pad.pitch_mm)
+    beside = (at < zone_mm / pad.unit_mm) | (at > pad.grid + 1 - zone_mm / pad.unit_mm)
     expected = np.trapezoid(np.maximum(np.abs(slope) - 1, 0) * beside, arc) / 8 / (pad.grid + 1)
     found_ = found(pad, NONE.model_copy(update={"border_mm": zone_mm}))["border_mm"]
     assert expected > 0

@@ -4,7 +4,7 @@ import pytest
 
 from design import InputError, Morphology
 from design.criteria.score import score
-from design.settings import PUBLISHED_CONTACT
+from design.settings import PUBLISHED_CONTACT, PadSettings
 
 
 def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
@@ -16,10 +16,12 @@ def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
 def test_a_pad_is_scored_where_it_is_pressed():
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
     pad = Morphology.random(3, 4, seed=1)
-    beyond, between, wide = (score(pad, lost=1, sensed_mm=where) for where in ("beyond", "fibres", (40, 20)))
+    beyond, between, wide = (
+        score(pad, lost=1, size=PadSettings(sensed_mm=where)) for where in ("beyond", "fibres", (40, 20))
+    )
     for name in beyond:
         same = name.startswith(("published", "information", "penalty"))
         assert (beyond[name] == between[name] == wide[name]) == same
     assert score(pad, lost=1) == beyond
     with pytest.raises(InputError, match="the pad itself is 45 mm wide"):
-        score(pad, sensed_mm=(46, 20))
+        score(pad, size=PadSettings(sensed_mm=(46, 20)))

@@ -7,7 +7,7 @@ import torch
 from design.evaluation import expected_error as module
 from design.evaluation.expected_error import balanced, expected_error, expected_errors, two_lattices
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import Contact, PadSettings
 
 SIDE, SIZE = 14, np.array([4.0, 4.0])
 PLACES, STEPS = two_lattices(((0.0, 0.0), (4.0, 4.0)), np.random.default_rng(0))
@@ -35,7 +35,7 @@ def test_two_lattices_lie_within_the_rectangle_a_step_apart():
 def test_a_pad_errs_more_the_more_fibres_are_lost_and_the_louder_they_are():
     pad = Morphology.straight(3)
     wide = Contact(reach=((0, 1), (0.5, 0.66), (1.0, 0.19), (1.65, 0)), length="euclidean")
-    quiet, loud = (expected_errors(pad, wide, 2, noise) for noise in (0.01, 0.05))
+    quiet, loud = (expected_errors(pad, wide, 2, noise, PadSettings(grid=3)) for noise in (0.01, 0.05))
     assert quiet == sorted(quiet)
     assert np.all(np.array(loud) > quiet)
 

@@ -9,6 +9,7 @@ import torch
 from design import Contact, Morphology, signals
 from design.common.errors import InputError
 from design.evaluation.localisation_error import PressSets, fresh_presses, localisation_error, training_presses
+from design.settings import Layout, between_fibres
 
 
 def means(pad, **settings):
@@ -49,14 +50,15 @@ def test_the_result_depends_on_the_seed_and_not_on_the_cores(monkeypatch):
 
 @pytest.mark.parametrize("grid", [1, 4])
 def test_presses_to_test_on_are_others_than_those_learned(grid):
-    learned, fresh = training_presses(grid, 32, seed=0), fresh_presses(grid, 2000, seed=0)
+    between = between_fibres(Layout.of(grid))
+    learned, fresh = training_presses(between, 32, seed=0), fresh_presses(between, 2000, seed=0)
     low, high = (0.5, 1.5) if grid == 1 else (1, grid)
     assert not set(map(tuple, learned)) & set(map(tuple, fresh))
     for presses, beyond in ((learned, 5 / 49), (fresh, 0)):
         assert presses.min() >= low
         assert high - 0.1 < presses.max() <= high + beyond
         assert np.unique(presses, axis=0).shape == presses.shape
-    assert not np.array_equal(fresh, fresh_presses(grid, 2000, seed=1))
+    assert not np.array_equal(fresh, fresh_presses(between, 2000, seed=1))
 
 
 def test_a_pad_of_two_fibres_is_evaluated_as_far_as_fibres_are_left():

@@ -26,7 +26,7 @@ def test_descent_beats_the_square_grid_within_the_rules():
     settings = PUBLISHED_SEARCH.model_copy(update={"knots": 9, "starts": 1, "steps": 60, "lost": 1})
     found = search(PUBLISHED_PAD, PUBLISHED_CONTACT, settings)
     pads = found.morphology, Morphology.straight(4)
-    pad, grid = (score(m, PUBLISHED_CONTACT, lost=1, noise=0.02, sensed_mm="fibres") for m in pads)
+    pad, grid = (score(m, PUBLISHED_CONTACT, lost=1, noise=0.02, size=PadSettings(sensed_mm="fibres")) for m in pads)
     assert found.violations == []
     assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
     assert pad["ambiguity_lost_1"] < 0.5 * grid["ambiguity_lost_1"]

@@ -16,7 +16,7 @@ from design.settings import PadSettings, RulesSettings
 @given(st.integers(1, 5), st.integers(1, 9), st.integers(0, 99))
 def test_variables_of_a_pad_give_back_its_knots(grid, knots, seed):
     pad = Morphology.random(grid, knots, seed)
-    back = Morphology(Fibres.through(pad.knots, 1e-3).knots())
+    back = Morphology(Fibres.through(pad.knots, pad.layout, 1e-3).knots())
     clear = (pad.knots > 0.006 * (grid + 1)) & (pad.knots < 0.994 * (grid + 1))  # others are moved off the border
     assert np.abs(back.knots - pad.knots)[clear].max(initial=0) < 1e-9
     assert np.abs(back.knots - pad.knots).max() < 0.01 * (grid + 1)
@@ -25,7 +25,7 @@ def test_variables_of_a_pad_give_back_its_knots(grid, knots, seed):
 @given(st.integers(1, 20), st.integers(0, 99))
 def test_more_knots_leave_the_old_ones_and_keep_near_the_curve(more, seed):
     pad = Morphology.random(3, 4, seed)
-    finer = refine(pad.knots, 4 + more)
+    finer = refine(pad.knots, 4 + more, pad.layout)
     assert finer.shape == (6, 6 + more, 2)
     for fibre, (old, new) in enumerate(zip(pad.knots, finer, strict=True)):
         axis = fibre // 3
@@ -68,5 +68,6 @@ def test_one_of_the_random_starts_has_straight_fibres():
 
 def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
     rules = RulesSettings(border_mm=400)
-    knots = Fibres.through(Morphology.random(4, 5).knots, border_of(PadSettings(), rules)).knots()
+    pad = Morphology.random(4, 5)
+    knots = Fibres.through(pad.knots, pad.layout, border_of(PadSettings(), rules)).knots()
     assert "border_mm" in {violation.rule for violation in check_rules(Morphology(knots), rules)}

@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 
 from design import Contact, InputError, Morphology, signals_quantized
 from design.pad.contact import boustrophedon
-from design.settings import PUBLISHED_CONTACT
+from design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 SETS = [
     ("1para", PUBLISHED_CONTACT),
@@ -82,7 +82,7 @@ def test_a_straight_fibre_through_the_centre_signals_the_diameter():
 
 def test_a_population_is_its_members_one_by_one():
     pads = [Morphology.random(3, 2, seed) for seed in range(4)]
-    presses = boustrophedon(3, 5, 0.1)
+    presses = boustrophedon(between_fibres(Layout.of(3)), 5, 0.1)
     batch = signals_quantized(np.stack([pad.knots for pad in pads]), presses)
     assert batch.shape == (4, 25, 6)
     for pad, signals in zip(pads, batch, strict=True):
@@ -102,12 +102,12 @@ def test_presses_that_are_no_places_are_refused(presses):
 
 
 def test_the_serpentine_moves_one_cell_at_a_time():
-    places = boustrophedon(4, 7)
+    places = boustrophedon(between_fibres(Layout.of(4)), 7)
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 0.5)
     assert (places.min(), places.max()) == (1, 4)
 
 
 def test_the_serpentine_fills_the_rectangle_it_is_given():
-    places = boustrophedon(4, 3, rectangle=((0.5, 2), (4.5, 3)))
+    places = boustrophedon(((0.5, 2), (4.5, 3)), 3)
     expected = [(0.5, 2), (2.5, 2), (4.5, 2), (4.5, 2.5), (2.5, 2.5), (0.5, 2.5), (0.5, 3), (2.5, 3), (4.5, 3)]
     assert places.tolist() == [list(place) for place in expected]

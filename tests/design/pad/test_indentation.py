@@ -122,7 +122,7 @@ def test_the_surface_has_no_step_and_is_deepest_at_the_axis(indenter, depth):
 def test_forces_are_newtons():
     # a ball of 20 mm pressed 2 mm into a half-space of 100 kPa: 4/3 1e5 sqrt(0.01) 0.002^1.5
     ball = Indenter("sphere", radius=2.0)
-    assert ball.force_n(0.4, pitch_mm=5, reduced_modulus_kpa=100) == pytest.approx(4 / 3 * 1e5 * 0.1 * 0.002**1.5)
+    assert ball.force_n(0.4, unit_mm=5, reduced_modulus_kpa=100) == pytest.approx(4 / 3 * 1e5 * 0.1 * 0.002**1.5)
     assert pytest.approx(73.33, abs=0.01) == REDUCED_MODULUS_KPA
 
 

@@ -53,8 +53,8 @@ def test_knots_cannot_be_changed_afterwards():
     [
         (lambda k: k[:3], r"shape \(3, 3, 2\), expected \(2 M, N \+ 2, 2\)"),
         (lambda k: k * np.nan, "NaN"),
-        (lambda k: k + 0.1, r"a knot lies at 3\.1, allowed is 0 to 3"),
-        (lambda k: k - 0.1, r"a knot lies at -0\.1, allowed is 0 to 3"),
+        (lambda k: k + 0.1, r"a knot lies at x = 3\.1, allowed is 0 to 3 grid units"),
+        (lambda k: k - 0.1, r"a knot lies at x = -0\.1, allowed is 0 to 3 grid units"),
         (lambda k: k[:, [0, 2, 1]], "horizontal fibre 1: knots do not ascend"),
         (lambda k: np.concatenate([k[:3], k[3:, [0, 2, 1]]]), "vertical fibre 2: knots do not ascend"),
         (lambda k: np.where(np.arange(3)[:, None] == 0, k + 0.1, k), "must run from"),

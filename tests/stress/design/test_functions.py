@@ -67,7 +67,7 @@ def lines(found: Any, given: Arguments) -> None:
 
 def a_pad(found: Any, given: Arguments) -> None:
     assert isinstance(found, Morphology)
-    assert Morphology(found.knots, found.pitch_mm) == found
+    assert Morphology.of_layout(found.knots, found.layout) == found
 
 
 def a_section(found: Any, given: Arguments) -> None:
@@ -115,7 +115,7 @@ CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Argument
     "deflection": (Indenter().deflection, {"r": [0.1], "depth": 0.1}, lambda found, given: finite(found)),
     "force_n": (
         Indenter("flat").force_n,
-        {"depths": [0.1], "pitch_mm": 11.25, "reduced_modulus_kpa": 70},
+        {"depths": [0.1], "unit_mm": 11.25, "reduced_modulus_kpa": 70},
         lambda found, given: finite(found),
     ),
     "indented_signals": (
@@ -124,8 +124,8 @@ CALLS: Mapping[str, tuple[Callable[..., Any], Arguments, Callable[[Any, Argument
         some_signals,
     ),
     "Morphology": (Morphology, {"knots": PAD.knots, "pitch_mm": 11.25, "provenance": {}}, a_pad),
-    "straight": (Morphology.straight, {"grid": 2, "pitch_mm": 5.0}, a_pad),
-    "random": (Morphology.random, {"grid": 2, "knots": 2, "seed": 0, "pitch_mm": 5.0}, a_pad),
+    "straight": (Morphology.straight, {"fibres": (2, 1), "pitch_mm": 5.0}, a_pad),
+    "random": (Morphology.random, {"fibres": 2, "knots": 2, "seed": 0, "pitch_mm": 5.0}, a_pad),
     "from_parameters": (Morphology.from_parameters, {"parameters": np.ones((3, 8)), "pitch_mm": 5}, a_pad),
     "tiled": (PAD.tiled, {"times": 2}, a_pad),
     "load": (Morphology.load, {"path": "nowhere.json"}, a_pad),

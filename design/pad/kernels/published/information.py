@@ -58,40 +58,47 @@ def second_differences(levels: Any) -> float:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
-def disorder(curves: Any) -> float:
-    """Sum over pairs i < j of each family of the negative parts of curve_j - curve_i, curves (2M, F)."""
-    grid = len(curves) // 2
+def disorder(curves: Any, horizontals: int) -> float:
+    """Sum over pairs i < j of each family of the negative parts of curve_j - curve_i, curves (F, samples)."""
     total = 0.0
-    for family in range(2):
-        for i in range(family * grid, (family + 1) * grid):
-            for j in range(i + 1, (family + 1) * grid):
-                upper, lower = curves[i], curves[j]
-                for k in range(len(upper)):
-                    gap = upper[k] - lower[k]
-                    total += gap if gap > 0 else 0.0
+    for i in range(len(curves)):
+        for j in range(i + 1, horizontals if i < horizontals else len(curves)):
+            upper, lower = curves[i], curves[j]
+            for k in range(len(upper)):
+                gap = upper[k] - lower[k]
+                total += gap if gap > 0 else 0.0
     return total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def published_terms(
-    travel: Any, cross: Any, presses: Any, shape: Any, samples: int, levels: int, begin: int, end: int, out: Any
+    travel: Any,
+    cross: Any,
+    horizontals: int,
+    presses: Any,
+    shape: Any,
+    samples: int,
+    levels: int,
+    begin: int,
+    end: int,
+    out: Any,
 ) -> None:
     """Entropy (sum of the families' joint entropies), sharpness and disorder of pads begin..end into out (P, 3)."""
     fibres = travel.shape[1]
-    grid = fibres // 2
-    step = (grid + 1) / (samples - 1)
     curves = np.empty((fibres, samples))
     signals = np.empty((fibres, len(presses))).T
     scaled = np.empty((len(presses), fibres))
     for p in range(begin, end):
         for f in range(fibres):
-            t, v, own = travel[p, f], cross[p, f], in_frame(shape, f // grid)
+            family = 0 if f < horizontals else 1
+            t, v, own = travel[p, f], cross[p, f], in_frame(shape, family)
+            step = t[-1] / (samples - 1)
             pchip_sample(t, v, step, curves[f])
-            fibre_quantized(t, v, curves[f], step, presses, f // grid, own, signals[:, f])
+            fibre_quantized(t, v, curves[f], step, presses, family, own, signals[:, f])
         to_levels(signals, levels, scaled)
-        out[p, 0] = row_entropy(scaled, 0, grid) + row_entropy(scaled, grid, fibres)
+        out[p, 0] = row_entropy(scaled, 0, horizontals) + row_entropy(scaled, horizontals, fibres)
         out[p, 1] = second_differences(scaled)
-        out[p, 2] = disorder(curves)
+        out[p, 2] = disorder(curves, horizontals)
 
 
 @njit(cache=True, error_model="numpy")
@@ -136,12 +143,10 @@ def area_above(t: Any, v: Any, d: Any, other_t: Any, other_v: Any, other_d: Any)
 
 
 @njit(cache=True, error_model="numpy")
-def disorder_area(travel: Any, cross: Any, slope: Any) -> float:
-    """Sum of `area_above` over pairs i < j of each family of a pad, knots and slopes (2M, n)."""
-    grid = len(travel) // 2
+def disorder_area(travel: Any, cross: Any, slope: Any, horizontals: int) -> float:
+    """Sum of `area_above` over pairs i < j of each family of a pad, knots and slopes (F, n)."""
     total = 0.0
-    for family in range(2):
-        for i in range(family * grid, (family + 1) * grid):
-            for j in range(i + 1, (family + 1) * grid):
-                total += area_above(travel[i], cross[i], slope[i], travel[j], cross[j], slope[j])
+    for i in range(len(travel)):
+        for j in range(i + 1, horizontals if i < horizontals else len(travel)):
+            total += area_above(travel[i], cross[i], slope[i], travel[j], cross[j], slope[j])
     return total

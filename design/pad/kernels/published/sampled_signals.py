@@ -143,27 +143,27 @@ def fibre_quantized(t: Any, v: Any, curve: Any, step: float, presses: Any, famil
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def quantized_signals(
-    travel: Any, cross: Any, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
+    travel: Any, cross: Any, horizontals: int, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
 ) -> int:
     """The published rule: sum over sampled segments that start inside the press.
 
     Args:
-        travel, cross: (P, 2M, n) knots. presses: (Q, 2) x and y. shape: as `in_frame` takes it.
+        travel, cross: (P, F, n) knots. presses: (Q, 2) x and y. shape: as `in_frame` takes it.
         samples: points per fibre, uniform along its travel axis.
-        begin, end: range of fibres to do, counted through the population, 0..2M P.
-        out: (P, Q, 2M) to fill.
+        begin, end: range of fibres to do, counted through the population, 0..F P.
+        out: (P, Q, F) to fill.
 
     Returns:
         How many samples were looked at.
     """
     fibres = travel.shape[1]
-    step = (fibres // 2 + 1) / (samples - 1)
     curve = np.empty(samples)
     looked_at = 0
     for index in range(begin, end):
         p, f = index // fibres, index % fibres
-        family = 0 if f < fibres // 2 else 1
+        family = 0 if f < horizontals else 1
         t, v = travel[p, f], cross[p, f]
+        step = t[-1] / (samples - 1)
         pchip_sample(t, v, step, curve)
         looked_at += fibre_quantized(t, v, curve, step, presses, family, in_frame(shape, family), out[p, :, f])
     return looked_at

@@ -35,7 +35,7 @@ def test_slopes_are_scipys(pad):
 @given(pads)
 def test_sampled_curves_are_scipys(pad):
     at = np.linspace(0, pad.grid + 1, 200)
-    compiled = sample_curves(pad.knots[None], 200)[0]
+    compiled = sample_curves(pad.knots[None], pad.layout.horizontals, 200)[0]
     axes = [0] * pad.grid + [1] * pad.grid
     t = torch.tensor(np.array([k[:, a] for k, a in zip(pad.knots, axes, strict=True)]))
     v = torch.tensor(np.array([k[:, 1 - a] for k, a in zip(pad.knots, axes, strict=True)]))

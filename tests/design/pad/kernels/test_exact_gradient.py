@@ -7,7 +7,8 @@ import torch
 from design import Contact, Morphology, signals
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.pad.contact import fibre_axes
-from design.settings import PUBLISHED_CONTACT
+from design.pad.knots import kernel_ends
+from design.settings import PUBLISHED_CONTACT, Layout
 
 REACH = ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0))
 CONTACTS = [
@@ -30,8 +31,12 @@ def straight_axes(grid):
     return [torch.tensor(np.insert(axis, 1, axis.mean(axis=1), axis=1), requires_grad=True) for axis in ends]
 
 
+def square_ends(travel):
+    return kernel_ends(Layout.of(len(travel) // 2))
+
+
 def torch_signals(travel, cross, presses, contact):
-    return press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact)
+    return press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact, square_ends(travel))
 
 
 def taylor_ratio(contact, seed):

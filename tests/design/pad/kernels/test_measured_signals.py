@@ -9,6 +9,8 @@ from design.criteria.differentiable import pchip_slopes, press_signals
 from design.pad.contact import fibre_axes
 from design.pad.kernels.measured_signals import PRECISION, fibre_elements, spacing_of
 from design.pad.kernels.press import MANHATTAN
+from design.pad.knots import kernel_ends
+from design.settings import Layout
 
 REACHES = {
     "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),
@@ -31,7 +33,12 @@ def knots_of(pad):
 def searched(pad, presses, contact):
     """(Q, 2M) signals of the kind that a search takes."""
     travel, cross = knots_of(pad)
-    return press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact).detach().numpy().T
+    return (
+        press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact, kernel_ends(pad.layout))
+        .detach()
+        .numpy()
+        .T
+    )
 
 
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
@@ -58,7 +65,7 @@ def test_the_gradient_is_that_of_the_exact_signals(reach):
     upstream = rng.normal(size=6)
     pad = Morphology.random(3, 5, seed=2)
     travel, cross = knots_of(pad)
-    found = press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact)
+    found = press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact, kernel_ends(pad.layout))
     (torch.tensor(upstream)[:, None] * found).sum().backward()
     assert cross.grad is not None
     move = rng.normal(size=cross.shape)
@@ -77,11 +84,11 @@ def test_elements_lie_only_where_a_press_may_feel_them():
     cross = torch.arange(1.0, grid + 1, dtype=torch.float64).repeat(2)[:, None].repeat(1, 42).requires_grad_()
     slope = torch.zeros_like(cross)
     t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-    starts = fibre_elements(t, v, d, corner, 1.6, spacing_of(reach), MANHATTAN).starts
+    starts = fibre_elements(t, v, d, grid, corner, 1.6, spacing_of(reach), MANHATTAN).starts
     felt = np.diff(starts) > 0
     assert felt.any(axis=1).nonzero()[0].tolist() == [0, 1, 2, 40, 41, 42]
     assert felt.any(axis=0).nonzero()[0].tolist() == [0, 1, 2, 3]
-    press_signals(travel, cross, slope, corner, Contact(reach=reach)).sum().backward()
+    press_signals(travel, cross, slope, corner, Contact(reach=reach), kernel_ends(Layout.of(grid))).sum().backward()
     assert cross.grad is not None
     moved = cross.grad.numpy().astype(bool)
     assert moved[0, :4].all()

@@ -76,7 +76,7 @@ def test_penalties_and_their_gradients_are_finite(data):
         max_crossings=data.draw(st.sampled_from([None, 9])),
         min_crossing_angle_deg=data.draw(st.sampled_from([0.0, 40.0])),
     )
-    course = Fibres.through(pad.knots, 0.01)
+    course = Fibres.through(pad.knots, pad.layout, 0.01)
     assert np.isfinite(course.knots()).all()
     with ends_in_time():
         found = penalties(*course.axes(), PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)

@@ -15,6 +15,8 @@ from design.pad.kernels.exact_gradient import signals_gradient
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.press import family_strays
 from design.pad.kernels.roots import SCRATCH, roots_in_unit
+from design.pad.knots import kernel_ends
+from design.settings import Layout
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import transposed
@@ -27,12 +29,15 @@ def test_gradients_are_finite_and_right_away_from_kinks(data):
     pad = data.draw(pads((1, 2), (1, 5)))
     contact = data.draw(contacts())
     travel, cross = (axis[0].copy() for axis in fibre_axes(pad)[:2])
+    ends = fibre_axes(pad)[2]
     slope = population_slopes(travel[None], cross[None])[0]
     places = np.random.default_rng(data.draw(seeds())).uniform(0, pad.grid + 1, (3, 2))
     shape = press_shape(contact)
     upstream = np.ones((len(places), 2 * pad.grid))
     with ends_in_time():
-        found = signals_gradient(travel, cross, slope, family_strays(cross[None])[0], places, upstream, *shape)
+        found = signals_gradient(
+            travel, cross, slope, family_strays(cross[None], ends)[0], ends, places, upstream, *shape
+        )
     if np.diff(travel).min() > 1e-6:
         assert np.isfinite(found).all()
     if (
@@ -55,15 +60,16 @@ def test_gradients_are_finite_differences(seed, weight, length):
     contact = Contact(radius=0.6, sides=None, weight=weight, length=length)
     slope, place = population_slopes(travel[None], cross[None])[0], np.array([[1.0, 1.1]])
     shape, strays = press_shape(contact), np.array([2.0, 2.0])
+    ends = kernel_ends(Layout.of(1))
 
     def total(v: Array) -> float:
         from design.pad.kernels.exact_signals import exact_signals
 
         out, none = np.zeros(2), np.empty(0, np.int64)
-        exact_signals(travel[None], v[None], slope[None], strays[None], place, *shape, 0, 1, none, none, out)
+        exact_signals(travel[None], v[None], slope[None], strays[None], ends, place, *shape, 0, 1, none, none, out)
         return float(out.sum())
 
-    found = signals_gradient(travel, cross, slope, strays, place, np.ones((1, 2)), *shape)[1]
+    found = signals_gradient(travel, cross, slope, strays, ends, place, np.ones((1, 2)), *shape)[1]
     step = 1e-6
     for fibre in range(2):
         for knot in range(1, 4):

@@ -1,0 +1,42 @@
+"""The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
+
+from collections.abc import Mapping
+
+from design.common.settings import Settings
+
+from .contact import MEASURED_REACH, PUBLISHED_CONTACT, Contact
+from .layout import MOST_FIBRES, Counts, Layout, Pitch
+from .pad import PadSettings, Polygon, Rectangle, Sensed, between_fibres, sensed_rectangle
+from .rules import RulesSettings
+from .search import NOISE, Lost, SearchSettings
+
+PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.11)
+PUBLISHED: Mapping[str, Settings] = {
+    "pad": PUBLISHED_PAD,
+    "contact": PUBLISHED_CONTACT,
+    "search": PUBLISHED_SEARCH,
+}
+"""The world of the paper, by section, as far as it is another than the default."""
+
+__all__ = [
+    "MEASURED_REACH",
+    "MOST_FIBRES",
+    "NOISE",
+    "PUBLISHED",
+    "PUBLISHED_CONTACT",
+    "PUBLISHED_PAD",
+    "PUBLISHED_SEARCH",
+    "Contact",
+    "Counts",
+    "Layout",
+    "Lost",
+    "PadSettings",
+    "Pitch",
+    "Polygon",
+    "Rectangle",
+    "RulesSettings",
+    "SearchSettings",
+    "Sensed",
+    "between_fibres",
+    "sensed_rectangle",
+]

@@ -1,0 +1,47 @@
+"""`[rules]`: what makes a pad buildable."""
+
+from typing import Annotated
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from design.common.settings import Settings
+
+
+def _any(value: object) -> object:
+    return None if isinstance(value, str) and value == "any" else value
+
+
+MaxCrossings = Annotated[
+    Annotated[int, Field(ge=0)] | None,
+    BeforeValidator(_any),
+    PlainSerializer(lambda most: "any" if most is None else most),
+]
+
+
+class RulesSettings(Settings):
+    """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`check_rules` has the formulas).
+
+    Attributes:
+        max_crossings: greatest number of crossings of a horizontal with a vertical fibre, or None for any number
+            ("any" in pad.toml). Every horizontal has to cross every vertical, so a limit below grid^2 cannot be met.
+    """
+
+    enforce: bool = Field(
+        default=True, description="false drops every rule: an explicit choice to design the unbuildable"
+    )
+    min_bend_radius_mm: float = Field(default=1.0, ge=0, le=1000, description="least bend radius of a fibre, mm")
+    min_gap_mm: float = Field(
+        default=0.8, ge=0, le=1000, description="least gap between centre lines of a family, or folds of a fibre, mm"
+    )
+    same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
+    max_crossings: MaxCrossings = Field(
+        default=None, description='crossings of horizontals with verticals allowed (at least grid^2), or "any"'
+    )
+    min_crossing_angle_deg: float = Field(
+        default=0.0, ge=0, le=90, description="least angle at which horizontals cross verticals, degrees"
+    )
+    border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
+    keep_out_mm: float = Field(
+        default=1.5, ge=0, le=1000, description="least distance of a fibre to a keep-out of [pad], mm"
+    )
+    max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")

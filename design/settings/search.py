@@ -1,0 +1,61 @@
+"""`[search]`: how the fibres are found."""
+
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, field_validator
+
+from design.common.settings import Settings, as_tuple
+
+from .contact import PUBLISHED_CONTACT, Contact
+
+Share = Annotated[float, Field(ge=0, le=1e6)]
+
+Lost = Annotated[
+    Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Share, ...], Field(min_length=1, max_length=9)],
+    BeforeValidator(as_tuple),
+]
+
+
+NOISE = 0.05
+"""What an ambiguity can tell: the built pad's responses scatter by 0.01 to 0.02 of full scale, but at that
+no confusions are left among presses a fifth of a grid unit apart."""
+
+
+class SearchSettings(Settings):
+    """`[search]`: how the fibres are found.
+
+    Attributes:
+        lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
+        contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
+    """
+
+    method: Literal["descent", "error", "genetic"] = Field(
+        default="descent", description="gradients of the ambiguity, or of the expected error; or as published"
+    )
+    knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
+    starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
+    steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
+    population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
+    generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
+    lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
+    noise: float = Field(
+        default=NOISE, ge=1e-9, le=10, description="standard deviation of a signal's noise, of full scale"
+    )
+    sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
+    contacts: Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="further contacts to serve as well, each a table like [contact]"
+    )
+    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where presses are told apart")
+
+    @property
+    def usual_contact(self) -> Contact:
+        """What is designed for where nothing else is asked: the measured contact, by the published method its own."""
+        return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
+
+    @field_validator("lost")
+    @classmethod
+    def _some_weight(cls, lost: int | tuple[float, ...]) -> int | tuple[float, ...]:
+        if isinstance(lost, tuple) and sum(lost) == 0:
+            raise ValueError("one of the weights must be above 0")
+        return lost

@@ -1,0 +1,173 @@
+"""Keep-outs and bent pads: exact rules against closed forms, penalties with a true gradient, courses that pass by."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from design import InputError, Morphology
+from design.criteria.penalties import penalties
+from design.criteria.rules import check_rules
+from design.criteria.score import free_presses
+from design.pad.contact import fibre_axes
+from design.pad.courses.bending import bend_radius, rolled_turns
+from design.pad.courses.keep_out import keep_outs, outside, require_free_ends
+from design.pad.courses.passing import passing, straight_course
+from design.settings import Layout, PadSettings, RulesSettings
+
+NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
+
+
+def only(**limits):
+    return NONE.model_copy(update=limits)
+
+
+def square(x, y, side):
+    half = side / 2
+    return ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
+
+
+def kept_off(*polygons, counts=(3, 6), pitch_mm=(8.0, 15.0)):
+    return PadSettings(keep_out_mm=polygons, **Layout.of(counts, pitch_mm).settings)
+
+
+def test_the_distance_of_straight_fibres_to_a_square_is_found_exactly():
+    """Horizontals of this pad run at y = -15, 0 and 15 mm, verticals 8 mm apart from x = -20 mm."""
+    size = kept_off(square(1.0, 7.0, 4.0))
+    found = check_rules(Morphology.straight(size.layout), only(keep_out_mm=5.9), size)
+    # edges at y = 5 and 9, x = -1 and 3; verticals at -4 and 4
+    expected = {(2,): 5.0, (6,): 3.0, (7,): 1.0}
+    assert {v.fibres: v.measured for v in found} == pytest.approx(expected)
+    assert {v.rule for v in found} == {"keep_out_mm"}
+    (nearest,) = (v for v in found if v.fibres == (7,))
+    assert nearest.place_mm is not None
+    assert nearest.place_mm[0] == pytest.approx(4)
+
+
+def test_a_fibre_through_a_keep_out_and_one_that_touches_it_are_in_it():
+    size = kept_off(square(-10.0, 0.0, 4.0))
+    found = check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), size)
+    assert {v.fibres: v.measured for v in found} == {(2,): 0, (5,): 0}
+    places = {v.fibres: v.place_mm for v in found}
+    assert places[2,] == pytest.approx((-10, 0))
+    assert places[5,] == pytest.approx((-12, 0))
+    assert not check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), kept_off(square(-8.0, 7.0, 6.0)))
+
+
+@pytest.mark.parametrize(
+    ("polygon", "message"),
+    [
+        (((0, 0), (4, 4), (4, 0), (0, 4)), "polygon 1 crosses or touches itself or has no area"),
+        (((0, 0), (4, 4), (8, 8)), "polygon 1 crosses or touches itself or has no area"),
+        (((0, 0), (4, 4)), "polygon 1 has 2 corners, allowed are 3 to 1000"),
+        (square(100, 0, 4), r"polygon 1 lies beside the pad, which is 56 by 60 mm about \(0, 0\)"),
+    ],
+)
+def test_keep_outs_that_are_none_are_refused_in_one_line(polygon, message):
+    with pytest.raises(InputError, match=rf"keep_out_mm: .*{message}") as refused:
+        kept_off(tuple((float(x), float(y)) for x, y in polygon))
+    assert "\n" not in str(refused.value)
+
+
+def test_keep_outs_over_the_ends_of_fibres_or_all_that_is_pressed_are_refused_in_one_line():
+    with pytest.raises(InputError, match=r"is 1 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"):
+        require_free_ends(kept_off(square(-25.0, -15.0, 4.0)), RulesSettings())
+    require_free_ends(kept_off(square(-24.0, -15.0, 4.0)), RulesSettings())
+    with pytest.raises(InputError, match="keep_out_mm covers all that is pressed"):
+        free_presses(kept_off(((-28.0, -30.0), (28.0, -30.0), (28.0, 30.0), (-28.0, 30.0))))
+
+
+def test_presses_lie_in_no_keep_out():
+    size = kept_off(square(0.0, 0.0, 16.0), ((-20.0, -20.0), (-10.0, -20.0), (-15.0, -10.0)))
+    places = np.random.default_rng(0).uniform(0, size.layout.extent, (500, 2))
+    free = outside(places, size)
+    mm = Morphology.straight(size.layout).to_mm(places)
+    assert not free[(np.abs(mm) < 8).all(axis=1)].any()
+    assert free[(mm[:, 0] > 8.1)].all()
+    assert sum(polygon.area for polygon in keep_outs(size)) * size.layout.unit_mm**2 == pytest.approx(16**2 + 50)
+
+
+def penalty(pad, size, cross=None, clearance=3.0):
+    travel, own = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
+    return penalties(travel, own if cross is None else cross, size, only(keep_out_mm=clearance))["keep_out_mm"]
+
+
+def test_the_penalty_of_a_keep_out_vanishes_with_the_clearance_and_has_a_true_gradient():
+    size = kept_off(square(2.0, 6.0, 9.0))
+    assert penalty(Morphology.straight(size.layout), size, clearance=1.0).item() > 0
+    free = Morphology.straight(size.layout)
+    assert penalty(free, kept_off(square(0.0, 7.0, 1.8))).item() == 0
+    pad, rng = Morphology.random(size.layout, 4, seed=3), np.random.default_rng(0)
+    cross = torch.tensor(fibre_axes(pad)[1][0], requires_grad=True)
+    penalty(pad, size, cross).backward()
+    assert cross.grad is not None
+    step = 1e-6 * torch.tensor(rng.standard_normal(cross.shape))
+    step[:, [0, -1]] = 0
+    ahead, behind = (penalty(pad, size, cross.detach() + sign * step).item() for sign in (1, -1))
+    assert (ahead - behind) / 2 == pytest.approx((cross.grad * step).sum().item(), rel=1e-3)
+
+
+def test_straight_fibres_bow_around_a_keep_out_within_the_rules_and_stay_in_order():
+    size, rules = kept_off(square(2.0, 1.0, 10.0)), RulesSettings()
+    assert check_rules(Morphology.straight(size.layout), rules, size)
+    pad = Morphology.of_layout(straight_course(size, rules, 21), size.layout)
+    assert check_rules(pad, rules, size) == []
+    away = np.abs(pad.knots[:3, :, 1] - size.layout.levels[:3, None]).max(axis=1)
+    assert (away[1] > 0.3, away[0] == 0) == (True, True)
+    few = Morphology.of_layout(straight_course(size, rules, 3), size.layout)
+    assert few.knots.shape == (9, 5, 2)
+
+
+@given(st.integers(0, 99), st.floats(-8, 8), st.floats(-8, 8))
+@settings(max_examples=20)
+def test_fibres_that_pass_keep_outs_keep_the_order_they_had(seed, x, y):
+    size, rng = kept_off(square(x, y, 6.0), square(-x, 2.0, 3.0)), np.random.default_rng(seed)
+    course = straight_course(PadSettings().of(size.layout), RulesSettings(), 12)
+    lifts = 0.3 * rng.standard_normal(12)
+    course[:3, 1:-1, 1] += lifts
+    course[3:, 1:-1, 0] += lifts
+    found = passing(course, size, RulesSettings())
+    assert (np.diff(found[:3, :, 1], axis=0) > 0).all()
+    assert (np.diff(found[3:, :, 0], axis=0) > 0).all()
+    np.testing.assert_array_equal(passing(course, size, RulesSettings(enforce=False)), course)
+
+
+def test_a_helix_is_as_curved_as_its_radius_and_pitch_say():
+    """A straight line at the angle a to x on a cylinder of radius R is a helix of radius R / cos(a)^2."""
+    for angle, expected in ((0.0, 5.0), (np.pi / 4, 10.0), (np.pi / 3, 20.0), (np.pi / 2, np.inf)):
+        line = np.linspace(0, 30, 61)[:, None] * [np.cos(angle), np.sin(angle)]
+        headings = np.full(61, angle)
+        radius = bend_radius(line, headings, 2.0, rolled_turns(line, headings, 5.0))[0]
+        assert radius == pytest.approx(expected) if angle < 1.5 else radius > 1e15
+
+
+def test_an_arc_on_a_cylinder_is_curved_by_the_root_of_both_squares():
+    """At the top of the arc, which runs along x there, 1 / r^2 + 1 / R^2; and as it is in space."""
+    r, cylinder, window = 6.0, 8.0, 0.2
+    angle = np.linspace(-0.3, 0.3, 4001)
+    points = r * np.column_stack([np.sin(angle), 1 - np.cos(angle)])
+    found, place = bend_radius(points, angle, window, rolled_turns(points, angle, cylinder))
+    assert found == pytest.approx(1 / np.hypot(1 / r, 1 / cylinder), rel=1e-3)
+    assert place == pytest.approx((0, 0), abs=0.05)
+    across = points[:, 0] / cylinder
+    space = np.column_stack([cylinder * np.sin(across), points[:, 1], cylinder * np.cos(across)])
+    tangent = np.diff(space, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    turned = np.linalg.norm(np.diff(tangent, axis=0), axis=1).sum()
+    rolled = np.hypot(np.diff(angle), rolled_turns(points, angle, cylinder)).sum()
+    assert rolled == pytest.approx(turned, rel=1e-3)
+
+
+def test_a_bent_pad_bends_fibres_that_run_around_it():
+    rules, pad = only(min_bend_radius_mm=10.0), Morphology.straight(Layout.of((3, 2), (8.0, 15.0)))
+    assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
+    found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
+    assert [(v.fibres, v.measured) for v in found] == [((f,), pytest.approx(9)) for f in (1, 2, 3)]
+    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
+    for radius, expected in ((9.0, 10 / 9 - 1), (10.5, 0.0)):
+        size = PadSettings(bent_radius_mm=radius).of(pad.layout)
+        # the penalty takes every fibre to run around the cylinder
+        assert penalties(travel, cross, size, rules)["min_bend_radius_mm"].item() == pytest.approx(
+            expected * float((travel[:, -1] / travel[:, -1].mean()).mean()), abs=1e-9
+        )
