@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +15,10 @@ from design.common.command_line import (
     show_result,
     spec_option,
 )
+
+if TYPE_CHECKING:
+    from design.common.settings import Spec
+    from design.pad.morphology import Morphology
 
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
@@ -130,3 +134,14 @@ def _line(finding: dict[str, Any]) -> str:
     more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
     where = f" at {' '.join(places[:3])}{more}" if places else ""
     return f"{MARKS[finding['status']]} {finding['name']}: {finding['message']}{where}"
+
+
+def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
+    """What the mould of a pad takes, with its fabrication.json and .stl written to `folder`: ml, and failed checks."""
+    from .export import build as build_files
+    from .settings import FabricationSettings
+
+    settings = FabricationSettings.from_spec(spec)
+    found = build_files(pad, folder, ("stl",), settings, warn=partial(click.echo, err=True))
+    failed = sum(finding["status"] == "fail" for finding in found["findings"])
+    return {"mould_ml": found["mould_volume_ml"], "silicone_ml": found["silicone_volume_ml"], "failed": failed}

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, field_validator
 
 from design.common.errors import InputError, instance
 from design.common.settings import Settings, Spec
-from design.settings import PadSettings, RulesSettings
+from design.settings import Layout, PadSettings, RulesSettings
 
 from .materials import FibreSettings, SiliconeSettings
 
@@ -73,6 +73,11 @@ class PrinterSettings(Settings):
     )
     resin: bool = Field(default=False, description="true for a resin printer")
 
+    @property
+    def line_mm(self) -> float:
+        """The narrowest that it draws: its nozzle, or two pixels of its screen."""
+        return self.nozzle_mm * (2 if self.resin else 1)
+
     def is_whole(self, height_mm: float) -> bool:
         """Whether a height is a whole number of layers."""
         layers = height_mm / self.layer_mm
@@ -136,6 +141,27 @@ STEP_MM = 0.03
 """Width of the terraces of a tapered ridge: no wider than what printers place a line by."""
 
 
+WELL_MM, WELL_RIM_MM = 3.0, 1.0
+"""Diameter of the wells for conductive material, and silicone around one."""
+WELL_SLOT_MM = WELL_MM + 2 * WELL_RIM_MM
+"""Length and width of the slots of a mould with wells."""
+
+
+@dataclass(frozen=True)
+class LeadRoom:
+    """What leads to one side keep.
+
+    Attributes:
+        border_mm: of silicone around the pad. apart_mm: between middles of neighbours. radius_mm: of their bends.
+        edge_mm: from the outermost lead's middle to the silicone's edge.
+    """
+
+    border_mm: float
+    apart_mm: float
+    radius_mm: float
+    edge_mm: float
+
+
 _SECTIONS: dict[str, type[Any]] = {"mould": MouldSettings, "printer": PrinterSettings}
 _SECTIONS |= {"pad": PadSettings, "rules": RulesSettings, "silicone": SiliconeSettings, "fibre": FibreSettings}
 _SECTIONS |= {"dispenser": DispenserSettings}
@@ -149,7 +175,7 @@ _RIDGES, _DEPTH = ("deep_ridge_height_mm", "shallow_ridge_height_mm"), ("silicon
 class FabricationSettings:
     """All that shapes a mould, and the way of what lays its fibres, beside the morphology.
 
-    Of `[pad]` only the deep family is used.
+    Of `[pad]` the deep family, keep-outs, leads and the radius it is bent to are used; its fibres are the morphology's.
     """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
@@ -204,21 +230,43 @@ class FabricationSettings:
             if all(self.printer.is_whole(getattr(self.mould, key)) for key in keys):
                 larger |= {key: round(round(larger[key] / layer) * layer, 9) for key in keys}
         mould = self.mould.model_copy(update=larger)
-        return replace(self, mould=mould, silicone=self.silicone.model_copy(update={"shrinkage": 0.0}))
+        keep_outs = tuple(tuple((x / self.shrunk, y / self.shrunk) for x, y in each) for each in self.pad.keep_out_mm)
+        pad = self.pad.model_copy(update={"keep_out_mm": keep_outs})
+        return replace(self, mould=mould, pad=pad, silicone=self.silicone.model_copy(update={"shrinkage": 0.0}))
 
-    def require_consistent(self, pitch_mm: float) -> None:
+    @property
+    def least_bend_mm(self) -> float:
+        """Radius of the tightest bend that the rules and the fibre allow, mm."""
+        return max(self.rules.min_bend_radius_mm, self.fibre.material.least_bend_mm or 0)
+
+    def lead_room(self, tallest_mm: float, flare_mm: float) -> "LeadRoom":
+        """What leads to one side keep, for ridges so tall and walls that lean outwards so far."""
+        mould = self.mould
+        foot = mould.ridge_width_mm + 2 * tallest_mm * self.ridge_slope
+        apart = max(foot + mould.min_silicone_mm, self.rules.min_gap_mm)
+        if mould.exit_mm:
+            width = max(mould.exit_width_mm, WELL_SLOT_MM if mould.conductive else 0)
+            apart = max(apart, width + 2 * flare_mm + 2 * self.printer.line_mm)
+        edge = max(apart / 2, foot / 2 + mould.min_silicone_mm)
+        return LeadRoom(mould.border_mm, apart, max(self.least_bend_mm, (foot + mould.min_silicone_mm) / 2), edge)
+
+    def require_consistent(self, layout: Layout) -> None:
         """Refuse settings that contradict each other or the pitch of the pad.
 
         Raises:
             InputError: names the key, its value and what is allowed.
         """
         mould = self.mould
+        across = (layout.pitch_y_mm, layout.horizontals), (layout.pitch_x_mm, layout.verticals)
+        pitch_mm = min(pitch for pitch, count in across if count)
         _require_less("ridge_width_mm", mould.ridge_width_mm, pitch_mm, "the pitch")
         _require_less("tolerance_mm", mould.tolerance_mm, mould.ridge_width_mm / 4, "a quarter of ridge_width_mm")
         shallow, deep = mould.shallow_ridge_height_mm, mould.deep_ridge_height_mm
         _require_less("shallow_ridge_height_mm", shallow, deep, "deep_ridge_height_mm")
         _require_less("deep_ridge_height_mm", deep, mould.silicone_mm, "silicone_mm")
         if mould.exit_mm:
+            if self.pad.leads == "one side":  # where the leads of horizontals keep a distance of their own
+                pitch_mm = layout.pitch_x_mm if layout.verticals else math.inf
             if mould.exit_width_mm <= mould.ridge_width_mm:
                 allowed = f"more than ridge_width_mm, {mould.ridge_width_mm:g} mm"
                 raise InputError(f"[mould] exit_width_mm: got {mould.exit_width_mm:g}, allowed is {allowed}")

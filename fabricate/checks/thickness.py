@@ -38,14 +38,9 @@ _NEAR_CORNER = 0.98
 """Share of the way from a triangle's middle to its corners where its thickness is measured too."""
 
 
-def least_line_mm(printer: PrinterSettings) -> float:
-    """The narrowest that a printer draws: its nozzle, or two pixels of its screen."""
-    return printer.nozzle_mm * (2 if printer.resin else 1)
-
-
 def ridge_width(slices: Sequence[Slab], printer: PrinterSettings) -> Finding:
     """Whether everything that stands in a layer is as wide as what the printer draws."""
-    limit, name = least_line_mm(printer), "two pixels" if printer.resin else "the nozzle"
+    limit, name = printer.line_mm, "two pixels" if printer.resin else "the nozzle"
     sections = [slab.cross_section for slab in slices]
     least, places = _narrowest(sections, [None] * len(sections), limit)
     if not places:
@@ -104,7 +99,7 @@ def _points_on(patches: NDArray[np.object_]) -> NDArray[np.float64]:
 
 def wall_thickness(slices: Sequence[Slab], printer: PrinterSettings, size: float) -> Finding:
     """Whether the walls around the casting are two lines thick where they are thinnest, just below their rim."""
-    line = least_line_mm(printer)
+    line = printer.line_mm
     limit = _WALL_LINES * printer.nozzle_mm
     cast = [slab for slab in slices if slab.void.area]
     if not cast:

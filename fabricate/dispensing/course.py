@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from design.pad.courses.bending import traced_curve
-from design.pad.courses.curves import beziers, flatten, slope_beziers
+from design.pad.courses.curves import beziers, slope_beziers
 from design.pad.knots import Array
 from fabricate.mould.plan import Plan
 from fabricate.report.fibre_layers import Layer, layers
@@ -28,6 +28,8 @@ TOLERANCE_MM = 0.005
 """How far the straight pieces of a course may lie from the curve: a tenth of what a fine gantry repeats."""
 _FLAT_SHARE, _THINNED_SHARE = 0.2, 0.8
 """How the tolerance is shared: most thins out the points."""
+_LEAD_MM = 1e-5
+"""To what the bends of leads are drawn, where it is looked how tight they are."""
 _TURN = 0.02
 """Between two points at which the heading is known a curve turns by no more, radians."""
 _STRAIGHT = 1e-6
@@ -43,7 +45,7 @@ class Stroke:
     """One fibre as the needle lays it, from the end of its first lead to the end of its other.
 
     Attributes:
-        fibre: its number among all, 0..2M-1.
+        fibre: its number among all, 0..F-1.
         places_mm: (n, 2) corners of the way, in the frame of the pad turned over.
         z_mm: height of the needle's mouth, negative within the track.
         feeds_mm_s: (n - 1,) speed from each corner to the next.
@@ -76,15 +78,16 @@ def laying_steps(plan: Plan, diameter_mm: float, largest_stretch: float = math.i
         diameter_mm: of the fibre.
         largest_stretch: elongation that the fibre bears, 1 for twice its length; inf where nobody knows.
     """
-    curves = flatten(plan.pad, _FLAT_SHARE * TOLERANCE_MM / plan.pad.pitch_mm)
+    courses = plan.courses(_FLAT_SHARE * TOLERANCE_MM, plan.settings.mould.lead_mm)
     bends = _Bends(plan, diameter_mm)
     steps = []
     for layer in layers(plan):
         strokes = []
         for fibre in layer.fibres:
-            places = _with_leads(plan, fibre, plan.pad.to_mm(curves[fibre]))
-            places, corner = _with_ends(places, diameter_mm)
-            radii = bends.least_radii(fibre, places[:, layer.family])
+            whole = shapely.LineString(courses[fibre])
+            thinned = whole.simplify(_THINNED_SHARE * TOLERANCE_MM, preserve_topology=False)
+            places, corner = _with_ends(shapely.get_coordinates(thinned), diameter_mm)
+            radii = bends.least_radii(fibre, places)
             feeds = _feeds(plan.settings.dispenser, radii, diameter_mm, largest_stretch)
             kept = corner | np.concatenate([[True], np.diff(feeds) != 0, [True]])
             z = round(diameter_mm - layer.depth_mm, 9)
@@ -96,14 +99,6 @@ def laying_steps(plan: Plan, diameter_mm: float, largest_stretch: float = math.i
 def turned_over(places_mm: Array) -> Array:
     """Places (..., 2) of the plan as they lie on the pad turned over, and the other way round; no -0."""
     return places_mm * (-1, 1) + 0.0
-
-
-def _with_leads(plan: Plan, fibre: int, curve: Array) -> Array:
-    """The corners of a fibre's course with straight leads at both ends, as few as the tolerance allows."""
-    mould = plan.settings.mould
-    ahead = (mould.border_mm + mould.exit_mm + mould.lead_mm) * np.eye(2)[plan.family(fibre)]
-    whole = shapely.LineString(np.vstack([curve[:1] - ahead, curve, curve[-1:] + ahead]))
-    return shapely.get_coordinates(whole.simplify(_THINNED_SHARE * TOLERANCE_MM, preserve_topology=False))
 
 
 def _with_ends(places: Array, end_mm: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -129,28 +124,24 @@ class _Bends:
 
     @cached_property
     def spans(self) -> Array:
-        """(2M, N+1, 4, 2) Bezier control points, grid units."""
+        """(F, N+1, 4, 2) Bezier control points, grid units."""
         return beziers(self.plan.pad)
 
     @cached_property
     def slopes(self) -> Array:
-        """(2M, N+1, 3) Bezier coefficients of the slopes."""
+        """(F, N+1, 3) Bezier coefficients of the slopes."""
         return slope_beziers(self.plan.pad)
 
-    def least_radii(self, fibre: int, travel_mm: Array) -> Array:
-        """(n - 1,) least bend radius, mm, between each two of n places along the axis a fibre travels, its leads too.
+    def least_radii(self, fibre: int, places: Array) -> Array:
+        """(n - 1,) least bend radius, mm, between each two of n places (n, 2) along a fibre and its leads.
 
         A fibre bends over no less than its own diameter: a radius is that length by the angle it turns there. A PCHIP
         curve is only C1, and the slope of its ends is not that of the leads: pointwise curvature says nothing.
         """
-        points, headings = traced_curve(self.spans[fibre], self.slopes[fibre], _TURN)
-        points = self.plan.pad.to_mm(points)
-        points = points[[0, 0, *range(len(points)), -1, -1]]  # the leads, with the corners in which they end
-        family = self.plan.family(fibre)
-        points[[0, -1], family] = travel_mm[[0, -1]]
-        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(headings, prepend=[0, 0], append=[0, 0])))])
-        corners = np.interp(travel_mm, points[:, family], arc)
+        points, headings = self._traced(fibre, places[[0, -1]])
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        turned = np.concatenate([[0.0], np.cumsum(np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi))])
+        corners = np.asarray(shapely.line_locate_point(shapely.LineString(points), shapely.points(places)))
         half = max(self.diameter_mm / 2, arc[-1] / _MOST_STATIONS)
         station = half * np.arange(math.ceil(arc[-1] / half) + 2)
         turns = np.interp(station + half, arc, turned) - np.interp(station - half, arc, turned)
@@ -158,6 +149,29 @@ class _Bends:
         last = np.ceil(corners[1:] / half).astype(int)
         most = np.maximum.reduceat(turns, np.column_stack([first, last + 1]).ravel())[::2]
         return np.divide(2 * half, most, out=np.full(len(most), np.inf), where=most > _STRAIGHT)
+
+    def _traced(self, fibre: int, ends: Array) -> tuple[Array, Array]:
+        """Points (n, 2) of a course between its leads' ends (2, 2), mm, and the heading at each, radians.
+
+        Where it turns in one place, that place stands there twice.
+        """
+        family = self.plan.family(fibre)
+        points, headings = traced_curve(self.spans[fibre], self.slopes[fibre], _TURN)
+        points = self.plan.pad.to_mm(points)
+        if family:
+            headings = np.pi / 2 - headings
+        leads = zip(self.plan.leads.pairs[fibre], ends, strict=True)
+        first, last = (np.vstack([lead.end_mm, lead.bends(_LEAD_MM), end]) for lead, end in leads)
+        parts = [_corners(first[::-1]), (points, headings), _corners(last)]
+        return np.vstack([places for places, _ in parts]), np.concatenate([heading for _, heading in parts])
+
+
+def _corners(way: Array) -> tuple[Array, Array]:
+    """Both ends (k, 2) of every step of a way, and its heading at each."""
+    steps = np.diff(way, axis=0)
+    long = np.linalg.norm(steps, axis=1) > 0
+    places = np.stack([way[:-1], way[1:]], axis=1)[long].reshape(-1, 2)
+    return places, np.repeat(np.arctan2(steps[long, 1], steps[long, 0]), 2)
 
 
 def _feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, largest_stretch: float) -> Array:

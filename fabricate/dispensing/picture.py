@@ -80,13 +80,12 @@ def _laid(steps: Sequence[Step]) -> Iterator[str]:
 
 def _marks(plan: Plan, ends: Array, fibres: Sequence[int]) -> Iterator[str]:
     for turn, (fibre, (start, end)) in enumerate(zip(fibres, ends, strict=True), 1):
-        aside = 2.5 * np.eye(2)[plan.family(fibre)]
-        ahead = np.sign(end - start)
+        off, beyond = (2.5 * turned_over(lead.outward) for lead in plan.leads.pairs[fibre])
         (x, y), (u, v) = start, end
         yield f'<circle cx="{_number(x)}" cy="{_number(-y)}" r="0.8" stroke="{INK}" stroke-width="0.2"/>'
         yield f'<circle cx="{_number(u)}" cy="{_number(-v)}" r="0.5" fill="{INK}"/>'
-        yield _text(start - ahead * aside, "middle", str(fibre + 1), INK)
-        yield _text(end + ahead * aside, "middle", f"{turn}.", INK)
+        yield _text(start + off, "middle", str(fibre + 1), INK)
+        yield _text(end + beyond, "middle", f"{turn}.", INK)
 
 
 def _legend(plan: Plan, steps: Sequence[Step]) -> Iterator[tuple[str, str]]:

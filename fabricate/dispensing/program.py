@@ -67,6 +67,11 @@ def summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
     yield "padforge: the fibres of a pad, laid by a needle"
     yield f"{len(strokes)} fibres in {len(steps)} layers, {length / 1000:.2f} m; {seconds / 60:.1f} minutes of laying"
     yield "the pad lies turned over, left to right, with its tracks up, on a flat plate"
-    yield "seen from above: x to the right, against the pad's, y away from you; fibre 1 starts on the right, nearest"
+    near = "on the right, nearest"
+    if plan.settings.pad.leads == "one side":
+        near = "at the near edge"
+    elif not plan.pad.layout.horizontals:
+        near = "on the right, at the near side"
+    yield f"seen from above: x to the right, against the pad's, y away from you; fibre 1 starts {near}"
     yield f"z is 0 where the needle touches the upper face; it goes down to {lowest:.3f} mm"
     yield f"needle of at most {plan.settings.dispenser.tip_mm:g} mm, pad {plan.thickness_mm:.3g} mm thick"

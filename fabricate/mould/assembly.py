@@ -7,26 +7,26 @@ are mm.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError
+from fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 
 from . import parts
-from .plan import Plan, square
+from .plan import Plan, box_around
 from .prisms import Body, Prism
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-WELL_MM = 3.0
-"""Diameter of the wells for conductive material."""
-_WELL_RIM_MM = 1.0
-"""Silicone around a well."""
 _VENT_INSET_MM = 3.0
 """How far from the cavity's rim the lid's vents lie."""
+_BESIDE_PILLAR_MM, _TRIED = 0.5, 101
+"""Between a bore of the lid and a pillar, at least, and how many places are tried for one along each side."""
 LID_MM = 3.0
 """Thickness of the lid."""
 HOLDER_WALL_MM = 1.0
@@ -43,7 +43,7 @@ def plan_mesh(plan: Plan) -> "Manifold":
 
 
 def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
-    """The inverse mould: tray, ridges, exits, numbers and pins.
+    """The inverse mould: tray, ridges, exits, numbers, pillars and pins.
 
     Args:
         wells: outlines that belong to the ridges of each level, mm; none for a pad whose fibres are laid.
@@ -65,6 +65,8 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
         body = body.with_adds(ridges)
     written = [outline for outline in plan.numbers if outline is not None]
     body = body.with_adds(parts.numeral_prisms(written, floor_mm=floor, height_mm=mould.shallow_ridge_height_mm))
+    if plan.pillars.area:
+        body = body.with_adds([Prism(plan.pillars, floor - parts.INTO_FLOOR_MM, floor + plan.silicone_mm)])
     if mould.pins:
         body = body.with_adds(pins(plan))
     return body
@@ -80,17 +82,20 @@ def pins(plan: Plan) -> list[Prism]:
     return parts.pins(_pin_places(plan), top_mm=top, diameter_mm=_pin_mm(plan))
 
 
-def sizes(plan: Plan) -> dict[str, float]:
-    """What pad and mould came out as, mm: where the settings leave it open or the pad needs more than they say."""
+def sizes(plan: Plan) -> dict[str, Any]:
+    """What pad and mould came out as, mm: where the settings leave it open or the pad needs more than they say.
+
+    Of what is not square there are width and height.
+    """
     printed = plan.enlarged
-    mould, edge = printed.settings.mould, printed.cavity.bounds[2]
+    mould = printed.settings.mould
     achieved = {
-        "pad_mm": 2 * plan.cavity.bounds[2],
+        "pad_mm": _sides(plan.cavity),
         "pad_thickness_mm": plan.thickness_mm,
-        "cavity_mm": 2 * edge,
+        "cavity_mm": _sides(printed.cavity),
         "cavity_depth_mm": printed.silicone_mm,
-        "rim_mm": 2 * (edge + printed.flare_mm),
-        "tray_mm": 2 * printed.tray.bounds[2],
+        "rim_mm": _sides(box_around(printed.cavity, printed.flare_mm)),
+        "tray_mm": _sides(printed.tray),
         "tray_height_mm": mould.floor_mm + printed.silicone_mm,
         "ridge_foot_mm": mould.ridge_width_mm + 2 * printed.heights_mm[-1] * printed.settings.ridge_slope,
     }
@@ -100,29 +105,32 @@ def sizes(plan: Plan) -> dict[str, float]:
         achieved["lid_mm"] = LID_MM
     if mould.conductive:
         achieved["well_mm"] = WELL_MM
-    return {name: round(size, 6) for name, size in achieved.items()}
+    return {name: np.round(size, 6).tolist() for name, size in achieved.items()}
 
 
 def lid_body(plan: Plan) -> Body:
     """The lid that lies on the tray's walls; its holes fit the pins, if there are any.
 
     Raises:
-        InputError: a pad too small for vents beside the spout.
+        InputError: a pad too small for vents beside the spout, or keep-outs that leave no room for them.
     """
-    mould, edge = plan.settings.mould, plan.cavity.bounds[2]
-    inset = edge - min(_VENT_INSET_MM, edge / 2)
-    least = (parts.spout_mm() + parts.VENT_MM) / math.sqrt(2)
-    if mould.spout and 2 * inset < least:
-        from_mm = least + 2 * _VENT_INSET_MM
-        raise InputError(f"[mould] spout: got true for a pad {2 * edge:.4g} mm wide, allowed from {from_mm:.4g} mm")
+    mould, (low, high) = plan.settings.mould, np.reshape(plan.cavity.bounds, (2, 2))
+    insets = [min(_VENT_INSET_MM, side / 4) for side in high - low]
+    (left, right), (near, far) = ((a + inset, b - inset) for a, b, inset in zip(low, high, insets, strict=True))
+    middle = _free_place(plan, ((left + right) / 2, (near + far) / 2), parts.BORE_MM) if mould.spout else None
+    vents = [_free_place(plan, (x, y), parts.VENT_MM) for x in (left, right) for y in (near, far)]
+    least = (parts.spout_mm() + parts.VENT_MM) / 2
+    if middle and min(math.dist(middle, vent) for vent in vents) < least:
+        width, from_mm = min(high - low), math.sqrt(2) * least + 2 * _VENT_INSET_MM
+        raise InputError(f"[mould] spout: got true for a pad {width:.4g} mm wide, allowed from {from_mm:.4g} mm")
     body = parts.lid(
         plan.tray,
-        [(x, y) for x in (-inset, inset) for y in (-inset, inset)],
+        vents,
         thickness_mm=LID_MM,
         pin_places=_pin_places(plan) if mould.pins else (),
         pin_mm=_pin_mm(plan) if mould.pins else 0.0,
     )
-    return parts.spout(body, thickness_mm=LID_MM) if mould.spout else body
+    return parts.spout(body, middle, thickness_mm=LID_MM) if middle else body
 
 
 def lid_holes(plan: Plan) -> int:
@@ -134,39 +142,40 @@ def lid_holes(plan: Plan) -> int:
 def holder_body(plan: Plan) -> Body:
     """The tray in which the finished pad lies as it was laid: tracks up, turned over left to right.
 
-    Slots let the leads out. The corner where the first horizontal and the first vertical fibre start is cut. Ends of
-    fibres are level with each other, so that the slots are the same seen from either side.
+    Slots let the leads out. The corner where the first horizontal and the first vertical fibre start is cut.
     """
-    mould, out, cut = plan.settings.mould, plan.tray.bounds[2], plan.corner_mm
+    mould, cut = plan.settings.mould, plan.corner_mm
     play = plan.flare_mm + HOLDER_PLAY_MM  # what lies below was the rim of the casting, wider than its tracks' side
     half = mould.exit_width_mm / 2 + play
+    through = mould.wall_mm + mould.exit_mm + plan.flare_mm + 1
     slots = []
-    for fibre, line in enumerate(plan.lines):
-        across = line.coords[0][1 - plan.family(fibre)], line.coords[-1][1 - plan.family(fibre)]
-        for side, middle in zip((-1, 1), across, strict=True):
-            along, beside = sorted((0.0, side * (out + 1))), (middle - half, middle + half)
-            (x0, x1), (y0, y1) = (beside, along) if plan.family(fibre) else (along, beside)
-            slots.append(shapely.box(x0, y0, x1, y1))
-    marked = plan.tray - shapely.Polygon([(out, -out), (out - cut, -out), (out, cut - out)])
-    hollow = shapely.union_all([square(plan.cavity.bounds[2] + play), *slots])
+    for lead in (lead for pair in plan.leads.pairs for lead in pair):
+        middle_mm = plan.leads.edge_mm(lead) * lead.outward[lead.axis]
+        x0, y0, x1, y1 = plan.leads.beside(lead, half, -middle_mm, through).bounds
+        slots.append(shapely.box(-x1, y0, -x0, y1))
+    _, low, right, _ = plan.tray.bounds
+    marked = plan.tray - shapely.Polygon([(right, low), (right - cut, low), (right, low + cut)])
+    hollow = shapely.union_all([box_around(plan.cavity, play), *slots])
     return parts.tray(marked, [hollow], floor_mm=mould.floor_mm, depth_mm=HOLDER_WALL_MM)
 
 
-def bed_frame(plan: Plan) -> dict[str, bool | float | list[float]]:
+def bed_frame(plan: Plan) -> dict[str, Any]:
     """Where the pad lies while its holder stands where a slicer puts it, in the middle of the bed; mm and degrees.
 
     Returns:
         "bed_mm": width, depth and height of the printer. "centre_mm": of the pad, x and y. "angle_deg": from the bed's
         y axis to the pad's. "mirrored": that the pad lies with its tracks up, its x axis against that of the bed.
-        "pad_mm": side of the pad. "surface_mm", "walls_mm": of the pad and of the holder's walls above the bed.
+        "pad_mm": side of the pad, or its width and height. "surface_mm", "walls_mm": of the pad and of the holder's
+        walls above the bed.
     """
     floor_mm, bed_mm = plan.settings.mould.floor_mm, plan.settings.printer.bed_mm
+    _, low, _, high = plan.tray.bounds
     return {
         "bed_mm": list(bed_mm),
-        "centre_mm": [side / 2 for side in bed_mm[:2]],
+        "centre_mm": [bed_mm[0] / 2, bed_mm[1] / 2 - (low + high) / 2],
         "angle_deg": 0.0,
         "mirrored": True,
-        "pad_mm": round(2 * plan.cavity.bounds[2], 6),
+        "pad_mm": np.round(_sides(plan.cavity), 6).tolist(),
         "surface_mm": round(floor_mm + plan.thickness_mm, 6),
         "walls_mm": round(floor_mm + HOLDER_WALL_MM, 6),
     }
@@ -178,8 +187,7 @@ def conductive_plan(plan: Plan) -> Plan:
     Raises:
         InputError: exits that large do not fit the pitch.
     """
-    side = WELL_MM + 2 * _WELL_RIM_MM
-    mould = plan.settings.mould.model_copy(update={"exit_mm": side, "exit_width_mm": side})
+    mould = plan.settings.mould.model_copy(update={"exit_mm": WELL_SLOT_MM, "exit_width_mm": WELL_SLOT_MM})
     return replace(plan, settings=replace(plan.settings, mould=mould))
 
 
@@ -194,12 +202,12 @@ def conductive_body(plan: Plan) -> Body:
 
 def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
     """The outlines of the wells at the ends of the ridges of every level, as polygons of so many sides, mm."""
-    away = plan.cavity.bounds[2] + _WELL_RIM_MM + WELL_MM / 2
     places: list[list[tuple[float, float]]] = [[] for _ in plan.heights_mm]
-    for fibre, line in enumerate(plan.lines):
-        for end, side in ((0, -away), (-1, away)):
-            across = line.coords[end][1 - plan.family(fibre)]
-            places[plan.levels[fibre]].append((across, side) if plan.family(fibre) else (side, across))
+    for level, pair in zip(plan.levels, plan.leads.pairs, strict=True):
+        for lead in pair:
+            place, out = lead.turned_mm.copy(), lead.outward[lead.axis]
+            place[lead.axis] = plan.leads.edge_mm(lead) + out * WELL_RIM_MM + out * WELL_MM / 2
+            places[level].append((float(place[0]), float(place[1])))
     return [parts.wells(own, diameter_mm=WELL_MM, sides=sides) for own in places]
 
 
@@ -216,5 +224,31 @@ def _pin_mm(plan: Plan) -> float:
 
 def _pin_places(plan: Plan) -> list[tuple[float, float]]:
     """Three corners of the tray, so that a lid fits one way only."""
-    away = plan.tray.bounds[2] - plan.corner_mm / 2
-    return [(-away, -away), (away, -away), (-away, away)]
+    left, low, right, high = box_around(plan.tray, -plan.corner_mm / 2).bounds
+    return [(left, low), (right, low), (left, high)]
+
+
+def _sides(box: shapely.Polygon) -> float | list[float]:
+    """The side of a square, or width and height."""
+    left, low, right, high = box.bounds
+    return right - left if right - left == high - low else [right - left, high - low]
+
+
+def _free_place(plan: Plan, wanted: tuple[float, float], diameter_mm: float) -> tuple[float, float]:
+    """The place in the cavity nearest to the one wanted where a bore of the lid comes out over silicone.
+
+    Raises:
+        InputError: there is none.
+    """
+    reach = diameter_mm / 2 + _BESIDE_PILLAR_MM
+    if not plan.pillars.area or plan.pillars.distance(shapely.Point(wanted)) >= reach:
+        return wanted
+    low, high = np.reshape(box_around(plan.cavity, -reach).bounds, (2, 2))
+    across, up = (np.linspace(a, b, _TRIED) for a, b in zip(low, high, strict=True))
+    places = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+    places = places[shapely.distance(plan.pillars, shapely.points(places)) >= reach]
+    if not len(places):
+        room = f"allowed only where keep-outs leave room for bores of {diameter_mm:g} mm"
+        raise InputError(f"[mould] lid: got true, {room}")
+    x, y = places[np.hypot(*(places - wanted).T).argmin()].tolist()
+    return x, y

@@ -22,7 +22,7 @@ from .cad.bodies import body_solid
 from .cad.facets import faceted_solid
 from .cad.model import FITS_MM, mould_model
 from .cad.step_file import write_step
-from .plan import Plan
+from .plan import Plan, box_around
 
 GRID, KNOTS = 4, (1, 5, 20)
 TOLERANCES_MM = (0.05, 0.01, 0.002)
@@ -108,8 +108,8 @@ def _with_middles(ring: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _deviation(plan: Plan, points: NDArray[np.float64]) -> float:
     """How far ridge outlines stray, at most, from where they belong: half a ridge's width from a level's fibres."""
-    inside = shapely.points(points[np.abs(points).max(axis=1) < plan.cavity.bounds[2] - _CLEAR_MM])
-    curves = [plan.pad.to_mm(line) for line in flatten(plan.pad, _EXACT_MM / plan.pad.pitch_mm)]
+    inside = shapely.points(points[shapely.contains_xy(box_around(plan.cavity, -_CLEAR_MM), points)])
+    curves = [plan.pad.to_mm(line) for line in flatten(plan.pad, _EXACT_MM / plan.pad.unit_mm)]
     off = []
     for level in range(len(plan.heights_mm)):
         own = [curve for curve, at in zip(curves, plan.levels, strict=True) if at == level]

@@ -95,13 +95,20 @@ def lid(
     return Body((Prism(outline, 0, thickness_mm),), tuple(Prism(hole, -1, thickness_mm + 1) for hole in holes))
 
 
-def spout(plate: Body, *, thickness_mm: float = 3.0, bore_mm: float = BORE_MM, funnel_mm: float = FUNNEL_MM) -> Body:
-    """The plate with a funnel in its middle to pour through, `funnel_mm` high; printed as it lies, without supports."""
+def spout(
+    plate: Body,
+    place: tuple[float, float] = (0, 0),
+    *,
+    thickness_mm: float = 3.0,
+    bore_mm: float = BORE_MM,
+    funnel_mm: float = FUNNEL_MM,
+) -> Body:
+    """The plate with a funnel at a place to pour through, `funnel_mm` high; printed as it lies, without supports."""
     flare = funnel_mm * math.tan(math.radians(FUNNEL_DEG))
-    foot = cylinder(0, 0, bore_mm + 2 * _FUNNEL_WALL_MM)
+    foot = cylinder(*place, bore_mm + 2 * _FUNNEL_WALL_MM)
     cup = Prism(foot, thickness_mm - INTO_FLOOR_MM, thickness_mm + funnel_mm, flare)
-    bore = Prism(cylinder(0, 0, bore_mm), -1, thickness_mm + INTO_FLOOR_MM)
-    mouth = Prism(cylinder(0, 0, bore_mm), thickness_mm, thickness_mm + funnel_mm + 1, flare * (1 + 1 / funnel_mm))
+    bore = Prism(cylinder(*place, bore_mm), -1, thickness_mm + INTO_FLOOR_MM)
+    mouth = Prism(cylinder(*place, bore_mm), thickness_mm, thickness_mm + funnel_mm + 1, flare * (1 + 1 / funnel_mm))
     return Body((*plate.base, cup), (*plate.cuts, bore, mouth))
 
 

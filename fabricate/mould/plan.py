@@ -8,7 +8,7 @@ Lengths are those of the pad as it is used. Where the silicone shrinks, the moul
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +16,17 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError, instance
-from design.pad.courses.curves import Crossing, crossings, flatten
+from design.pad.courses.curves import Crossing, crossings, flatten, lengths
+from design.pad.courses.keep_out import keep_outs
+from design.pad.knots import Array
 from design.pad.morphology import Morphology
+from design.settings import Layout
 from fabricate.settings import DEFAULTS, FabricationSettings
 
-from .depth_levels import fibre_levels
-from .numerals import number_strokes, with_room
+from .planning.depth_levels import fibre_levels
+from .planning.leads import Lead, Leads, straight_on, to_one_side
+from .planning.numerals import number_strokes, with_room
+from .planning.pillars import pillar_outlines
 
 INTO_WALL_MM = 0.5
 """How far ridges run into the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
@@ -41,16 +46,22 @@ _CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
 class Plan:
     """A morphology with the settings of its mould; what is derived from them is computed when first asked for.
 
+    Attributes:
+        used: where this one is of what is printed, larger than the pad, the plan of the pad as it is used.
+
     Raises:
-        InputError: settings that contradict each other or the pitch.
+        InputError: settings that contradict each other or the pitch, or keep-outs that are none of this pad.
     """
 
     pad: Morphology
     settings: FabricationSettings = DEFAULTS
+    used: "Plan | None" = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         instance("pad", self.pad, Morphology)
-        instance("settings", self.settings, FabricationSettings).require_consistent(self.pad.pitch_mm)
+        instance("settings", self.settings, FabricationSettings).require_consistent(self.pad.layout)
+        if self.settings.pad.keep_out_mm and self.used is None:
+            keep_outs(self.settings.pad.of(self.pad.layout))
 
     @cached_property
     def enlarged(self) -> "Plan":
@@ -61,8 +72,10 @@ class Plan:
         shrunk = self.settings.shrunk
         if shrunk == 1:
             return self
-        pad = Morphology(self.pad.knots, self.pad.pitch_mm / shrunk, self.pad.provenance)
-        return Plan(pad, self.settings.enlarged())
+        layout = self.pad.layout
+        larger = Layout(*layout.counts, layout.pitch_x_mm / shrunk, layout.pitch_y_mm / shrunk)
+        pad = Morphology.of_document({**self.pad.document(), "pitch_mm": larger.pitch_mm})
+        return Plan(pad, self.settings.enlarged(), self)
 
     @cached_property
     def depths_mm(self) -> tuple[float, ...]:
@@ -76,39 +89,68 @@ class Plan:
 
     @cached_property
     def lines(self) -> list[shapely.LineString]:
-        """2M centre lines, mm: each within a fifth of the tolerance, continued straight through border and wall."""
+        """Of every fibre its centre line, mm, within a fifth of the tolerance, continued by its leads into the wall."""
         return self._centre_lines(self.settings.mould.tolerance_mm)
 
     def _centre_lines(self, tolerance_mm: float) -> list[shapely.LineString]:
-        mould = self.settings.mould
-        tolerance = _CENTRE_SHARE * tolerance_mm / self.pad.pitch_mm
-        reach = mould.border_mm + mould.exit_mm + INTO_WALL_MM
-        lines = []
-        for fibre, points in enumerate(flatten(self.pad, tolerance)):
-            places = self.pad.to_mm(points)
-            ahead = reach * np.eye(2)[self.family(fibre)]
-            lines.append(shapely.LineString(np.vstack([places[0] - ahead, places, places[-1] + ahead])))
-        return lines
+        return [shapely.LineString(course) for course in self.courses(_CENTRE_SHARE * tolerance_mm, INTO_WALL_MM)]
+
+    def courses(self, tolerance_mm: float, past_mm: float) -> list[Array]:
+        """Of every fibre (n, 2) corners of its course and its leads, until so far past its tongues' ends, mm."""
+        past = self.settings.mould.exit_mm, past_mm
+        curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
+        found = []
+        for (start, end), curve in zip(self.leads.pairs, curves, strict=True):
+            before, after = start.bends(tolerance_mm)[::-1], end.bends(tolerance_mm)
+            found.append(np.vstack([start.beyond(*past), before, self.pad.to_mm(curve), after, end.beyond(*past)]))
+        return found
+
+    @cached_property
+    def leads(self) -> Leads:
+        """How every fibre goes on from its ends to the silicone's edge."""
+        pad, mould = self.pad, self.settings.mould
+        ends = pad.to_mm(pad.knots[:, [0, -1]])
+        if self.settings.pad.leads == "edges":
+            return straight_on(ends, pad.layout, mould.border_mm)
+        if self.used is not None:
+            return self.used.leads.scaled(1 / self.used.settings.shrunk)
+        return to_one_side(ends, pad.layout, self.settings.lead_room(self.heights_mm[-1], self.flare_mm))
+
+    @cached_property
+    def lengths_mm(self) -> Array:
+        """(F,) of every fibre within the silicone, its tongues included."""
+        leads = [start.length_mm + end.length_mm for start, end in self.leads.pairs]
+        return lengths(self.pad) * self.pad.unit_mm + leads + 2 * self.settings.mould.exit_mm
+
+    @property
+    def least_pitch_mm(self) -> float:
+        """Of the two."""
+        return min(self.pad.layout.pitch_x_mm, self.pad.layout.pitch_y_mm)
 
     @cached_property
     def crossings(self) -> list[Crossing]:
         """Every place where two fibres meet; `place` in grid units."""
-        return crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.pitch_mm)
+        return crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.unit_mm)
 
     @cached_property
     def clashes(self) -> list[Crossing]:
         """The crossings of fibres of one family."""
         return [c for c in self.crossings if self.family(c.first) == self.family(c.second)]
 
+    @property
+    def clash_places_mm(self) -> Array:
+        """(n, 2) where the clashes are."""
+        return self.pad.to_mm(np.array([c.place for c in self.clashes]).reshape(-1, 2))
+
     def family(self, fibre: int) -> int:
         """0 for a horizontal fibre, 1 for a vertical one."""
-        return fibre // self.pad.grid
+        return self.pad.layout.family(fibre)
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        """(2M,) level of every fibre, 0 the shallowest; fibres that cross differ, if the settings allow for it."""
+        """(F,) level of every fibre, 0 the shallowest; fibres that cross differ, if the settings allow for it."""
         clashes = self.clashes if self.settings.mould.levels == "as_needed" else []
-        return fibre_levels(self.pad.grid, clashes, self.settings.pad.deep_family == "horizontal")
+        return fibre_levels(self.pad.layout.counts, clashes, self.settings.pad.deep_family == "horizontal")
 
     def require_levels(self) -> None:
         """Refuse a pad whose fibres need more levels than the settings grant.
@@ -117,7 +159,7 @@ class Plan:
             InputError: lists the crossings of fibres of one family.
         """
         if self.clashes and self.settings.mould.levels == "two":
-            places = [self.pad.to_mm(c.place) for c in self.clashes]
+            places = self.clash_places_mm.tolist()
             listed = ", ".join(
                 f"{c.first + 1} x {c.second + 1} at ({x:.1f}, {y:.1f}) mm"
                 for c, (x, y) in zip(self.clashes, places, strict=True)
@@ -164,18 +206,20 @@ class Plan:
 
     @cached_property
     def numbers(self) -> list[BaseGeometry | None]:
-        """Strokes of every fibre's number, 1..2M, beside its start, mirrored; None without room, empty if unwanted."""
+        """Strokes of every fibre's number, from 1, beside its start, mirrored; None without room, empty if unwanted."""
         mould = self.settings.mould
         if not mould.number_mm:
             return []
-        strokes = [number_strokes(n, mould.number_mm, mould.ridge_width_mm) for n in range(1, 2 * self.pad.grid + 1)]
+        count = self.pad.layout.fibres
+        strokes = [number_strokes(n, mould.number_mm, mould.ridge_width_mm) for n in range(1, count + 1)]
         clear = mould.ridge_width_mm / 2 + self.heights_mm[-1] * self.settings.ridge_slope + mould.min_silicone_mm
-        return with_room(strokes, self.lines, self.cavity, clear, min(self.pad.pitch_mm, _BESIDE * mould.number_mm))
+        free, reach = self.cavity.difference(self.pillars), min(self.least_pitch_mm, _BESIDE * mould.number_mm)
+        return with_room(strokes, self.lines, free, self.cavity.bounds, clear, reach)
 
     @cached_property
     def cavity(self) -> shapely.Polygon:
-        """What the silicone fills on the floor but for the exits, seen from above, mm."""
-        return square(self.pad.size_mm / 2 + self.settings.mould.border_mm)
+        """What is between the walls on the floor but for the exits, seen from above, mm: keep-outs stand in it."""
+        return shapely.box(*self.leads.bounds_mm)
 
     @cached_property
     def exits(self) -> list[shapely.Polygon]:
@@ -186,21 +230,25 @@ class Plan:
         mould = self.settings.mould
         if not mould.exit_mm:
             return []
-        edge, half = self.cavity.bounds[2], mould.exit_width_mm / 2
-        boxes = []
-        for end, outward in ((0, -1), (-1, 1)):
-            for fibre, line in enumerate(self.lines):
-                axis = self.family(fibre)
-                corners = np.empty((2, 2))
-                corners[:, axis] = outward * (edge - half), outward * (edge + mould.exit_mm)
-                corners[:, 1 - axis] = line.coords[end][1 - axis] + np.array([-half, half])
-                boxes.append(shapely.box(*corners.min(axis=0), *corners.max(axis=0)))
-        return boxes
+        half = mould.exit_width_mm / 2
+        return [self.leads.beside(lead, half, -half, mould.exit_mm) for end in (0, 1) for lead in self.ends(end)]
+
+    def ends(self, end: int) -> list[Lead]:
+        """The leads of all fibres' starts, 0, or other ends, 1."""
+        return [pair[end] for pair in self.leads.pairs]
+
+    @cached_property
+    def pillars(self) -> BaseGeometry:
+        """Outlines of what stands in the cavity up to its rim where keep-outs are, mm; at an edge within the wall."""
+        polygons = self.settings.pad.keep_out_mm
+        outlines = pillar_outlines(polygons, self.cavity, self.flare_mm + INTO_WALL_MM)
+        return areas(shapely.set_precision(outlines, SNAP_MM)) if polygons else shapely.MultiPolygon()
 
     @cached_property
     def silicone(self) -> BaseGeometry:
         """All that the silicone fills on the floor, exits included, seen from above, mm."""
-        return shapely.union_all([self.cavity, *self.exits])
+        whole = shapely.union_all([self.cavity, *self.exits])
+        return without(whole, self.pillars) if self.pillars.area else whole
 
     @property
     def flare_mm(self) -> float:
@@ -215,7 +263,7 @@ class Plan:
     @cached_property
     def tray(self) -> shapely.Polygon:
         """The mould seen from above, walls included, mm."""
-        return square(self.cavity.bounds[2] + self.flare_mm + self.corner_mm)
+        return box_around(self.cavity, self.flare_mm, self.corner_mm)
 
 
 def overlap(first: BaseGeometry, second: BaseGeometry) -> BaseGeometry:
@@ -243,6 +291,9 @@ def polygon_rings(area: BaseGeometry) -> list[list[np.ndarray]]:
     return [[shapely.get_coordinates(ring)[:-1] for ring in shapely.get_rings(polygon)] for polygon in polygons]
 
 
-def square(half_mm: float) -> shapely.Polygon:
-    """A square around the pad's centre, mm."""
-    return shapely.box(-half_mm, -half_mm, half_mm, half_mm)
+def box_around(area: BaseGeometry, *out_mm: float) -> shapely.Polygon:
+    """The rectangle around an area, so much further out on every side, mm."""
+    left, low, right, high = area.bounds
+    for out in out_mm:
+        left, low, right, high = left - out, low - out, right + out, high + out
+    return shapely.box(left, low, right, high)

@@ -19,7 +19,7 @@ class Layer:
     Attributes:
         family: 0 horizontal, 1 vertical. level: as in `Plan.levels`.
         depth_mm: of their tracks in the casting.
-        fibres: their numbers among all, 0..2M-1.
+        fibres: their numbers among all, 0..F-1.
         colour: "#rrggbb", the family's own for its deepest level and paler the shallower.
     """
 
@@ -50,7 +50,7 @@ def layers(plan: Plan) -> list[Layer]:
 
 def fibre_name(plan: Plan, fibre: int) -> str:
     """What a fibre is called, such as "horizontal 1"; each family counts from 1."""
-    return f"{FAMILIES[plan.family(fibre)]} {fibre % plan.pad.grid + 1}"
+    return f"{FAMILIES[plan.family(fibre)]} {fibre - plan.pad.layout.families[plan.family(fibre)].start + 1}"
 
 
 def pale(colour: str, white: float) -> str:

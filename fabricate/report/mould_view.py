@@ -139,6 +139,9 @@ def _colours(document: Mapping[str, Any]) -> str:
     shallow = document["fibres"][-1 if document["settings"]["pad"]["deep_family"] == FAMILIES[0] else 0]
     numbers = " and the numbers" if document["settings"]["mould"]["number_mm"] else ""
     first, second = (numbers if shallow["fibre"].startswith(family) else "" for family in FAMILIES)
+    there = {fibre["fibre"].split()[0] for fibre in document["fibres"]}
+    if len(there) == 1:
+        return f"Tops of ridges{numbers} are {'blue' if FAMILIES[0] in there else 'orange'}."
     return f"Tops of {FAMILIES[0]} ridges{first} are blue, of {FAMILIES[1]} ones{second} orange."
 
 

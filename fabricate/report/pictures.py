@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 
 from design.common.figures import ALARM, FAINT, INK, PAPER
 from fabricate.checks.findings import Finding
-from fabricate.mould.plan import INTO_WALL_MM, Plan, polygon_rings
+from fabricate.mould.plan import INTO_WALL_MM, Plan, overlap, polygon_rings
 
 from .fibre_layers import COLOURS, FAMILIES, Layer, layers
-from .laying.orientation import SENTENCE
+from .laying.orientation import sentence
 from .relief import RIDGE, lit, mesh_relief, mould_relief
-from .track_drawings import SCALE_MM
+from .track_sheet import SCALE_MM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,7 +56,9 @@ def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
-    heights, shown = mould_relief(plan, _PIXELS)
+    left, low, right, high = plan.tray.bounds
+    wide, tall = _pixels(right - left, high - low)
+    heights, shown = mould_relief(plan, wide, tall)
     order = layers(plan)
     tints = [PAPER, FAINT, _NUMBER, *[PAPER] * len(plan.heights_mm)]
     for layer in order:
@@ -67,7 +69,6 @@ def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
     entries += [(layer.colour, f"{FAMILIES[layer.family]} ridges, {layer.depth_mm:g} mm") for layer in order]
     handles = [Patch(facecolor=colour, edgecolor=_GREY, label=label) for colour, label in entries]
 
-    left, low, right, high = plan.tray.bounds
     depth_mm = plan.settings.mould.floor_mm + plan.silicone_mm
     title = f"Mould from above, {right - left:.4g} x {high - low:.4g} x {depth_mm:.4g} mm"
     sheet = _sheet((left, right, low, high), title, len(handles) + len(_marked(findings)))
@@ -83,13 +84,19 @@ def draw_tracks(plan: Plan, path: Path) -> None:
     left, low, right, high = plan.silicone.bounds
     room = 0.06 * (right - left)
     order = layers(plan)
-    places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
-    title = f"Fibres as they lie in the tray, from above: {2 * plan.pad.grid} fibres, {len(plan.crossings)} crossings"
+    places = plan.clash_places_mm
+    title = (
+        f"Fibres as they lie in the tray, from above: {plan.pad.layout.fibres} fibres, {len(plan.crossings)} crossings"
+    )
     bounds = (left - room, right + room, low - room, high + room)
-    sheet = _sheet(bounds, title, len(order) + (len(places) > 0), SENTENCE)
+    sheet = _sheet(
+        bounds, title, len(order) + (len(places) > 0), sentence(plan.pad.layout.counts, plan.settings.pad.leads)
+    )
     for area in (plan.silicone, plan.cavity):
         for ring in (ring for polygon in polygon_rings(area) for ring in polygon):
             sheet.axes.fill(*ring.T, facecolor=PAPER, edgecolor=_EDGE, linewidth=1, zorder=1)
+    for hole, *_ in polygon_rings(overlap(plan.pillars, plan.cavity)):
+        sheet.axes.fill(*hole.T, facecolor=FAINT, edgecolor=_EDGE, linewidth=1, zorder=1)
     handles = [h for layer in reversed(order) for h in _draw_layer(sheet, plan, layer)][::-1]
     if len(places):
         label = f"{len(places)} crossings of one family"
@@ -125,12 +132,15 @@ def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[
 
 
 def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
-    """Draw the fibres of a depth with their numbers; the first of their lines stands for them in the legend."""
+    """Draw the fibres of a depth with their numbers, at both ends where these lie side by side.
+
+    The first of their lines stands for them in the legend.
+    """
     from matplotlib.patheffects import withStroke
     from shapely.ops import substring
 
     width = max(1.3, sheet.points(plan.settings.fibre.material.diameter_mm))
-    size = min(11.0, 0.5 * sheet.points(plan.pad.pitch_mm))
+    size = min(11.0, 0.5 * sheet.points(plan.least_pitch_mm))
     drawn = []
     for fibre in layer.fibres:
         line = substring(plan.lines[fibre], INTO_WALL_MM, plan.lines[fibre].length - INTO_WALL_MM)
@@ -138,12 +148,13 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: Layer) -> list[Any]:
         style = {"linewidth": width, "color": layer.colour, "zorder": 2, "path_effects": edged}
         label = f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
         drawn += sheet.axes.plot(*np.array(line.coords).T, label=label, solid_capstyle="butt", **style)
-        (x, y), *_ = line.coords
-        away, place = ((0, -5), ("center", "top")) if layer.family else ((-5, 0), ("right", "center"))
-        sheet.axes.annotate(
-            str(fibre + 1), (x, y), away, textcoords="offset points", ha=place[0], va=place[1],
-            color=COLOURS[layer.family], fontsize=size, fontweight="bold",
-        )  # fmt: skip
+        below = plan.leads.pairs[fibre][0].axis == 1
+        away, place = ((0, -5), ("center", "top")) if below else ((-5, 0), ("right", "center"))
+        for x, y in (line.coords[0], line.coords[-1])[: 1 + (plan.settings.pad.leads == "one side")]:
+            sheet.axes.annotate(
+                str(fibre + 1), (x, y), away, textcoords="offset points", ha=place[0], va=place[1],
+                color=COLOURS[layer.family], fontsize=size, fontweight="bold",
+            )  # fmt: skip
     return drawn[:1]
 
 
@@ -226,13 +237,18 @@ class _Sheet:
         save_figure(self.figure, path, _DPI)
 
 
+def _pixels(width_mm: float, height_mm: float) -> tuple[int, int]:
+    """Width and height in pixels of what is so large."""
+    scale = _PIXELS / max(width_mm, height_mm)
+    return max(1, round(scale * width_mm)), max(1, round(scale * height_mm))
+
+
 def _sheet(extent: tuple[float, float, float, float], title: str, entries: int, note: str = "") -> _Sheet:
     """An empty picture of `extent` (left, right, low, high) mm with room for the legend's entries and a note."""
     from matplotlib.figure import Figure
 
     left, right, low, high = extent
-    scale = _PIXELS / max(right - left, high - low)
-    wide, tall = max(1, round(scale * (right - left))), max(1, round(scale * (high - low)))
+    wide, tall = _pixels(right - left, high - low)
     width = _LEFT + max(wide, _NARROWEST) + _RIGHT
     lines = tuple(textwrap.wrap(note, int((width - _LEFT) / _LETTER)))
     below = _BOTTOM + _ROW * math.ceil(entries / _COLUMNS) + 6 * (entries > 0) + _LINE * len(lines)

@@ -27,10 +27,11 @@ _STEPS = 8
 """Steps of shade on either side: enough for the eye, and small files."""
 
 
-def mould_relief(plan: Plan, pixels: int) -> tuple[Array, Ints]:
-    """Heights (pixels, pixels) above the tray's floor, and what each pixel shows, over the square of the tray."""
-    mould = plan.settings.mould
+def mould_relief(plan: Plan, wide: int, tall: int) -> tuple[Array, Ints]:
+    """Heights (tall, wide) above the tray's floor, and what each pixel shows, over the tray."""
+    mould, pixels = plan.settings.mould, (wide, tall)
     walls = _walls(plan, pixels)
+    walls[_inside(plan.pillars, plan.tray.bounds, pixels)] = plan.silicone_mm
     heights = walls.copy()
     for prism in mould_body(plan).adds:
         inside = _inside(prism.area, plan.tray.bounds, pixels)
@@ -82,15 +83,15 @@ def lit(colours: Array, heights_mm: Array) -> Array:
     return out
 
 
-def _walls(plan: Plan, pixels: int) -> Array:
-    """(pixels, pixels) height of the walls alone, which lean outwards from the outline of the floor."""
-    low, _, high, _ = plan.tray.bounds
-    middles = low + (np.arange(pixels) + 0.5) * (high - low) / pixels
-    outside = np.full((pixels, pixels), np.inf)
+def _walls(plan: Plan, pixels: tuple[int, int]) -> Array:
+    """(tall, wide) height of the walls alone, which lean outwards from the outline of the floor."""
+    low, high = np.reshape(plan.tray.bounds, (2, 2))
+    x, y = (a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, pixels, strict=True))
+    outside = np.full(pixels[::-1], np.inf)
     for hollow in (plan.cavity, *plan.exits):
         left, bottom, right, top = hollow.bounds
-        across = np.maximum(left - middles, middles - right)
-        up = np.maximum(bottom - middles, middles - top)[::-1]
+        across = np.maximum(left - x, x - right)
+        up = np.maximum(bottom - y, y - top)[::-1]
         columns, rows = _near(across, plan.flare_mm), _near(up, plan.flare_mm)
         window = outside[rows, columns]
         np.minimum(window, np.maximum(up[rows, None], across[None, columns]), out=window)
@@ -103,18 +104,18 @@ def _near(away: Array, reach_mm: float) -> slice:
     return slice(near[0], near[-1] + 1) if len(near) else slice(0)
 
 
-def _inside(area: BaseGeometry, bounds: tuple[float, ...], pixels: int) -> NDArray[np.bool_]:
-    """(pixels, pixels) whether the pixel's middle lies in `area`, over the square `bounds`."""
-    low, _, high, _ = bounds
+def _inside(area: BaseGeometry, bounds: tuple[float, ...], pixels: tuple[int, int]) -> NDArray[np.bool_]:
+    """(tall, wide) whether the pixel's middle lies in `area`, over the rectangle `bounds`."""
+    (low, high), (wide, tall) = np.reshape(bounds, (2, 2)), pixels
     rings = [(ring - low) / (high - low) * pixels - 0.5 for polygon in polygon_rings(area) for ring in polygon]
     if not rings:
-        return np.zeros((pixels, pixels), dtype=bool)
+        return np.zeros((tall, wide), dtype=bool)
     starts, ends = np.concatenate(rings), np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
-    ends_at = np.ceil(np.stack([starts[:, 1], ends[:, 1]])).clip(0, pixels).astype(np.intp)
+    ends_at = np.ceil(np.stack([starts[:, 1], ends[:, 1]])).clip(0, tall).astype(np.intp)
     edge, row = _runs(ends_at.min(axis=0), ends_at.max(axis=0) - 1)
     (x, y), (to_x, to_y) = starts[edge].T, ends[edge].T
-    column = np.ceil(x + (row - y) * (to_x - x) / (to_y - y)).clip(0, pixels).astype(np.intp)
-    passed = np.bincount(row * (pixels + 1) + column, minlength=pixels * (pixels + 1)).reshape(pixels, pixels + 1)
+    column = np.ceil(x + (row - y) * (to_x - x) / (to_y - y)).clip(0, wide).astype(np.intp)
+    passed = np.bincount(row * (wide + 1) + column, minlength=tall * (wide + 1)).reshape(tall, wide + 1)
     return (np.cumsum(passed[::-1, :-1], axis=1) % 2).astype(bool)
 
 

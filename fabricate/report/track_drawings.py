@@ -7,43 +7,27 @@ Both show the pad as it lies in the tray, tracks down, seen from above, and say 
 # ezdxf does not mark what its own manual imports as exported.
 
 import io
-import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from design.pad.courses.curves import beziers
 from design.pad.knots import Array
 from fabricate.mould.plan import Plan, polygon_rings
 
-from .fibre_layers import COLOURS, FAMILIES, fibre_name, layers
-from .laying.orientation import SENTENCE
+from .fibre_layers import FAMILIES, fibre_name, layers
+from .track_sheet import NOTE, SCALE_MM, Point, TrackSheet, Writing
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts import Modelspace
 
-Point = tuple[float, float]
-
-SCALE_MM = 10.0
-"""Length of the scale bar: whoever prints a drawing measures it."""
-_TEXT_MM = 2.5
-"""Height of writing, as drawing standards have it; less where the pitch is narrow."""
-_ASIDE_MM = 1.0
-"""Between the silicone and the writing beside it."""
-_NOTE = "as it lies in the tray, seen from above"
 _DESCRIPTION = (
     "True size, 1 unit = 1 mm. Seen from above as the pad lies in the tray, tracks down: the mould's ridges lie as"
-    f" drawn. {SENTENCE} Layers are in laying order, the deepest first."
+    " drawn. {} Layers are in laying order, the deepest first."
 )
-_LETTER_MM = 0.6
-"""Width of a letter, at most and on average, for a height of 1."""
-
 _ACI = (5, 30)
 """Blue and orange of the old CAD colour index, for readers that know no others."""
 
@@ -54,7 +38,7 @@ def tracks_svg(plan: Plan) -> str:
     Each depth is a layer, each fibre a path that runs straight on from its ends through border and exit to the
     silicone's edge. Further layers hold that edge, the sensor numbers beside the starts, and a scale bar.
     """
-    sheet = _Sheet(plan)
+    sheet = TrackSheet(plan)
     left, low, right, high = sheet.frame
     size = f"{_number(right - left)}mm", f"{_number(high - low)}mm"
     view = " ".join(map(_number, (left, -high, right - left, high - low)))
@@ -62,8 +46,8 @@ def tracks_svg(plan: Plan) -> str:
         [
             '<svg xmlns="http://www.w3.org/2000/svg" xmlns:inkscape="http://www.inkscape.org/namespaces/inkscape"',
             f' width="{size[0]}" height="{size[1]}" viewBox="{view}" fill="none">',
-            f"<title>Fibre tracks of a pad, {_NOTE}</title>",
-            f"<desc>{_DESCRIPTION}</desc>",
+            f"<title>Fibre tracks of a pad, {NOTE}</title>",
+            f"<desc>{_DESCRIPTION.format(sheet.sentence)}</desc>",
             *_svg_layer("silicone", "silicone's edge", 'stroke="#888" stroke-width="0.2"', _svg_silicone(plan)),
             *_svg_tracks(sheet),
             *_svg_layer("numbers", "sensor numbers", _svg_writing(sheet), map(_svg_text, sheet.numbers)),
@@ -81,7 +65,7 @@ def tracks_dxf(plan: Plan) -> str:
     import ezdxf
     from ezdxf import units
 
-    sheet = _Sheet(plan)
+    sheet = TrackSheet(plan)
     with _fixed_dates():
         document = ezdxf.new("R2010", units=units.MM)
         space = document.modelspace()
@@ -98,102 +82,6 @@ def tracks_dxf(plan: Plan) -> str:
     return stream.getvalue()
 
 
-@dataclass(frozen=True)
-class _Text:
-    """Writing at (x, y) mm: `anchor` "end" ends there, "middle" has its middle there, "start" begins there."""
-
-    text: str
-    x: float
-    y: float
-    anchor: str
-    colour: str
-
-
-@dataclass(frozen=True)
-class _Sheet:
-    """Where everything is on a drawing, mm, y upwards."""
-
-    plan: Plan
-
-    @cached_property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """Left, low, right and high of the silicone."""
-        return self.plan.silicone.bounds
-
-    @cached_property
-    def text_mm(self) -> float:
-        """Height of the writing."""
-        return min(_TEXT_MM, 0.6 * self.plan.pad.pitch_mm)
-
-    @cached_property
-    def frame(self) -> tuple[float, float, float, float]:
-        """Left, low, right and high of the drawing; the scale bar and the numbers lie outside of the silicone."""
-        left, _, _, high = self.bounds
-        digits = len(str(2 * self.plan.pad.grid))
-        left -= 2 * _ASIDE_MM + digits * self.text_mm
-        low = self.scale_y - 3 * _ASIDE_MM - len(self.said) * self.line_mm
-        return left, low, self.bounds[0] + self.room_mm + 2 * _ASIDE_MM, high + 2 * _ASIDE_MM
-
-    @cached_property
-    def spans(self) -> Array:
-        """(2M, N+1, 4, 2) Bezier control points of every fibre between its ends."""
-        return self.plan.pad.to_mm(beziers(self.plan.pad))
-
-    @cached_property
-    def ends(self) -> Array:
-        """(2M, 2, 2) where every fibre enters and leaves the silicone, straight on from its ends."""
-        mould = self.plan.settings.mould
-        ahead = (mould.border_mm + mould.exit_mm) * np.repeat(np.eye(2), self.plan.pad.grid, axis=0)
-        return np.stack([self.spans[:, 0, 0] - ahead, self.spans[:, -1, -1] + ahead], axis=1)
-
-    @cached_property
-    def numbers(self) -> list[_Text]:
-        """The number of every fibre, outside of the silicone where the fibre starts."""
-        texts = []
-        for fibre, (x, y) in enumerate(self.ends[:, 0].tolist()):
-            family = self.plan.family(fibre)
-            place = (x, y - _ASIDE_MM - self.text_mm / 2) if family else (x - _ASIDE_MM, y)
-            texts.append(_Text(str(fibre + 1), *place, "middle" if family else "end", COLOURS[family]))
-        return texts
-
-    @cached_property
-    def scale_y(self) -> float:
-        """Height of the scale bar."""
-        return self.bounds[1] - 4 * _ASIDE_MM - self.text_mm
-
-    @cached_property
-    def scale(self) -> list[tuple[Point, Point]]:
-        """The strokes of the scale bar."""
-        left, y = self.bounds[0], self.scale_y
-        ticks = [(left + share * SCALE_MM, tick) for share, tick in ((0, 1.5), (0.5, 0.8), (1, 1.5))]
-        return [((left, y), (left + SCALE_MM, y)), *(((x, y), (x, y + tick)) for x, tick in ticks)]
-
-    @cached_property
-    def line_mm(self) -> float:
-        """From one line of writing to the next."""
-        return 1.4 * self.text_mm
-
-    @cached_property
-    def room_mm(self) -> float:
-        """For writing: as wide as the silicone, or as the scale bar with its two texts."""
-        left, _, right, _ = self.bounds
-        return max(right - left, SCALE_MM + _ASIDE_MM + (5 + _LETTER_MM * len(_NOTE)) * self.text_mm)
-
-    @cached_property
-    def said(self) -> list[str]:
-        """Which way round, in lines as long as there is room for."""
-        return textwrap.wrap(SENTENCE, int(self.room_mm / (_LETTER_MM * self.text_mm)))
-
-    @cached_property
-    def notes(self) -> list[_Text]:
-        """What is written beside the scale bar and below it."""
-        left, x, y = self.bounds[0], self.bounds[0] + SCALE_MM + _ASIDE_MM, self.scale_y + self.text_mm / 4
-        beside = [(f"{SCALE_MM:g} mm", x, y), (_NOTE, x + 5 * self.text_mm, y)]
-        first = self.scale_y - _ASIDE_MM - self.line_mm / 2
-        below = [(line, left, first - row * self.line_mm) for row, line in enumerate(self.said)]
-        return [_Text(*text, "start", "#555555") for text in (*beside, *below)]
-
-
 def _svg_layer(name: str, label: str, style: str, content: Iterator[str]) -> list[str]:
     """A group that drawing programs show as a layer."""
     marks = f'id={quoteattr(name)} inkscape:groupmode="layer" inkscape:label={quoteattr(label)}'
@@ -205,7 +93,7 @@ def _svg_silicone(plan: Plan) -> Iterator[str]:
     yield f'<path id="edge" d="{"".join(rings)}"/>'
 
 
-def _svg_tracks(sheet: _Sheet) -> Iterator[str]:
+def _svg_tracks(sheet: TrackSheet) -> Iterator[str]:
     width = f'stroke-width="{sheet.plan.settings.fibre.material.diameter_mm:g}"'
     for layer in layers(sheet.plan):
         label = f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
@@ -213,24 +101,24 @@ def _svg_tracks(sheet: _Sheet) -> Iterator[str]:
         yield from _svg_layer(layer.name, label, f'stroke="{layer.colour}" {width}', paths)
 
 
-def _svg_path(sheet: _Sheet, fibre: int) -> str:
+def _svg_path(sheet: TrackSheet, fibre: int) -> str:
     spans, (start, end) = sheet.spans[fibre], sheet.ends[fibre]
     curves = "".join(f"C{_pair(a)} {_pair(b)} {_pair(c)}" for _, a, b, c in spans)
     name = fibre_name(sheet.plan, fibre).replace(" ", "-")
     return f'<path id="{name}" d="M{_pair(start)}L{_pair(spans[0, 0])}{curves}L{_pair(end)}"/>'
 
 
-def _svg_scale(sheet: _Sheet) -> Iterator[str]:
+def _svg_scale(sheet: TrackSheet) -> Iterator[str]:
     strokes = "".join(f"M{_pair(start)}L{_pair(end)}" for start, end in sheet.scale)
     yield f'<path d="{strokes}" stroke="#555555" stroke-width="0.2"/>'
     yield from map(_svg_text, sheet.notes)
 
 
-def _svg_writing(sheet: _Sheet) -> str:
+def _svg_writing(sheet: TrackSheet) -> str:
     return f'font-family="sans-serif" font-size="{_number(sheet.text_mm)}"'
 
 
-def _svg_text(text: _Text) -> str:
+def _svg_text(text: Writing) -> str:
     place = f'x="{_number(text.x)}" y="{_number(-text.y)}" dy="0.35em"'  # its middle, in every viewer
     return f'<text {place} text-anchor="{text.anchor}" fill="{text.colour}">{text.text}</text>'
 
@@ -241,7 +129,7 @@ def _dxf_silicone(document: "Drawing", space: "Modelspace", plan: Plan) -> None:
         space.add_lwpolyline(np.round(ring, 6).tolist(), close=True, dxfattribs={"layer": "silicone"})
 
 
-def _dxf_tracks(document: "Drawing", space: "Modelspace", sheet: _Sheet) -> None:
+def _dxf_tracks(document: "Drawing", space: "Modelspace", sheet: TrackSheet) -> None:
     from ezdxf.colors import RGB
 
     for layer in layers(sheet.plan):
@@ -254,7 +142,7 @@ def _dxf_tracks(document: "Drawing", space: "Modelspace", sheet: _Sheet) -> None
             space.add_open_spline(np.round(points, 6).tolist(), knots=knots, dxfattribs={"layer": layer.name})
 
 
-def _spline_points(sheet: _Sheet, fibre: int) -> Array:
+def _spline_points(sheet: TrackSheet, fibre: int) -> Array:
     """(3 n + 1, 2) control points of a fibre's n spans, with the straight ones at its ends if there are any."""
     spans, (start, end) = sheet.spans[fibre], sheet.ends[fibre]
     points = np.vstack([spans[0, :1], *spans[:, 1:]])
@@ -264,7 +152,7 @@ def _spline_points(sheet: _Sheet, fibre: int) -> Array:
     return np.vstack([start + thirds * (points[0] - start), points, end + thirds[::-1] * (points[-1] - end)])
 
 
-def _dxf_writing(document: "Drawing", space: "Modelspace", sheet: _Sheet) -> None:
+def _dxf_writing(document: "Drawing", space: "Modelspace", sheet: TrackSheet) -> None:
     from ezdxf.enums import TextEntityAlignment as Alignment
 
     at = {"start": Alignment.MIDDLE_LEFT, "middle": Alignment.MIDDLE_CENTER, "end": Alignment.MIDDLE_RIGHT}

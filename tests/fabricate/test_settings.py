@@ -4,6 +4,7 @@ import pytest
 
 from design.common.errors import InputError
 from design.common.settings import Spec, commented_toml
+from design.settings import Layout
 from fabricate.materials import FibreSettings, SiliconeSettings
 from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import with_settings
@@ -57,14 +58,14 @@ def test_a_bad_key_is_one_clear_line(tables, parts):
 )
 def test_hostile_values_are_one_clear_line(key, value):
     with pytest.raises(InputError, match=rf"\[mould\] {key}: (got )?") as refusal:
-        FabricationSettings.from_spec(Spec({"mould": {key: value}})).require_consistent(11.25)
+        FabricationSettings.from_spec(Spec({"mould": {key: value}})).require_consistent(Layout.of(4))
     assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("pitch_mm", [0.1, 3.0])
 def test_a_pitch_too_small_for_the_ridges_or_the_exits(pitch_mm):
     with pytest.raises(InputError, match="allowed is less than the pitch"):
-        DEFAULTS.require_consistent(pitch_mm)
+        DEFAULTS.require_consistent(Layout.of(4, pitch_mm))
 
 
 def test_terraces_are_whole_layers_with_steps_no_printer_places():

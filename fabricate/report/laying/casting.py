@@ -60,7 +60,8 @@ def casting(document: Mapping[str, Any]) -> Iterator[str]:
     yield "2. Degas the mix in a vacuum until its bubbles have burst."
     yield f"3. {pour}"
     yield f"4. Leave it for {_duration(60 * silicone['cure_h'])} at room temperature."
-    yield "5. Free the casting all along the walls, then pull it out from a corner."
+    around = " and around every pillar" if document["settings"]["pad"]["keep_out_mm"] else ""
+    yield f"5. Free the casting all along the walls{around}, then pull it out from a corner."
 
 
 def _duration(minutes: float) -> str:

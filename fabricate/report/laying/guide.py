@@ -8,14 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from design.pad.courses.curves import lengths
 from fabricate.materials import PLASTICS
 from fabricate.mould.plan import Plan, overlap
 from fabricate.report.fibre_layers import fibre_name, layers
 from fabricate.settings import MouldSettings, PrinterSettings
 
 from . import casting, print_settings, wiring
-from .orientation import LINK, SENTENCE
+from .orientation import LINK, sentence
 from .tables import table
 
 _LONGEST_TABLE = 24
@@ -34,7 +33,10 @@ def document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
         "fibre": what they are of. "fibres": one each, in the order of their numbers.
         "laying_order": the numbers laid in each step, deep first.
         "crossings": all of them, with the silicone left between the fibres.
+        "exits": of leads to one side, the numbers along it from left to right as the pad lies turned over.
     """
+    ends = [(lead.turned_mm[0], number) for number, pair in enumerate(plan.leads.pairs, 1) for lead in pair]
+    one_side = plan.settings.pad.leads == "one side"
     return {
         "silicone": casting.silicone(plan, mould_mm3),
         "adhesive": _adhesive(plan),
@@ -42,7 +44,14 @@ def document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
         "fibres": _fibres(plan),
         "laying_order": [[fibre + 1 for fibre in layer.fibres] for layer in layers(plan)],
         "crossings": _crossings(plan),
+        **({"exits": [number for _, number in sorted(ends, reverse=True)]} if one_side else {}),
     }
+
+
+def pad_settings(plan: Plan) -> dict[str, Any]:
+    """What `[pad]` says of a mould and of the way its fibres lie, with how many they are."""
+    said = plan.settings.pad.model_dump(mode="json", include={"deep_family", "leads", "keep_out_mm", "bent_radius_mm"})
+    return {**said, "horizontals": plan.pad.layout.horizontals, "verticals": plan.pad.layout.verticals}
 
 
 def _adhesive(plan: Plan) -> dict[str, Any]:
@@ -56,8 +65,7 @@ def _adhesive(plan: Plan) -> dict[str, Any]:
 
 
 def _fibres(plan: Plan) -> list[dict[str, Any]]:
-    mould = plan.settings.mould
-    courses = lengths(plan.pad) * plan.pad.pitch_mm + 2 * (mould.border_mm + mould.exit_mm)
+    mould, courses = plan.settings.mould, plan.lengths_mm
     return [
         {
             "number": fibre + 1,
@@ -85,7 +93,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
     return {
         "total": len(table),
         "same_family": len(plan.clashes),
-        "gap_mm": min(row[-1] for row in table),
+        "gap_mm": min((row[-1] for row in table), default=None),
         "columns": ["first", "second", "x_mm", "y_mm", "depth_first_mm", "depth_second_mm", "gap_mm"],
         "table": table,
     }
@@ -123,8 +131,7 @@ def _printing(document: Mapping[str, Any]) -> Iterator[str]:
     if mould["holder"]:
         yield (
             "- Print the holder last, in the middle of the bed, and leave it there. The finished pad lies in it with"
-            " its tracks up; fibres 1 and "
-            f"{len(document['fibres']) // 2 + 1} start at the cut corner."
+            f" its tracks up; {_at_corner(document['settings']['pad'])} the cut corner."
         )
     if mould["conductive"]:
         yield "- The mould called `conductive` is for casting a conductive material in place of fibres."
@@ -133,9 +140,27 @@ def _printing(document: Mapping[str, Any]) -> Iterator[str]:
         yield from table(print_settings.HEAD, list(print_settings.rows(*settings)))
 
 
+def _at_corner(pad: Mapping[str, Any]) -> str:
+    """What begins at the corner of the holder that is cut."""
+    if pad["leads"] == "one side":
+        return "its leads are at the side of"
+    first = [first for first, count in ((1, pad["horizontals"]), (pad["horizontals"] + 1, pad["verticals"])) if count]
+    return f"fibres {first[0]} and {first[1]} start at" if len(first) > 1 else f"fibre {first[0]} starts at"
+
+
 def _way_round(document: Mapping[str, Any]) -> Iterator[str]:
-    grid = len(document["fibres"]) // 2
-    yield f"{SENTENCE} Horizontal fibres are {_span(1, grid)}, vertical ones {_span(grid + 1, 2 * grid)}."
+    pad = document["settings"]["pad"]
+    horizontals, verticals = counts = pad["horizontals"], pad["verticals"]
+    numbers = f"Horizontal fibres are {_span(1, horizontals)}, vertical ones"
+    numbers += f" {_span(horizontals + 1, horizontals + verticals)}."
+    yield sentence(counts, pad["leads"]) + (f" {numbers}" if all(counts) else "")
+    for finding in document["findings"]:
+        if finding["name"] == "fibre_strain":
+            yield ""
+            yield (
+                "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards:"
+                f" {finding['message']}."
+            )
     yield ""
     yield LINK
 
@@ -180,6 +205,9 @@ def _handling(fibre: Mapping[str, Any]) -> str:
 
 def _crossing_places(document: Mapping[str, Any]) -> Iterator[str]:
     crossings = document["crossings"]
+    if not crossings["total"]:
+        yield "No two fibres cross."
+        return
     number = {fibre["fibre"]: fibre["number"] for fibre in document["fibres"]}
     least = f"At least {crossings['gap_mm']:g} mm lie between two fibres." if crossings["gap_mm"] > 0 else "Some touch."
     yield f"{crossings['total']} crossings, {crossings['same_family']} of them within a family. {least}"

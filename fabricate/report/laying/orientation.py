@@ -3,6 +3,7 @@
 Beside the places of the plan there are no others: whoever looks at the tracks sees its x axis run to the left.
 """
 
+import math
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,18 +16,32 @@ from shapely.geometry.base import BaseGeometry
 from design.common.figures import FAINT, INK, PAPER
 from design.pad.knots import Array
 from fabricate.mould.plan import Plan, polygon_rings
-from fabricate.report.fibre_layers import COLOURS, layers
+from fabricate.report.fibre_layers import COLOURS, FAMILIES, layers
 
 FILE = "orientation.svg"
-SENTENCE = (
+_TURNED = (
     "The casting is turned over, left to right, and stays so: the face with the tracks and their numbers lies up, to be"
-    " laid and then to be pressed; y runs as in the mould and x the other way (mirrored = true in [rig]); horizontal"
-    " fibres count from near to far and start on the right, vertical ones count from right to left and start at the"
-    " near side."
+    " laid and then to be pressed; y runs as in the mould and x the other way (mirrored = true in [rig]); "
 )
+_COUNTED = ("count from near to far and start", "count from right to left and start")
+_STARTS = {
+    "edges": ("on the right", "at the near side"),
+    "one side": ("right of the pad, the first next to it", "within its width"),
+}
 CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
 LINK = f"![{CAPTION}]({FILE})"
 """The drawing on a page that lies beside it."""
+
+
+def sentence(counts: tuple[int, int], leads: str) -> str:
+    """Which way round a pad of (H, V) fibres lies, whose leads are those of `[pad] leads`."""
+    ways = [f"{way} {start}" for way, start in zip(_COUNTED, _STARTS[leads], strict=True)]
+    fibres = f"horizontal fibres {ways[0]}, vertical ones {ways[1]}"
+    if 0 in counts:
+        family = int(counts[0] == 0)
+        fibres = f"all fibres are {FAMILIES[family]}: they {ways[family]}"
+    return _TURNED + ("all leads leave at the near side: " if leads == "one side" else "") + fibres + "."
+
 
 TURN_DEG = 20.0
 """By which the pad in use is turned under the arm: as an example."""
@@ -77,12 +92,13 @@ class _Panel:
 
 def orientation_svg(plan: Plan) -> str:
     """The pad from above and from the near side: in the mould, turned over, and in use under an arm; 1 unit = 1 mm."""
-    scale, middle = _HALF_MM / plan.tray.bounds[2], _ABOVE_MM + _TALL_MM / 2
+    scale, middle = _HALF_MM / np.abs(plan.tray.bounds).max(), _ABOVE_MM + _TALL_MM / 2
     tray, over, used = (
         _Panel((number + 0.5) * _WIDE_MM, middle, scale, mirrored, turn_deg)
         for number, (mirrored, turn_deg) in enumerate(((False, 0.0), (True, 0.0), (True, TURN_DEG)))
     )
-    lines = textwrap.wrap(SENTENCE, _LETTERS)
+    said = sentence(plan.pad.layout.counts, plan.settings.pad.leads)
+    lines = textwrap.wrap(said, _LETTERS)
     side_y = _ABOVE_MM + _TALL_MM + 6
     text_y = side_y + _SLAB_MM + 2 * _LINE_MM + 2
     width, height = 3 * _WIDE_MM, text_y + (len(lines) - 0.5) * _LINE_MM
@@ -92,12 +108,12 @@ def orientation_svg(plan: Plan) -> str:
             f'<svg xmlns="http://www.w3.org/2000/svg" {xlink} width="{_mm(width)}mm" height="{_mm(height)}mm"'
             f' viewBox="0 0 {_mm(width)} {_mm(height)}" fill="none" font-family="sans-serif" font-size="{_TEXT_MM}">',
             f"<title>{CAPTION}</title>",
-            f"<desc>{escape(SENTENCE)}</desc>",
+            f"<desc>{escape(said)}</desc>",
             f'<rect width="{_mm(width)}" height="{_mm(height)}" fill="white"/>',
             f'<defs><g id="pad">{"".join(_pad(plan, scale))}</g></defs>',
-            *_above(plan, "mould", tray, plan.tray.bounds[2]),
-            *_above(plan, "turned", over, plan.silicone.bounds[2]),
-            *_above(plan, "used", used, plan.silicone.bounds[2]),
+            *_above(plan, "mould", tray, plan.tray),
+            *_above(plan, "turned", over, plan.silicone),
+            *_above(plan, "used", used, plan.silicone),
             *_arm(used),
             *_sides(plan, (tray, over, used), side_y),
             *_titles(),
@@ -121,20 +137,19 @@ def _pad(plan: Plan, scale: float) -> Iterator[str]:
             yield f'<path class="cast" d="{_rings(number)}" fill="{COLOURS[plan.family(fibre)]}"/>'
 
 
-def _above(plan: Plan, name: str, panel: _Panel, edge_mm: float) -> Iterator[str]:
-    """The pad in a panel with its axes, and the number of each fibre beside its start, beyond the edge."""
+def _above(plan: Plan, name: str, panel: _Panel, shown: BaseGeometry) -> Iterator[str]:
+    """The pad in a panel with its axes, and the number of each fibre beside its start, beyond what is shown."""
     yield f'<g id="{name}">'
     if not panel.mirrored:
         yield f'<path d="{_rings(plan.tray)}" fill="{FAINT}" transform="{panel.transform}"/>'
     yield f'<use xlink:href="#pad" transform="{panel.transform}"/>'
-    size = min(_TEXT_MM, 0.6 * plan.pad.pitch_mm * panel.scale)
-    out = edge_mm + (_BESIDE_MM + size / 2) / panel.scale
-    for fibre, line in enumerate(plan.lines):
-        family = plan.family(fibre)
-        start = np.array(line.coords[0])
-        start[family] = -out
-        yield _text(str(fibre + 1), *panel.at(start[None])[0], colour=COLOURS[family], size=size, bold=True)
-    reach = 0.45 * plan.cavity.bounds[2]
+    size = min(_TEXT_MM, 0.6 * plan.least_pitch_mm * panel.scale)
+    for fibre, lead in enumerate(plan.ends(0)):
+        start = lead.turned_mm.copy()
+        start[lead.axis] = -((_BESIDE_MM + size / 2) / panel.scale - shown.bounds[lead.axis])
+        colour = COLOURS[plan.family(fibre)]
+        yield _text(str(fibre + 1), *panel.at(start[None])[0], colour=colour, size=size, bold=True)
+    reach = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
     for axis, tip in zip("xy", np.eye(2) * reach, strict=True):
         start, end, beyond = panel.at(np.array([0 * tip, tip, 1.2 * tip]))
         yield _arrow(start, end)
@@ -158,7 +173,7 @@ def _arm(panel: _Panel) -> Iterator[str]:
 
 
 def _sides(plan: Plan, panels: tuple[_Panel, _Panel, _Panel], top: float) -> Iterator[str]:
-    """The three from the near side, cut where the vertical fibres start; heights are of no scale."""
+    """The three from the near side, cut where fibres start there; heights are of no scale."""
     tray, over, used = panels
     low, half = top + _SLAB_MM, plan.cavity.bounds[2] * tray.scale
     floor = low + _FLOOR_MM
@@ -166,13 +181,14 @@ def _sides(plan: Plan, panels: tuple[_Panel, _Panel, _Panel], top: float) -> Ite
     yield _box(tray.x - half - _WALL_MM, top, 2 * (half + _WALL_MM), floor - top, FAINT)
     for panel in panels:
         yield _box(panel.x - half, top, 2 * half, _SLAB_MM, PAPER)
-    starts = [(fibre + 1, line.coords[0][0]) for fibre, line in enumerate(plan.lines) if plan.family(fibre)]
-    size = min(_TEXT_MM, 0.6 * plan.pad.pitch_mm * tray.scale)
-    for panel, y, fill in ((tray, low - _TRACK_MM, FAINT), (over, top, "white"), (used, top, COLOURS[1])):
-        for number, x_mm in starts:
+    starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
+    size = min(_TEXT_MM, 0.6 * plan.least_pitch_mm * tray.scale)
+    for panel, y, fill in ((tray, low - _TRACK_MM, FAINT), (over, top, "white"), (used, top, "")):
+        for fibre, x_mm in starts:
             x = panel.x + (-x_mm if panel.mirrored else x_mm) * panel.scale
-            yield _box(x - 0.4, y, 0.8, _TRACK_MM, fill)
-            yield _text(str(number), x, floor + size, colour=COLOURS[1], size=size)
+            colour = COLOURS[plan.family(fibre)]
+            yield _box(x - 0.4, y, 0.8, _TRACK_MM, fill or colour)
+            yield _text(str(fibre + 1), x, floor + size, colour=colour, size=size)
     yield f'<path id="probe" d="M{_mm(used.x - 2)},{_mm(top - 7)}v4a2,2 0 0 0 4,0v-4z" fill="{INK}"/>'
     table = f"M{_mm(used.x - half - 6)},{_mm(low)}h{_mm(2 * half + 12)}"
     yield f'<path d="{table}" stroke="{INK}" stroke-width="0.4"/>'

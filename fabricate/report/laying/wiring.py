@@ -21,6 +21,10 @@ def resistances(plan: Plan, length_mm: float) -> dict[str, float | None]:
 def wiring(document: Mapping[str, Any]) -> Iterator[str]:
     """What every fibre should have, and the resistor to wire it to, from a whole fabrication document."""
     fibres, ohm_per_mm = document["fibres"], document["fibre"]["ohm_per_mm"]
+    if "exits" in document:
+        numbers = ", ".join(map(str, document["exits"]))
+        yield f"Along the near side, from left to right as the pad lies for laying, these fibres end: {numbers}."
+        yield ""
     if ohm_per_mm is None:
         yield (
             f"The resistance of the fibre, {document['fibre']['name']}, is unknown: measure 100 mm of it and set"

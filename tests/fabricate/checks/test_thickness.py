@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from manifold3d import CrossSection, Manifold, Mesh, OpType
 
 from fabricate.checks.mesh_checks import SOUND
-from fabricate.checks.thickness import least_line_mm
 from fabricate.settings import PrinterSettings
 from tests.fabricate.checks.trays import (
     CROSS,
@@ -256,4 +255,4 @@ def _manifold(mesh: trimesh.Trimesh) -> Manifold:
 
 @pytest.mark.parametrize(("resin", "least"), [(False, 0.3), (True, 0.6)])
 def test_the_narrowest_line(resin, least):
-    assert least_line_mm(PrinterSettings(nozzle_mm=0.3, resin=resin)) == least
+    assert PrinterSettings(nozzle_mm=0.3, resin=resin).line_mm == least

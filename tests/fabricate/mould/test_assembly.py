@@ -10,7 +10,6 @@ from design.common.errors import InputError
 from design.pad.morphology import Morphology
 from fabricate.checks.plan_checks import check_plan
 from fabricate.mould.assembly import (
-    WELL_MM,
     bed_frame,
     conductive_body,
     conductive_plan,
@@ -24,6 +23,7 @@ from fabricate.mould.cad.bodies import body_solid
 from fabricate.mould.mesh import arrays, mesh
 from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body, Prism
+from fabricate.settings import WELL_MM
 from tests.fabricate.planted import with_settings
 from tests.helpers.effort import LONG
 

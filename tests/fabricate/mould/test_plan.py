@@ -45,11 +45,11 @@ def test_published_curves_within_the_tolerance(published):
 @pytest.mark.parametrize("border_mm", [0.0, 3.0])
 def test_ridges_run_into_the_walls_at_both_ends(border_mm):
     plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": border_mm}))
-    side = plan.pad.size_mm / 2 + border_mm
+    side = plan.pad.layout.size_mm[0] / 2 + border_mm
     assert plan.cavity.bounds == pytest.approx((-side, -side, side, side))
     ends = np.array([line.coords[0] for line in plan.lines[:3]])
     assert ends[:, 0] == pytest.approx(-side - plan.settings.mould.exit_mm - INTO_WALL_MM)
-    assert ends[:, 1] == pytest.approx(plan.pad.to_mm([1, 2, 3]))
+    assert ends[:, 1] == pytest.approx(plan.pad.to_mm([[0, 1], [0, 2], [0, 3]])[:, 1])
     for line in plan.lines:
         assert shapely.within(line, plan.tray)
 

@@ -70,7 +70,7 @@ def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_the_drawn_mould_is_the_mould(mould):
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould))
-    drawn, _ = mould_relief(plan, 300)
+    drawn, _ = mould_relief(plan, 300, 300)
     meshed, _ = mesh_relief(*mesh_of(plan), 300)
     assert drawn.shape == meshed.shape
     off = np.abs(meshed - plan.settings.mould.floor_mm - drawn)
@@ -79,7 +79,7 @@ def test_the_drawn_mould_is_the_mould(mould):
 
 def test_the_drawn_mould_of_a_published_pad_is_the_mould(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    drawn, shown = mould_relief(plan, 400)
+    drawn, shown = mould_relief(plan, 400, 400)
     meshed, _ = mesh_relief(*mesh_of(plan), 400)
     assert (np.abs(meshed - 2 - drawn) > 0.01).mean() < 2e-4
     assert set(np.unique(shown)) == {FLOOR, WALL, NUMBER, *(RIDGE + level for level in range(4))}

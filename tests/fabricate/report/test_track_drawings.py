@@ -19,7 +19,7 @@ from scipy.interpolate import PchipInterpolator
 from design.pad.morphology import Morphology
 from fabricate.mould.plan import Plan
 from fabricate.report.fibre_layers import layers
-from fabricate.report.laying.orientation import SENTENCE
+from fabricate.report.laying.orientation import sentence
 from fabricate.report.track_drawings import tracks_dxf, tracks_svg
 from tests.fabricate.planted import level_pad, with_settings
 
@@ -52,13 +52,13 @@ def assert_on_curve(plan: Plan, fibre: int, places_mm: np.ndarray) -> None:
     travel = np.clip(places_mm[:, axis], knots[0, axis], knots[-1, axis])
     off = np.abs(places_mm[:, 1 - axis] - curve(travel)) / np.hypot(1, curve(travel, 1))
     assert off.max() < 1e-4
-    assert np.ptp(travel) == pytest.approx(plan.pad.size_mm)
+    assert np.ptp(travel) == pytest.approx(plan.pad.layout.size_mm[0])
 
 
 def assert_ends(plan: Plan, fibre: int, ends_mm: np.ndarray) -> None:
     """The fibre begins and ends at the edge of the silicone, level with its own ends."""
     axis, mould = plan.family(fibre), plan.settings.mould
-    edge = plan.pad.size_mm / 2 + mould.border_mm + mould.exit_mm
+    edge = plan.pad.layout.size_mm[0] / 2 + mould.border_mm + mould.exit_mm
     assert ends_mm[:, axis] == pytest.approx([-edge, edge], abs=1e-4)
     level = plan.pad.to_mm(plan.pad.knots[fibre])[[0, -1], 1 - axis]
     assert ends_mm[:, 1 - axis] == pytest.approx(level, abs=1e-4)
@@ -127,14 +127,14 @@ def test_svg_numbers_stand_beside_the_starts_outside_the_silicone():
         assert place.distance(shapely.Point(line.coords[0])) < 3
     root = ElementTree.fromstring(tracks_svg(plan))
     assert "as it lies in the tray" in (root.findtext(f"{SVG}title") or "")
-    assert SENTENCE in (root.findtext(f"{SVG}desc") or "")
+    assert sentence((4, 4), "edges") in (root.findtext(f"{SVG}desc") or "")
 
 
 @pytest.mark.parametrize("pad", [Morphology.straight(1, pitch_mm=4.0), PAD, Morphology.straight(10)])
 def test_both_drawings_say_which_way_round_and_have_room_for_it(pad, tmp_path):
     plan = Plan(pad)
     beside, *texts = svg_groups(plan)["scale"].findall(f"{SVG}text")[1:]
-    assert " ".join(text.text or "" for text in texts) == SENTENCE
+    assert " ".join(text.text or "" for text in texts) == sentence((4, 4), "edges")
     notes = read_dxf(tracks_dxf(plan), tmp_path).modelspace().query('TEXT[layer=="scale"]')
     assert [note.dxf.text for note in notes][2:] == [text.text for text in texts]
     left, top, width, height = map(float, ElementTree.fromstring(tracks_svg(plan)).get("viewBox", "").split())
@@ -166,7 +166,7 @@ def test_dxf_splines_are_the_exact_curves(mould, tmp_path):
             assert counts.tolist() == [4, *[3] * (len(knots) - 2), 4]
             points = np.array([tuple(p)[:2] for p in curve.points(np.linspace(knots[0], knots[-1], 400).tolist())])
             assert_ends(plan, fibre, points[[0, -1]])
-            inside = np.abs(points[:, layer.family]) <= plan.pad.size_mm / 2
+            inside = np.abs(points[:, layer.family]) <= plan.pad.layout.size_mm[0] / 2
             control = np.array([tuple(p)[:2] for p in curve.control_points])
             first = 3 * bool(plan.settings.mould.border_mm + plan.settings.mould.exit_mm)
             ends = control[[first, len(control) - 1 - first]]

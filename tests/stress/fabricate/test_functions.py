@@ -164,10 +164,10 @@ def test_a_pad_however_wild_gives_a_closed_mould_or_one_line(data):
         except InputError:
             return
     of_a_sound_mould(
-        [f for f in found if pad.pitch_mm < 100 or f.name != "self_intersection"]
+        [f for f in found if pad.unit_mm < 100 or f.name != "self_intersection"]
     )  # floats are coarse there
     size = np.ptp(vertices.astype(float), axis=0)
-    side = pad.size_mm + 2 * plan_settings.mould.border_mm
+    side = pad.layout.size_mm[0] + 2 * plan_settings.mould.border_mm
     assert size[0] > side
     assert size[1] > side
     assert size[2] > plan.settings.mould.floor_mm

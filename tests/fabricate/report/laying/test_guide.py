@@ -26,6 +26,7 @@ def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
         "settings": {
             "mould": plan.settings.mould.model_dump(),
             "printer": plan.settings.printer.model_dump(),
+            "pad": guide.pad_settings(plan),
         },
         **guide.document(plan, volume),
     }
@@ -231,7 +232,7 @@ def test_the_page_names_the_ways_of_a_machine_where_there_are_some():
 def test_the_page_says_and_shows_which_way_round():
     page = guide.laying_page(whole(Plan(Morphology.straight(4))))
     section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
-    assert orientation.SENTENCE in section
+    assert orientation.sentence((4, 4), "edges") in section
     assert "Horizontal fibres are 1 to 4, vertical ones 5 to 8." in section
     assert f"]({orientation.FILE})" in section
 

@@ -9,7 +9,7 @@ import pytest
 
 from design.pad.morphology import Morphology
 from fabricate.mould.plan import Plan
-from fabricate.report.laying.orientation import SENTENCE, TURN_DEG, orientation_svg
+from fabricate.report.laying.orientation import TURN_DEG, orientation_svg, sentence
 from sense.rig.session.pad_frame import Frame
 from sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
@@ -80,8 +80,8 @@ def test_the_drawing_is_small_and_says_the_sentence(pad):
     text = orientation_svg(Plan(pad))
     assert len(text) < 40_000
     root = ElementTree.fromstring(text)
-    assert root.findtext(f"{SVG}desc") == SENTENCE
-    assert " ".join(line.text or "" for line in root.findall(f"{SVG}text")[-3:]) == SENTENCE
+    assert root.findtext(f"{SVG}desc") == sentence((4, 4), "edges")
+    assert " ".join(line.text or "" for line in root.findall(f"{SVG}text")[-3:]) == sentence((4, 4), "edges")
     width, height = map(float, root.get("viewBox", "").split()[2:])
     for one in root.iter(f"{SVG}text"):
         assert 0 < float(one.get("x", "")) < width
@@ -96,6 +96,6 @@ def test_without_numbers_none_are_drawn_as_cast():
 
 def test_the_bench_page_says_the_same():
     page = " ".join((DOCS / "bench.md").read_text(encoding="utf-8").split())
-    assert page.count(SENTENCE) == 1
+    assert page.count(sentence((4, 4), "edges")) == 1
     assert page.count("with its tracks up") >= 2  # under an arm, in the holder
     assert "with its tracks down" not in page

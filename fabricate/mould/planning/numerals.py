@@ -36,7 +36,8 @@ def number_strokes(number: int, height_mm: float, width_mm: float) -> BaseGeomet
 def with_room(
     numbers: Sequence[BaseGeometry],
     lines: Sequence[shapely.LineString],
-    cavity: shapely.Polygon,
+    area: BaseGeometry,
+    bounds: tuple[float, float, float, float],
     clear_mm: float,
     reach_mm: float,
 ) -> list[BaseGeometry | None]:
@@ -44,16 +45,17 @@ def with_room(
 
     Args:
         numbers: outlines with their middles at (0, 0). lines: centre lines of their ridges.
-        cavity: the floor between the walls. clear_mm: from a ridge's middle to writing, at least.
+        area: that is free of walls and pillars. bounds: of what is between the walls.
+        clear_mm: from a ridge's middle to writing, at least.
         reach_mm: how far into the pad, and within half of it to either side of the line's start, a number may lie.
     """
     shapely.prepare(lines)
-    floor, taken = cavity.buffer(-clear_mm, join_style="mitre"), []
+    floor, taken = area.buffer(-clear_mm, join_style="mitre"), []
     placed: list[BaseGeometry | None] = []
     for number, line in zip(numbers, lines, strict=True):
         start, second = np.array(line.coords[:2])
-        inward = np.sign(second - start)  # along its family's axis: lines leave the walls upright
-        start = np.where(inward > 0, cavity.bounds[:2], start)
+        inward = np.sign(second - start)  # along an axis: lines leave the walls upright
+        start = np.where(inward > 0, bounds[:2], start)
         ahead, aside = np.arange(0, reach_mm, _SEARCH_MM), np.arange(-reach_mm / 2, reach_mm / 2, _SEARCH_MM)
         depth, shift = (grid.ravel() for grid in np.meshgrid(ahead, aside))
         middles = start + depth[:, None] * inward + shift[:, None] * inward[::-1]

@@ -5,8 +5,8 @@ from shapely import affinity
 
 from design.pad.morphology import Morphology
 from fabricate.mould.assembly import mould_body
-from fabricate.mould.numerals import number_strokes
 from fabricate.mould.plan import Plan
+from fabricate.mould.planning.numerals import number_strokes
 from sense.rig.session.pad_frame import Frame
 from sense.settings import RigSettings
 from tests.fabricate.planted import with_settings

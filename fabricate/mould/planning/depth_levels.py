@@ -9,20 +9,20 @@ from collections.abc import Iterable, Sequence
 from design.pad.courses.curves import Crossing
 
 
-def fibre_levels(grid: int, clashes: Sequence[Crossing], deep_horizontal: bool) -> tuple[int, ...]:
-    """(2M,) level of every fibre, 0 the shallowest; the deep family has the upper ones.
+def fibre_levels(counts: tuple[int, int], clashes: Sequence[Crossing], deep_horizontal: bool) -> tuple[int, ...]:
+    """(H + V,) level of every fibre, 0 the shallowest; the deep family has the upper ones.
 
     Args:
-        grid: M.
+        counts: H and V.
         clashes: crossings of fibres of one family, in any order.
         deep_horizontal: whether horizontals are the deep family.
     """
-    horizontal, vertical = range(grid), range(grid, 2 * grid)
+    horizontal, vertical = range(counts[0]), range(counts[0], sum(counts))
     shallow, deep = (vertical, horizontal) if deep_horizontal else (horizontal, vertical)
     level = _coloured(shallow, clashes)
-    below = 1 + max(level.values())
+    below = 1 + max(level.values(), default=-1)
     level |= {fibre: below + colour for fibre, colour in _coloured(deep, clashes).items()}
-    return tuple(level[fibre] for fibre in range(2 * grid))
+    return tuple(level[fibre] for fibre in range(sum(counts)))
 
 
 def _coloured(family: Iterable[int], clashes: Sequence[Crossing]) -> dict[int, int]:

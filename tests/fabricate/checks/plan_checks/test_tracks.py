@@ -6,7 +6,8 @@ from design.pad.courses.curves import beziers, cubic
 from design.pad.morphology import Morphology
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND
-from fabricate.checks.plan_checks import _thinner, check, check_plan
+from fabricate.checks.plan_checks import check, check_plan
+from fabricate.checks.plan_checks.tracks import thinner
 from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -185,7 +186,7 @@ class TestSilicone:
     def test_corners_of_less_than_a_hundredth_of_a_square_millimetre_are_no_walls(self, length, patches):
         """A peg 0.3 mm wide on a block: 0.006 and 0.015 mm² of it are thinner than 0.4 mm."""
         block, peg = shapely.box(0, 0, 10, 5), shapely.box(4, 5, 4.3, 5 + length)
-        assert len(_thinner(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
+        assert len(thinner(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
 
     def test_tracks_of_different_depths_may_come_near(self):
         """Two horizontals that cross lie at two depths, and their verticals far apart."""

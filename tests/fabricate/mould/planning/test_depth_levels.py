@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 from design.common.errors import InputError
 from design.pad.courses.curves import Crossing
 from design.pad.morphology import Morphology
-from fabricate.mould.depth_levels import fibre_levels
 from fabricate.mould.plan import COVER_MM, Plan
+from fabricate.mould.planning.depth_levels import fibre_levels
 from tests.fabricate.planted import level_pad, with_settings
 
 
 def test_two_levels_are_enough_without_crossings_in_a_family():
-    assert fibre_levels(3, [], deep_horizontal=True) == (1, 1, 1, 0, 0, 0)
-    assert fibre_levels(3, [], deep_horizontal=False) == (0, 0, 0, 1, 1, 1)
+    assert fibre_levels((3, 3), [], deep_horizontal=True) == (1, 1, 1, 0, 0, 0)
+    assert fibre_levels((3, 3), [], deep_horizontal=False) == (0, 0, 0, 1, 1, 1)
 
 
 @given(st.integers(1, 6), st.data())
@@ -23,7 +23,7 @@ def test_fibres_that_cross_never_share_a_level(grid, data):
     fibres = [*itertools.combinations(range(grid), 2), *itertools.combinations(range(grid, 2 * grid), 2)]
     pairs = data.draw(st.lists(st.sampled_from(fibres), max_size=12)) if fibres else []
     deep = data.draw(st.booleans())
-    levels = fibre_levels(grid, [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
+    levels = fibre_levels((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
     assert all(levels[i] != levels[j] for i, j in pairs)
     horizontal, vertical = levels[:grid], levels[grid:]
     assert min(horizontal if deep else vertical) > max(vertical if deep else horizontal)
@@ -32,7 +32,7 @@ def test_fibres_that_cross_never_share_a_level(grid, data):
 
 def test_a_star_of_crossings_needs_one_level_more():
     star = [Crossing(0, other, (0.0, 0.0)) for other in range(1, 5)]
-    assert max(fibre_levels(5, star, deep_horizontal=True)) == 2
+    assert max(fibre_levels((5, 5), star, deep_horizontal=True)) == 2
 
 
 def test_crossing_fibres_of_a_family_lie_a_step_apart():

@@ -1,11 +1,6 @@
-"""Whether a mould prints, demoulds and lets the fibres be laid: each check one finding with its places.
-
-Nothing here changes a mould or stops its making: a pass, warn or fail with what was measured is all there is. The
-checks here need the plan; those that a mesh of any origin goes through are in `mesh_checks`.
-"""
+"""Whether ridges print and demould, and tracks let the fibres be laid: each check one finding with its places."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import shapely
@@ -16,15 +11,8 @@ from shapely.geometry.base import BaseGeometry
 from design.criteria.rules import tight_bends
 from design.pad.courses.bending import traced_curve
 from design.pad.courses.curves import beziers, flatten, slope_beziers
-from design.pad.morphology import Morphology
-from fabricate.mesh_files import read_mesh
-from fabricate.mould.assembly import plan_mesh
+from fabricate.checks.findings import Finding, Status, as_places, graded, verdict
 from fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
-from fabricate.settings import DEFAULTS, FabricationSettings
-
-from .findings import Finding, Status, as_places, graded, verdict
-from .mesh_checks import inspect_mesh
-from .thickness import least_line_mm
 
 _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""
@@ -35,47 +23,9 @@ _FINE_MM, _TURN = 3e-4, 0.05
 _NAMED = 8
 """More fibres than this are counted instead of named."""
 
-Inspected = tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]
-"""Vertices (n, 3) mm, triangles (m, 3) vertex numbers, and what the checks found."""
 
-
-def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Finding]:
-    """Every check on the mould of a pad.
-
-    Raises:
-        InputError: settings that contradict each other.
-    """
-    return meshed(Plan(pad, settings))[-1]
-
-
-def inspect_file(source: Path, settings: FabricationSettings = DEFAULTS) -> Inspected:
-    """The mesh in a .stl or .3mf, or of the mould of the morphology in any other file, and every check on it.
-
-    Raises:
-        InputError: the file cannot be read, or settings contradict each other.
-    """
-    if source.suffix.lower() not in (".stl", ".3mf"):
-        return meshed(Plan(Morphology.load(source), settings))
-    vertices, triangles = read_mesh(source)
-    return vertices, triangles, inspect_mesh(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)
-
-
-def meshed(plan: Plan) -> Inspected:
-    """The mesh of a plan, and every check on both."""
-    from fabricate.mould.mesh import arrays
-
-    vertices, triangles = arrays(plan_mesh(plan.enlarged))
-    return vertices, triangles, inspect(plan, vertices, triangles)
-
-
-def inspect(plan: Plan, vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> list[Finding]:
-    """Every check on a plan and its mesh: vertices (n, 3) mm, triangles (m, 3) vertex numbers."""
-    of_mesh = inspect_mesh(vertices, triangles, plan.settings.printer, genus=0, unplanned=False)
-    return [*of_mesh, *check_plan(plan)]
-
-
-def check_plan(plan: Plan) -> list[Finding]:
-    """The checks that need no mesh: of the mould as it is printed, and of the pad as it is used."""
+def check_tracks(plan: Plan) -> list[Finding]:
+    """The checks of ridges and tracks: of the mould as it is printed, and of the pad as it is used."""
     mould = plan.enlarged
     return [
         _ridge_width(mould),
@@ -95,7 +45,7 @@ def check_plan(plan: Plan) -> list[Finding]:
 
 def _ridge_width(plan: Plan) -> Finding:
     """A printer draws nothing narrower than its nozzle, or than two pixels of its screen."""
-    width, least = plan.settings.mould.ridge_width_mm, least_line_mm(plan.settings.printer)
+    width, least = plan.settings.mould.ridge_width_mm, plan.settings.printer.line_mm
     reason = "two pixels" if plan.settings.printer.resin else "the nozzle"
     message = f"ridges are {width:g} mm wide, {reason} {least:g} mm"
     wide = width >= least - 1e-9
@@ -142,6 +92,8 @@ def _slenderness(plan: Plan) -> Finding:
 def _crossing_gap(plan: Plan) -> Finding:
     """Where fibres cross, silicone or adhesive between them keeps them from shorting."""
     mould = plan.settings.mould
+    if len(plan.depths_mm) < 2:
+        return Finding("crossing_gap", "pass", 0.0, mould.min_silicone_mm, "no two fibres cross: all lie at one depth")
     gap = plan.depths_mm[1] - plan.depths_mm[0] - plan.settings.fibre.material.diameter_mm
     message = f"{gap:.3f} mm lie between fibres of neighbouring depths where they cross"
     return Finding("crossing_gap", graded(gap, mould.min_silicone_mm), gap, mould.min_silicone_mm, message)
@@ -149,7 +101,7 @@ def _crossing_gap(plan: Plan) -> Finding:
 
 def _same_family_crossings(plan: Plan) -> Finding:
     """Tracks of one depth that cross become one, and the fibres in them touch; each further depth is more work."""
-    places = plan.pad.to_mm([c.place for c in plan.clashes]).reshape(-1, 2)
+    places = plan.clash_places_mm
     message = f"{len(places)} crossings of fibres of one family"
     if plan.settings.mould.levels == "two":
         status: Status = "fail" if len(places) else "pass"
@@ -161,14 +113,17 @@ def _same_family_crossings(plan: Plan) -> Finding:
 
 
 def _silicone_wall(plan: Plan) -> Finding:
-    """The thinnest silicone between tracks of equal depth, of two fibres or of one that turns back.
+    """The thinnest silicone between tracks of equal depth, of two fibres or of one that turns back, and keep-outs.
 
     Silicone beside the tray's walls is left to the check of those. Found by bisection to 2 % or 10 µm.
     """
-    limit, pitch = plan.settings.mould.min_silicone_mm, plan.pad.pitch_mm
+    layout, limit = plan.pad.layout, plan.settings.mould.min_silicone_mm
+    pitch = max(layout.pitch_x_mm, layout.pitch_y_mm)
     around = plan.cavity.buffer(2 * pitch, join_style="mitre")
+    if plan.pillars.area:
+        around = without(around, plan.pillars)
     silicones = [without(around, plan.outline(level, foot)) for level, foot in enumerate(plan.heights_mm)]
-    patches = [_thinner(silicone, limit, plan.cavity) for silicone in silicones]
+    patches = [thinner(silicone, limit, plan.cavity) for silicone in silicones]
     within: list[BaseGeometry] = [plan.cavity] * len(silicones)
     low, high = limit, pitch
     if any(patches):  # the thinnest place lies in one of them: look no further than their surroundings
@@ -178,15 +133,15 @@ def _silicone_wall(plan: Plan) -> Finding:
         silicones = [overlap(silicones[level], own.buffer(2 * limit)) for level, own in zip(thin, within, strict=True)]
     while high - low > max(0.01, 0.02 * low):
         middle = (low + high) / 2
-        thinner = any(_thinner(silicone, middle, own) for silicone, own in zip(silicones, within, strict=True))
-        low, high = (low, middle) if thinner else (middle, high)
+        narrow = any(thinner(silicone, middle, own) for silicone, own in zip(silicones, within, strict=True))
+        low, high = (low, middle) if narrow else (middle, high)
     message = f"the thinnest silicone between tracks of one depth is {high:.2f} mm"
     places = [patch.representative_point().coords[0] for found in patches for patch in found]
     status = graded(low, limit) if places else "pass"
     return Finding("silicone_wall", status, high, limit, message, as_places(places))
 
 
-def _thinner(area: BaseGeometry, width: float, within: BaseGeometry) -> list[BaseGeometry]:
+def thinner(area: BaseGeometry, width: float, within: BaseGeometry) -> list[BaseGeometry]:
     """Patches of `area` that vanish when it shrinks and grows again by half of `width`, corners kept sharp."""
     opened = area.buffer(-width / 2, join_style="mitre").buffer(width / 2, join_style="mitre")
     if not opened.is_valid:  # sharp corners that grow past each other
@@ -226,7 +181,7 @@ def _cover(plan: Plan) -> Finding:
 
 def _fibre_bend(plan: Plan) -> Finding:
     """A fibre cannot follow a bend tighter than it bears, or than the rules: it lifts out of its track or breaks."""
-    limit = max(plan.settings.rules.min_bend_radius_mm, plan.settings.fibre.material.least_bend_mm or 0)
+    limit = plan.settings.least_bend_mm
     tight = tight_bends(plan.pad, limit)
     least = min((bend.measured for bend in tight), default=limit)
     names = _listed("fibre", [bend.fibres[0] for bend in tight])
@@ -242,7 +197,7 @@ def _folds(plan: Plan) -> Finding:
     """
     pad, mould = plan.pad, plan.settings.mould
     found: list[tuple[float, NDArray[np.floating]]] = []
-    curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, _FINE_MM / pad.pitch_mm), strict=True)
+    curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, _FINE_MM / pad.unit_mm), strict=True)
     for fibre, (spans, slopes, line) in enumerate(curves):
         half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.levels[fibre]] * plan.settings.ridge_slope
         points, headings = traced_curve(spans, slopes, _TURN)

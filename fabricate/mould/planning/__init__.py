@@ -1,0 +1,1 @@
+"""What a plan is made of: depths of fibres, their leads, and numbers."""

@@ -1,0 +1,151 @@
+"""Moulds of pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.pad.morphology import Morphology
+from design.settings import PadSettings
+from fabricate.checks.plan_checks import check_plan, meshed
+from fabricate.mould.assembly import bed_frame, holder_body, lid_body, plan_mesh, sizes
+from fabricate.mould.mesh import mesh
+from fabricate.mould.plan import Plan
+from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings
+from tests.helpers.effort import few
+
+PAD = Morphology.straight((3, 6), (8.0, 15.0))
+HOLE = ((-2.5, 3.0), (2.5, 3.0), (2.5, 11.0), (-2.5, 11.0))
+"""Between fibres of `PAD`."""
+
+
+def settings(pad: Morphology, mould: dict | None = None, **more) -> FabricationSettings:
+    own = PadSettings(**{**pad.layout.settings, **more})
+    return replace(DEFAULTS, mould=MouldSettings(**{"number_mm": 0.0, **(mould or {})}), pad=own)
+
+
+def test_the_tray_is_as_wide_and_high_as_the_pad():
+    plan = Plan(PAD, settings(PAD))
+    assert sizes(plan)["pad_mm"] == [56.0, 60.0]
+    left, low, right, high = plan.tray.bounds
+    assert (right - left) - (high - low) == pytest.approx(56 - 60)
+    starts = np.array([lead.beyond(0) for lead in plan.ends(0)])
+    assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
+    assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
+
+
+def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
+    with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
+    found = {finding.name: finding for finding in meshed(with_hole)[-1]}
+    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
+    more = plan_mesh(with_hole).volume() - plan_mesh(without).volume()
+    assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
+    rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
+    section = plan_mesh(with_hole).slice(rim - 1e-3).to_polygons()
+    assert any(
+        shapely.Polygon(ring).equals_exact(shapely.Polygon(HOLE).normalize(), 1e-3)
+        or shapely.Polygon(ring).symmetric_difference(shapely.Polygon(HOLE)).area < 1e-2
+        for ring in section
+    )
+
+
+def test_a_keep_out_at_the_edge_joins_the_wall():
+    notch = ((20.0, 20.0), (28.0, 20.0), (28.0, 30.0), (20.0, 30.0))
+    plan = Plan(Morphology.straight((1, 1), (28.0, 30.0)), settings(PAD, keep_out_mm=(notch,)))
+    rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
+    free = [ring for ring in plan_mesh(plan).slice(rim - 1e-3).to_polygons() if len(ring)]
+    assert len(free) == 2  # the walls' outside and inside: no film between pillar and wall
+
+
+@pytest.mark.parametrize(
+    ("hole", "name", "status"),
+    [
+        (((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)), "keep_out", "fail"),
+        (((0.0, 3.0), (0.6, 3.0), (0.6, 9.0), (0.0, 9.0)), "pillars", "warn"),
+        (((0.0, 3.0), (0.3, 3.0), (0.3, 9.0), (0.0, 9.0)), "pillars", "fail"),
+        (((-1.0, -40.0), (1.0, -40.0), (1.0, 40.0), (-1.0, 40.0)), "one_piece", "fail"),
+    ],
+)
+def test_keep_outs_that_do_harm_are_found(hole, name, status):
+    found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=(hole,))))}
+    assert found[name].status == status
+    assert found[name].places_mm
+
+
+def test_the_lids_bores_keep_off_pillars():
+    hole = ((-6.0, -5.0), (6.0, -5.0), (6.0, 5.0), (-6.0, 5.0))
+    plan = Plan(PAD, settings(PAD, {"lid": True, "spout": True}, keep_out_mm=(hole,)))
+    for prism in lid_body(plan).cuts:
+        assert not prism.area.intersects(plan.pillars)
+
+
+@pytest.mark.parametrize("fibres", [(0, 3), (2, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize("leads", ["edges", "one side"])
+def test_few_fibres_have_a_mould_as_any_other(fibres, leads):
+    pad = Morphology.straight(fibres, (9.0, 12.0))
+    found = {finding.name: finding for finding in meshed(Plan(pad, settings(pad, leads=leads)))[-1]}
+    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
+
+
+@few(40)
+@given(
+    st.tuples(st.integers(0, 8), st.integers(0, 8)).filter(any),
+    st.tuples(st.floats(4, 25), st.floats(4, 25)),
+    st.floats(0, 4),
+)
+def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches, border):
+    pad = Morphology.straight(fibres, pitches)
+    plan = Plan(pad, settings(pad, {"border_mm": border}, leads="one side"))
+    room = plan.settings.lead_room(plan.heights_mm[-1], plan.flare_mm)
+    apart = min(room.apart_mm, *pitches)
+    ways = []
+    for fibre, pair in enumerate(plan.leads.pairs):
+        for lead in pair:
+            assert lead.beyond(0)[1] == pytest.approx(plan.cavity.bounds[1])
+            way = np.vstack([lead.end_mm, lead.bends(1e-4), lead.beyond(0)])
+            assert lead.length_mm == pytest.approx(shapely.LineString(way).length, rel=1e-4)
+            ways.append((fibre, shapely.LineString(way)))
+    for fibre, way in ways:
+        assert way.within(plan.cavity.buffer(1e-6))
+        for other, its in ways:
+            if other != fibre:
+                assert way.distance(its) > apart - 1e-3
+    exits = sorted(lead.beyond(0)[0] for pair in plan.leads.pairs for lead in pair)
+    assert np.diff(exits).min() > apart - 1e-6
+
+
+def test_leads_turn_no_tighter_than_the_fibre_bears():
+    plan = Plan(
+        PAD, replace(settings(PAD, leads="one side"), fibre=DEFAULTS.fibre.model_copy(update={"least_bend_mm": 4.0}))
+    )
+    for lead in (lead for pair in plan.leads.pairs for lead in pair if len(lead.spans)):
+        way = np.vstack([lead.end_mm, lead.bends(1e-6)])
+        turns = np.abs((np.diff(np.arctan2(*np.diff(way, axis=0).T)) + np.pi) % (2 * np.pi) - np.pi)
+        steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+        bent = turns > 1e-9
+        inner = bent[1:] & bent[:-1]
+        assert (steps[1:-1][inner] / turns[1:][inner]).min() > 3.99
+
+
+def test_leads_of_a_shrinking_silicone_come_out_as_planned():
+    plan = Plan(
+        PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))
+    )
+    large = plan.enlarged
+    assert np.array(large.cavity.bounds) * 0.99 == pytest.approx(plan.cavity.bounds)
+    assert large.lengths_mm * 0.99 == pytest.approx(plan.lengths_mm)
+
+
+def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
+    pad = Morphology.straight((1, 3), (9.0, 12.0))
+    plan = Plan(pad, settings(pad, {"holder": True}, leads="one side"))
+    walls = mesh(holder_body(plan)).slice(DEFAULTS.mould.floor_mm + 0.5)
+    solid = shapely.union_all([shapely.Polygon(ring) for ring in walls.to_polygons()])
+    for lead in (lead for pair in plan.leads.pairs for lead in pair):
+        x, y = lead.beyond(DEFAULTS.mould.exit_mm + 1)
+        assert not solid.boundary.dwithin(shapely.Point(-x, y), 1e-3)
+    low, high = plan.tray.bounds[1], plan.tray.bounds[3]
+    assert bed_frame(plan)["centre_mm"] == pytest.approx([110.0, 110.0 - (low + high) / 2])
