@@ -82,10 +82,11 @@ def live(
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
         show = _json if as_json else stack.enter_context(_terminal())
         scaling = localizers[0].normalization
+        half_mm = scaling.half_mm
         pad = {
             "title": f"{replay or f'{rig} rig'}, {models[0]}",
             "middle_mm": scaling.middle_mm.tolist(),
-            "half_mm": scaling.span_mm,
+            "half_mm": [scaling.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
             "mirrored": mirrored,
         }
 

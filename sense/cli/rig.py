@@ -104,8 +104,8 @@ def record(
         options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
-        sensed_mm = settings.section(PadSettings, grid=pad.grid, pitch_mm=pad.pitch_mm).sensed_mm
-        setup = Setup(pad, settings.section(Contact), options, target, command, inputs, sensed_mm, folder)
+        size = settings.section(PadSettings, **pad.layout.settings)
+        setup = Setup(pad, settings.section(Contact), options, target, command, inputs, size, folder)
         recording = _record_with(rig, setup, model, dry_run, resume, through_drivers)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
 
@@ -191,7 +191,7 @@ def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording"
 def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
     from design.pad.morphology import Morphology
 
-    return Morphology.load(morphology) if morphology else Morphology.straight(of_pad.grid, of_pad.pitch_mm)
+    return Morphology.load(morphology) if morphology else Morphology.straight(of_pad.layout)
 
 
 @click.command()

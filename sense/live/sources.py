@@ -98,15 +98,15 @@ def simulated(model: Path) -> SimulatedConverter:
     if "twin" in source:
         raise InputError(f"{path}: of a pad simulated by its twin, which is not live; --replay shows a recording")
     try:
-        pad = Morphology(np.array(source["morphology"]["knots"]), source["morphology"]["pitch_mm"])
+        pad = Morphology.of_document(source["morphology"])
         contact, rig = dict(source["contact"]), dict(source["rig"])
         rig.pop("channels", None)  # of no simulated pad; once it was a number
-        size = {"grid": pad.grid, "pitch_mm": pad.pitch_mm, "sensed_mm": source.get("sensed_mm", "beyond")}
+        size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
     return SimulatedConverter(
         pad,
         validated(RigSettings, rig, f"{path}: rig"),
         validated(Contact, contact, f"{path}: contact"),
-        sensed_mm=validated(PadSettings, size, f"{path}: pad").sensed_mm,
+        size=validated(PadSettings, {**pad.layout.settings, **size}, f"{path}: pad"),
     )

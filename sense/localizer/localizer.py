@@ -199,6 +199,7 @@ class Localizer:
                     if (measures := self.normalization.measures)
                     else {}
                 ),
+                **({} if (half_mm := self.normalization.half_mm) is None else {"half_mm": half_mm.tolist()}),
             },
             "factors": self.factors.tolist(),
             "weights_sha256": "",  # known when they are written
@@ -230,6 +231,7 @@ class Localizer:
             np.array(document.scaling.middle_mm),
             document.scaling.span_mm,
             tuple(Target(each.name, each.middle, each.span) for each in document.scaling.measures),
+            None if document.scaling.half_mm is None else np.array(document.scaling.half_mm),
         )
         with files.arrays(document.weights_sha256, "the localizer") as weights:
             table = weights.pop(TABLE)

@@ -74,6 +74,7 @@ class Normalization:
         memory: (C, J, F) V/V, what of a volt of history shows in the inputs; usual: (C, J) V, the usual history.
         middle_mm: (2,) place that the network calls 0. span_mm: distance that it calls 1.
         measures: what the network gives beside the place; none, the depth, or depth and force, in this order.
+        half_mm: (2,) half the width and height of what was pressed; None where nobody has kept it.
     """
 
     centre: Array
@@ -83,6 +84,7 @@ class Normalization:
     middle_mm: Array
     span_mm: float
     measures: Sequence[Target] = ()
+    half_mm: Array | None = None
 
     @classmethod
     def fit(
@@ -111,7 +113,7 @@ class Normalization:
         spread = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
         spread = np.where(spread >= LEAST_SPREAD_V, spread, 1.0)
         centre = np.zeros_like(centre) if targets else centre
-        scaling = cls(centre, spread, response.memory, response.usual, middle, span, targets)
+        scaling = cls(centre, spread, response.memory, response.usual, middle, span, targets, (high - low) / 2)
         return scaling, scaling.scaled(response.table)
 
     def refuse_unsound(self, table: Floats) -> None:

@@ -21,6 +21,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
 Factor = Annotated[float, Field(gt=0, le=1e6)]
 Distance = Annotated[float, Field(ge=0)]
+Side = Annotated[float, Field(ge=0, le=MAX_MM)]
 Place = Annotated[float, Field(ge=-MAX_MM, le=MAX_MM)]
 
 
@@ -42,6 +43,7 @@ class ScalingTable(Settings):
     middle_mm: Annotated[list[Place], Field(min_length=2, max_length=2)]
     span_mm: float = Field(gt=0, le=MAX_MM)
     measures: Annotated[list[MeasureTable], Field(max_length=2)] = Field(default_factory=list)
+    half_mm: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
 
 
 class ErrorRow(Settings):

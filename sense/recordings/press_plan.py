@@ -1,19 +1,28 @@
 """Press plans as data: where and how deep a probe presses, real or simulated, in the order it does."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from design.common.errors import InputError
+from design.common.settings import or_default
+from design.pad.courses.keep_out import keep_outs, outside
 from design.pad.morphology import Morphology
-from design.settings import Sensed, sensed_rectangle
+from design.settings import PadSettings
 from sense.recordings.formats.csv_table import CsvTable
-from sense.recordings.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
+from sense.recordings.processing.limits import MAX_MM, Array, Indices, Mask, as_numbers, refuse_beyond
 from sense.settings import RigSettings
 
 COLUMNS = ("x_mm", "y_mm", "depth_mm")
+LEAST_FREE = 0.01
+"""Least share of what is pressed that keep-outs must leave."""
+
+Free = Callable[[Array], Mask]
+"""Says of places (Q, 2) in mm which of them (Q,) may be pressed: those in no hole."""
 
 
 @dataclass(frozen=True)
@@ -62,36 +71,115 @@ class PressPlan:
         return cls(table[:, :2], table[:, 2])
 
 
-def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator, sensed_mm: Sensed = "beyond") -> PressPlan:
-    """The plan that `[rig]` asks for over what is pressed of a pad, by `sensed_mm` of `[pad]`; see `planned_in`."""
-    return planned_in(pad.to_mm(sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm)), rig, rng)
-
-
-def planned_in(corners_mm: Array, rig: RigSettings, rng: np.random.Generator) -> PressPlan:
-    """The plan that `[rig]` asks for: that of a file, or `presses` places between two corners (2, 2), low and high.
-
-    A grid has as many rows as columns and at least `presses` places, of which the first are taken; boustrophedon runs
-    forth and back along its rows. Depths are taken in turn along a row, and each row begins one further on: columns of
-    one depth would tie depth to place. An adaptive plan is uniform until a localizer steers it.
+def size_of(pad: Morphology, size: PadSettings | None = None) -> PadSettings:
+    """What is pressed of a pad, and what is not, by `[pad]`; the default where None.
 
     Raises:
-        InputError: as `read_plan`.
+        InputError: presses beyond this pad, or keep-outs that leave less than LEAST_FREE of what is pressed.
+    """
+    size = or_default("size", size, PadSettings).of(pad.layout)
+    if size.keep_out_mm:
+        import shapely
+
+        (left, low), (right, high) = size.sensed
+        pressed = shapely.box(left, low, right, high)
+        share = pressed.difference(shapely.union_all(keep_outs(size))).area / pressed.area
+        if share < LEAST_FREE:
+            raise InputError(f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {LEAST_FREE:.0%}")
+    return size
+
+
+def told_pad(pad: Morphology) -> dict[str, Any]:
+    """What a recording says of its pad, which `Morphology.of_document` reads."""
+    document = pad.document()
+    kept = ("pitch_mm", "knots") if pad.layout.is_square else ("format", "fibres", "pitch_mm", "knots")
+    return {key: document[key] for key in kept}
+
+
+def free_of(pad: Morphology, size: PadSettings) -> Free:
+    """Which places on the plan of a pad lie in no keep-out of `size`."""
+    return lambda places_mm: outside(pad.to_grid(places_mm), size)
+
+
+def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator, size: PadSettings | None = None) -> PressPlan:
+    """The plan that `[rig]` asks for over what is pressed of a pad, see `size_of` and `planned_in`."""
+    size = size_of(pad, size)
+    return planned_in(pad.to_mm(size.sensed), rig, rng, free_of(pad, size))
+
+
+def planned_in(corners_mm: Array, rig: RigSettings, rng: np.random.Generator, free: Free) -> PressPlan:
+    """The plan that `[rig]` asks for: that of a file, or `presses` places between two corners (2, 2), low and high.
+
+    A grid has so many rows and columns that neighbours are about as far apart either way (as many of both over a
+    square), and at least `presses` places that are free, of which the first are taken; boustrophedon runs forth and
+    back along its rows. Depths are taken in turn along a row, and each row begins one further on: columns of one depth
+    would tie depth to place. An adaptive plan is uniform until a localizer steers it.
+
+    Raises:
+        InputError: as `read_plan`, or a place of a file that is not free.
     """
     if rig.plan_file is not None:
-        return read_plan(rig.plan_file, rig.depth_mm)
-    low, high = corners_mm
+        return all_free(read_plan(rig.plan_file, rig.depth_mm), rig.plan_file, free)
     depths = np.array(rig.depths_mm or (rig.depth_mm,))
     if rig.plan in ("grid", "boustrophedon"):
-        side = int(np.ceil(np.sqrt(rig.presses)))
-        x, y = np.linspace(low, high, side).T if side > 1 else np.zeros((2, 1))
-        columns = np.tile(np.arange(side), (side, 1))
-        if rig.plan == "boustrophedon":
-            columns[1::2] = columns[1::2, ::-1]
-        places = np.column_stack([x[columns.ravel()], np.repeat(y, side)])[: rig.presses]
-        turns = (columns + np.arange(side)[:, None]).ravel()[: rig.presses]
+        asked = rig.presses
+        while True:
+            places, turns = _rows(corners_mm, asked, forth_and_back=rig.plan == "boustrophedon")
+            there = free(places)
+            if there.sum() >= rig.presses:
+                break
+            asked = max(asked + 1, int(asked * rig.presses / max(there.sum(), 1)))
+        places, turns = places[there][: rig.presses], turns[there][: rig.presses]
     else:
-        places, turns = rng.uniform(low, high, (rig.presses, 2)), np.arange(rig.presses)
+        places, turns = uniform(corners_mm, rig.presses, rng, free), np.arange(rig.presses, dtype=np.int64)
     return PressPlan(places, depths[turns % len(depths)])
+
+
+def uniform(corners_mm: Array, count: int, rng: np.random.Generator, free: Free) -> Array:
+    """(count, 2) places, mm, drawn uniformly over what is free between two corners (2, 2), low and high."""
+    low, high = corners_mm
+    places = rng.uniform(low, high, (count, 2))
+    while not (there := free(places)).all():
+        places = np.vstack([places[there], rng.uniform(low, high, (int((~there).sum()), 2))])
+    return places
+
+
+def _rows(corners_mm: Array, asked: int, forth_and_back: bool) -> tuple[Array, Indices]:
+    """At least so many places (Q, 2) in rows between two corners, and for each the depth whose turn it is (Q,)."""
+    low, high = corners_mm
+    width, height = (high - low).tolist()
+    across, up = _counts(width, height, asked)
+    x = np.linspace(low[0], high[0], across) if across > 1 else corners_mm[:, 0].mean(keepdims=True)
+    y = np.linspace(low[1], high[1], up) if up > 1 else corners_mm[:, 1].mean(keepdims=True)
+    columns = np.tile(np.arange(across), (up, 1))
+    if forth_and_back:
+        columns[1::2] = columns[1::2, ::-1]
+    places = np.column_stack([x[columns.ravel()], np.repeat(y, across)])
+    return places, (columns + np.arange(up)[:, None]).ravel()
+
+
+def _counts(width: float, height: float, asked: int) -> tuple[int, int]:
+    """Columns and rows of at least so many places."""
+    if width == height:
+        side = int(np.ceil(np.sqrt(asked)))
+        return side, side
+    # (1 + width / step) (1 + height / step) = asked
+    per_mm = 2 * (asked - 1) / (width + height + np.sqrt((width + height) ** 2 + 4 * width * height * (asked - 1)))
+    rows = round(1 + per_mm * height)
+    return -(-asked // rows), rows
+
+
+def all_free(plan: PressPlan, path: Path, free: Free) -> PressPlan:
+    """The plan that was read from `path`; InputError where it presses what is not free."""
+    there = free(plan.places_mm)
+    if not there.all():
+        press = int(np.argmin(there))
+        x, y = plan.places_mm[press]
+        raise InputError(
+            f"{path}: press {press + 1}, at ({x:g}, {y:g}) mm, lies in a keep-out, allowed are places outside of those "
+            "of [pad] keep_out_mm"
+        )
+    return plan
 
 
 def read_plan(path: Path, depth_mm: float) -> PressPlan:

@@ -55,11 +55,18 @@ def label_losses(axes: Any, rows: Sequence[Mapping[str, Any]], title: str) -> No
 def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
     """Draw mean errors by cell of the pad, without the fibres that its title names."""
     cells = found["by_place"]
-    x_mm, y_mm = (sorted({cell[name] for cell in cells}) for name in ("x_mm", "y_mm"))
-    errors = np.full((len(y_mm), len(x_mm)), np.nan)
-    for cell in cells:
-        errors[y_mm.index(cell["y_mm"]), x_mm.index(cell["x_mm"])] = cell["mean_mm"]
+    places = np.array([[cell["x_mm"], cell["y_mm"]] for cell in cells])
+    low, high = places.min(axis=0), places.max(axis=0)
+    # not every row or column need have a cell: nothing is pressed in holes
+    side = np.array(
+        [np.diff(np.unique(places[:, axis])).min(initial=max(high[axis] - low[axis], 1)) for axis in (0, 1)]
+    )
+    columns, rows = np.rint((places - low) / side).astype(int).T
+    errors = np.full((rows.max() + 1, columns.max() + 1), np.nan)
+    errors[rows, columns] = [cell["mean_mm"] for cell in cells]
+    (left, below), (right, above) = low - side / 2, high + side / 2
     axes.set(xticks=[], yticks=[])
     lost = "+".join(str(fibre + 1) for fibre in found["lost"])
     axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
-    return axes.imshow(errors, origin="lower", cmap="magma_r", vmin=0, vmax=highest_mm)
+    extent = (left, right, below, above)
+    return axes.imshow(errors, origin="lower", extent=extent, cmap="magma_r", vmin=0, vmax=highest_mm)

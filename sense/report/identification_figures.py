@@ -47,18 +47,19 @@ def draw_laid_plan(found: Identification, path: Path) -> None:
     pad = found.pad
     figure = Figure(figsize=(9.6, 5.4), layout="constrained")
     plan, aside = figure.subplots(1, 2, width_ratios=(1.15, 1))
-    half = pad.size_mm / 2
-    plan.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor=PAPER, edgecolor=FAINT))
+    right, top = (side / 2 for side in pad.layout.size_mm)
+    plan.add_patch(Rectangle((-right, -top), 2 * right, 2 * top, facecolor=PAPER, edgecolor=FAINT))
     for points in flatten(pad, 1e-3):
         plan.plot(*pad.to_mm(points).T, color=FAINT, linewidth=1.4)
     pressed = found.fit.pad.frame.to_plan(found.learnt.places_mm)
     plan.scatter(*pressed.T, s=1, color=INK, alpha=0.25, linewidths=0)
     for row, (off, unsure, within) in enumerate(found.laid_mm()):
         fibre = found.fit.pad.fibres[row]
-        colour = HORIZONTAL if fibre < pad.grid else VERTICAL
+        colour = VERTICAL if pad.layout.family(fibre) else HORIZONTAL
         x, y = pad.to_mm(found.fit.pad.course(row)[0]).T
         plan.plot(x, y, color=colour, linewidth=1.6)
-        end = (1.03 * half, y[-1]) if fibre < pad.grid else (x[-1], 1.03 * half)
+        beside = 0.03 * max(right, top)
+        end = (x[-1], top + beside) if pad.layout.family(fibre) else (right + beside, y[-1])
         plan.text(*end, str(fibre + 1), color=colour, fontsize=9, ha="center", va="center")
         run, shown = np.linspace(0, 100, len(off)), np.where(within, off, np.nan)
         aside.plot(run, shown, color=colour, linewidth=1.2)
@@ -66,7 +67,8 @@ def draw_laid_plan(found: Identification, path: Path) -> None:
         last = int(np.flatnonzero(within)[-1]) if within.any() else 0
         aside.annotate(str(fibre + 1), (run[last], off[last]), color=colour, fontsize=9, va="center")
     plan.set_aspect("equal")
-    plan.set(xlabel="x (mm)", ylabel="y (mm)", xlim=(-1.1 * half, 1.1 * half), ylim=(-1.1 * half, 1.1 * half))
+    room = 0.1 * max(right, top)
+    plan.set(xlabel="x (mm)", ylabel="y (mm)", xlim=(-room - right, right + room), ylim=(-room - top, top + room))
     aside.set(xlabel="along the fibre (%)", ylabel="beside its plan, to the left (mm)", xlim=(0, 104))
     aside.axhline(0, color=FAINT, linewidth=0.8)
     for axes in (plan, aside):

@@ -17,7 +17,7 @@ from design.pad.morphology import Morphology
 from design.pad.twin import Twin
 from design.settings import Contact, PadSettings
 from sense.localizer.localizer import Localizer
-from sense.recordings.press_plan import PressPlan
+from sense.recordings.press_plan import PressPlan, free_of, size_of
 from sense.recordings.recorder import refuse_begun, refuse_existing
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate
@@ -54,9 +54,9 @@ def record_simulated(
     refuse_existing(out)
     options = spec.section(RigSettings, **overrides)
     plan = pad.morphology if isinstance(pad, Twin) else pad
-    sensed_mm = spec.section(PadSettings, grid=plan.grid, pitch_mm=plan.pitch_mm).sensed_mm
+    size = spec.section(PadSettings, **plan.layout.settings)
     with stage("simulate"):
-        recording = simulate(pad, options, spec.section(Contact), sensed_mm, like)
+        recording = simulate(pad, options, spec.section(Contact), size, like)
     inputs = [*inputs, *([options.plan_file] if options.plan_file else [])]
     recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
     return recording
@@ -168,7 +168,8 @@ def _steering(setup: Setup, rig: RigSettings, model: Path | None) -> Callable[[P
         return lambda plan, press: plan
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
-    return Steering(Localizer.load(model), setup.out, np.random.default_rng(rig.seed))
+    free = free_of(setup.pad, size_of(setup.pad, setup.size))
+    return Steering(Localizer.load(model), setup.out, np.random.default_rng(rig.seed), free)
 
 
 def look_over(kind: str, setup: Setup, inputs: Sequence[int], through_drivers: bool = False) -> list[Diagnosis]:

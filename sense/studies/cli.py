@@ -29,8 +29,8 @@ def study() -> None:
     padforge study robustness square out/pad/morphology.json
     padforge study scaling --jobs 2 --out out/study
 
-    A PAD is a morphology.json, a published .mat, `square`, `random-N` (N knots a fibre) or `optimised` (found by a
-    short search); `square@8` has a grid of 8.
+    A PAD is a morphology.json, a published .mat, `square`, `random-N` (N knots a fibre), `optimised` or `optimised-N`
+    (found by a short search) or `genetic-N` (found by the published one); `square@8` has a grid of 8.
     Each study writes NAME.json, NAME.csv, NAME.png and NAME.md. Broken off, it goes on with --resume.
     """
 
@@ -111,6 +111,10 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     \b
     padforge study robustness square random-5 --lost 2
+
+    \b
+    Figures 3 and 4, errors by method, number of knots and lost fibres:
+    padforge study robustness square random-5 optimised-1 optimised-3 optimised-5 genetic-1 genetic-3 genetic-5
 
     For recordings of a built pad (figures 13 and 14) see `padforge sense fibre-loss`.
     """

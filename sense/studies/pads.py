@@ -4,16 +4,18 @@ import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from design.common.errors import InputError
+from design.common.settings import validated
 from design.pad.morphology import Morphology
 
 if TYPE_CHECKING:
     from sense.recordings.recording import Recording
 
-NAMED = re.compile(r"(square|optimised|random-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
-"""Straight fibres, random ones of N knots, and what a short search finds; their grid after an @."""
+NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
+"""Straight fibres, random ones of N knots, and what a search finds: by gradients, or as published; their grid after an
+@."""
 GRID = 4
 
 
@@ -21,7 +23,8 @@ def load_pads(names: Sequence[str], seed: int) -> dict[str, Morphology]:
     """Pads by the label that tables and figures give them, in order.
 
     Args:
-        names: files, `square`, `random-N` or `optimised` (`square@8`: with a grid of 8). seed: of the last two.
+        names: files, `square`, `random-N`, `optimised`, `optimised-N` or `genetic-N` (`square@8`: with a grid of 8).
+        seed: of all but the first two.
 
     Raises:
         InputError: no such file or name, a file that is no morphology, or a name given twice.
@@ -56,24 +59,31 @@ def _labelled(parts: list[tuple[str, str, Any]]) -> dict[str, Any]:
 def _load(name: str, seed: int) -> tuple[str, Morphology]:
     named = NAMED.fullmatch(name)
     if named and not Path(name).exists():
-        grid = int(named[3] or GRID)
-        if named[2]:
-            return name, Morphology.random(grid, int(named[2]), seed)
-        return name, _optimised(grid, seed) if named[1] == "optimised" else Morphology.straight(grid)
+        grid, method, knots = int(named[5] or GRID), named[2] or named[3], int(named[4]) if named[4] else None
+        if method is None:
+            return name, Morphology.straight(grid)
+        if method == "random":
+            return name, Morphology.random(grid, knots or 0, seed)
+        return name, _found(grid, "genetic" if method == "genetic" else "descent", knots, seed)
     if not Path(name).exists():
-        raise InputError(f"{name}: no such file, and none of square, optimised, random-N (N from 1 to 99)")
+        raise InputError(
+            f"{name}: no such file, and none of square, optimised, random-N, optimised-N, genetic-N (N from 1 to 99 "
+            "knots; 64 where they are searched for)"
+        )
     path = Path(name)
     label = path.parent.name if path.name == "morphology.json" and path.parent.name else path.stem
     return label, Morphology.load(path)
 
 
-def _optimised(grid: int, seed: int) -> Morphology:
-    """What a search finds from a single start, for the published contact and under the default rules."""
+def _found(grid: int, method: Literal["descent", "genetic"], knots: int | None, seed: int) -> Morphology:
+    """What a search finds for the published contact: by gradients from a single start, under the default rules; or as
+    published, where rules count for nothing. So many knots, or the default."""
     from design.optimisers.search import search
-    from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH
+    from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, SearchSettings
 
     pad = PUBLISHED_PAD.model_copy(update={"grid": grid})
-    settings = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "seed": seed})
+    asked = {"starts": 1, "seed": seed, "method": method} | ({} if knots is None else {"knots": knots})
+    settings = validated(SearchSettings, PUBLISHED_SEARCH.model_dump() | asked, f"{method} search")
     return search(pad, PUBLISHED_CONTACT, settings).morphology
 
 
@@ -81,7 +91,7 @@ def described(pads: Mapping[str, Morphology]) -> dict[str, Any]:
     """What the settings say of each pad."""
     return {
         label: {
-            "grid": pad.grid,
+            **({"grid": pad.grid} if pad.layout.is_square else {"fibres": list(pad.layout.counts)}),
             "pitch_mm": pad.pitch_mm,
             "knots_sha256": hashlib.sha256(pad.knots.tobytes()).hexdigest(),
         }

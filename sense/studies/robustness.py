@@ -13,9 +13,9 @@ from design.common.errors import InputError
 from design.common.figures import CURVES, FAINT, INK, tidy
 from design.criteria.fibre_loss import lost_subsets
 from design.evaluation.localisation_error import Loss, PressSets, batches
-from design.pad.contact import signals, signals_quantized
+from design.pad.contact import lattice, signals, signals_quantized
 from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, Contact
+from design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from sense.recordings.processing.limits import Array
 
 from .pads import described
@@ -60,8 +60,8 @@ def robustness_study(
     parts = [
         (label, part)
         for label, pad in pads.items()
-        for level in range(min(lost, 2 * pad.grid - 1) + 1)
-        for part in batches(lost_subsets(2 * pad.grid, level, MOST_SETS))
+        for level in range(min(lost, pad.layout.fibres - 1) + 1)
+        for part in batches(lost_subsets(pad.layout.fibres, level, MOST_SETS))
     ]
     tasks = [
         Task(
@@ -93,9 +93,9 @@ def _found(
         return RULES[rule](pad, places, contact)
 
     trial = PressSets.of(pad, side, test, seed, answer)
-    places = _lattice(pad.grid)
+    places = lattice(between_fibres(pad.layout), SIDE)
     over = answer(places)
-    repeats = -(-NETWORKS // math.comb(2 * pad.grid, len(losses[0])))
+    repeats = -(-NETWORKS // math.comb(pad.layout.fibres, len(losses[0])))
     found = [
         (
             trial.errors(network, loss).mean(),
@@ -113,12 +113,6 @@ def _found(
         "own": own.reshape(by_loss[:2]).mean(axis=0),
         "maps": maps,
     }
-
-
-def _lattice(grid: int) -> Array:
-    """(SIDE^2, 2) places on which maps are drawn, over the square that is evaluated."""
-    line = np.linspace(1, grid, SIDE) if grid > 1 else np.linspace(0.5, 1.5, SIDE)
-    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
 
 def _conclude(
@@ -140,19 +134,21 @@ def _conclude(
                     "pad": label,
                     "lost": level,
                     "subsets": len(means),
-                    "of": math.comb(2 * pad.grid, level),
+                    "of": math.comb(pad.layout.fibres, level),
                     "mean": float(means.mean()),
                     "std": float(means.std()),
                     "max": float(means.max()),
-                    "mean_mm": float(means.mean() * pad.pitch_mm),
-                    "max_mm": float(means.max() * pad.pitch_mm),
+                    "mean_mm": float(means.mean() * pad.unit_mm),
+                    "max_mm": float(means.max() * pad.unit_mm),
                     "mean_trained_on": float(seen[sizes == level].mean()),
                 }
             )
             # The worst set of each level, and where it is worst.
             worst = int(np.flatnonzero(sizes == level)[means.argmax()])
             shown = np.round(over[worst].reshape(SIDE, SIDE), 3)
-            maps.append({"pad": label, "lost": list(losses[worst]), "errors": shown.tolist()})
+            (left, low), (right, high) = between_fibres(pad.layout)
+            told = {"pad": label, "lost": list(losses[worst]), "extent": [left, right, low, high]}
+            maps.append(told | {"errors": shown.tolist()})
         by_subset += [
             {"pad": label, "lost": list(loss), "mean": float(mean)} for loss, mean in zip(losses, fresh, strict=True)
         ]
@@ -220,7 +216,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     for place, label in enumerate(labels):
         for column, each in enumerate(each for each in document["maps"] if each["pad"] == label):
             axes = figure.add_subplot(grid[1 + place, column], aspect="equal")
-            picture = axes.imshow(each["errors"], origin="lower", cmap="magma_r", vmin=0, vmax=highest)
+            picture = axes.imshow(
+                each["errors"], origin="lower", extent=each["extent"], cmap="magma_r", vmin=0, vmax=highest
+            )
             axes.set(xticks=[], yticks=[])
             lost = "+".join(str(fibre + 1) for fibre in each["lost"])
             axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)

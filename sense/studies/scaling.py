@@ -23,6 +23,7 @@ from design.evaluation.levenberg_marquardt import fit
 from design.evaluation.localisation_error import fresh_presses, training_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
+from design.settings import Rectangle, between_fibres
 from sense.recordings.processing.limits import Array
 
 from .pads import described
@@ -48,9 +49,11 @@ def scaling_study(
         side: of the square of presses, side^2 to learn from. seed: of presses and networks.
 
     Raises:
-        InputError: a grid that is no multiple of a tile's.
+        InputError: a tile that is no square of one pitch, or a grid that is no multiple of a tile's.
     """
     for label, pad in pads.items():
+        if not pad.layout.is_square:
+            raise InputError(f"{label} has {pad.layout}, expected tiles of M + M fibres of one pitch")
         for grid in grids:
             if grid % pad.grid:
                 raise InputError(f"grids has {grid}, expected multiples of {pad.grid}, the grid of {label}")
@@ -71,9 +74,9 @@ def scaling_study(
     return Study("scaling", "Larger surfaces", settings, tasks, partial(_conclude, dict(pads), cases, settings), _draw)
 
 
-def spread_presses(grid: int, side: int, seed: int) -> Array:
-    """(side^2, 2) presses, one at random in each of side x side cells of the square that is evaluated, grid units."""
-    low, high = (1, grid) if grid > 1 else (0.5, 1.5)
+def spread_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
+    """(side^2, 2) presses, one at random in each of side x side cells of a rectangle, grid units."""
+    low, high = np.array(rectangle)
     cells = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
     places = cells + np.random.default_rng([6, seed]).uniform(size=cells.shape)
     return low + (high - low) / side * places
@@ -112,11 +115,11 @@ def around(given: Array, tile: int) -> tuple[Array, Array]:
 def _found(tile: Morphology, grid: int, way: str, side: int, seed: int) -> State:
     """Errors (Q,) and places (Q, 2) of the presses that a way is judged on, and how long it learnt."""
     pad = tile.tiled(grid // tile.grid) if grid > tile.grid else tile
-    begin = time.perf_counter()
+    pressed, begin = between_fibres(pad.layout), time.perf_counter()
     if way == PUBLISHED:
-        learned = judged = training_presses(grid, side, seed)
+        learned = judged = training_presses(pressed, side, seed)
     else:
-        learned, judged = spread_presses(grid, side, seed), fresh_presses(grid, TEST, seed)
+        learned, judged = spread_presses(pressed, side, seed), fresh_presses(pressed, TEST, seed)
 
     def given(places: Array) -> tuple[Array, Array]:
         """Inputs of the network, and the places (Q, 2) its outputs count from."""

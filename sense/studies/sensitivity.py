@@ -93,7 +93,7 @@ def _conclude(
                     "sides": met.sides,
                     "mean": float(each.mean()),
                     "std": float(each.std()),
-                    "mean_mm": float(each.mean() * pad.pitch_mm),
+                    "mean_mm": float(each.mean() * pad.unit_mm),
                 }
                 for met, each in zip(objects, errors.T, strict=True)
             ]

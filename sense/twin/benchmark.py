@@ -13,7 +13,7 @@ from design import Morphology
 from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.contact import signals
 from design.pad.twin import Frame, Twin, TwinChannel
-from design.settings import Contact
+from design.settings import Contact, sensed_rectangle
 from sense.localizer.response_model import RIDGE_PLACE, bumps
 from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
@@ -86,14 +86,15 @@ def printed_pad(
         reach: one of `REACHES`. laid_mm: standard deviation of fibres beside their plan. dead: channels that read
             nothing. noise: of a response, share of full scale.
     """
-    fibres, pitch = len(plan.knots), plan.pitch_mm
+    fibres, unit_mm = len(plan.knots), plan.unit_mm
     distance, weight = reach_of(reach)
     turn, shift = rng.choice([-3.0, 3.0]), rng.uniform(2, 3, 2) * rng.choice([-1, 1], 2)
     wired, lost = rng.permutation(fibres), set(rng.choice(fibres, dead, replace=False).tolist())
     gains = GAIN_V * np.exp(UNEVEN_GAIN * rng.standard_normal(fibres))
-    laid = [plan.to_mm(line) for line in _laid(Plan.of(plan), laid_mm / pitch, rng)]
+    laid = [plan.to_mm(line) for line in _laid(Plan.of(plan), laid_mm / unit_mm, rng)]
     read = [None if channel in lost else int(fibre) for channel, fibre in enumerate(wired)]
-    sensed = (plan.grid * pitch, plan.grid * pitch)
+    low, high = np.array(sensed_rectangle(plan.layout))
+    width, height = (unit_mm * (high - low)).tolist()
 
     def twin(noise_v: float) -> Twin:
         channels = [
@@ -104,10 +105,12 @@ def printed_pad(
         ]
         courses = tuple(line if fibre in read else None for fibre, line in enumerate(laid))
         frame = Frame(True, float(turn), (float(shift[0]), float(shift[1])))
-        return Twin(plan, tuple(channels), frame, distance * pitch, weight, courses, noise, sensed, presses=1)
+        return Twin(
+            plan, tuple(channels), frame, distance * unit_mm, weight, courses, noise, (width, height), presses=1
+        )
 
     silent = twin(0.0)
-    places = rng.uniform(-0.5, 0.5, (400, 2)) * sensed
+    places = rng.uniform(-0.5, 0.5, (400, 2)) * (width, height)
     signals = silent.laid_signals(places)
     largest = [abs(gains[c]) * signals[:, fibre].max() for c, fibre in enumerate(read) if fibre is not None]
     return twin(noise * float(np.mean(largest)))

@@ -175,7 +175,7 @@ class _Objective:
         counts = np.maximum(self._presses.there.sum(axis=0), 1)
         self.noise = np.maximum(self._caution * np.sqrt((self._left**2).sum(axis=0) / counts), LEAST_SPREAD_V)
         if covariance is not None:
-            aside = self._spread(covariance, AWAY, ASIDE_STIFFNESS) * self.pad.plan.pitch_mm
+            aside = self._spread(covariance, AWAY, ASIDE_STIFFNESS) * self.pad.plan.unit_mm
             uneven = self._spread(covariance, COUNTS, SENSITIVITY_STIFFNESS)
             self.freedom = replace(
                 self.freedom,
@@ -211,7 +211,7 @@ class _Objective:
         for c in range(len(pad.fibres)):
             own = own_values(c)
             for part, stiffness, sd in (
-                (own[AWAY], ASIDE_STIFFNESS, self.freedom.aside_mm / pad.plan.pitch_mm),
+                (own[AWAY], ASIDE_STIFFNESS, self.freedom.aside_mm / pad.plan.unit_mm),
                 (own[COUNTS], SENSITIVITY_STIFFNESS, self.freedom.uneven),
             ):
                 if sd > 0:

@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 from design import Morphology
 from design.common.errors import InputError, instance, whole
 from design.pad.twin import MOST_LOOKS, TwinReadings
+from design.settings import sensed_rectangle
 from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.strengths import strengths
@@ -22,7 +23,7 @@ from .wiring import Wiring, wirings
 
 LEAST_PRESSES = 60
 LEAST_SIDE = 0.5
-"""Least width and height of what was pressed, as a share of the square half a pitch beyond the outermost fibres."""
+"""Least width and height of what was pressed, as a share of the rectangle half a pitch beyond the outermost fibres."""
 HELD_OUT = 0.15
 """Share of the presses that are kept back to say how much is explained."""
 MOST_PRESSES = 2000
@@ -76,7 +77,7 @@ def identify(
     held[rng.permutation(len(places))[: max(round(HELD_OUT * len(places)), 2)]] = True
     answers = responses(recording, ~held)
     learnt_rows = rng.permutation(np.flatnonzero(~held))[:MOST_PRESSES]
-    shown = smooth_function(answers.of(learnt_rows), pad.pitch_mm)
+    shown = smooth_function(answers.of(learnt_rows), pad.unit_mm)
     live = _live(shown.certainty, len(pad.knots))
     learnt, held_out = answers.of(learnt_rows, live), answers.of(np.flatnonzero(held), live)
     compared = learnt.of(np.arange(min(PATCHES, len(learnt))))
@@ -85,7 +86,7 @@ def identify(
     _refuse_stranger(candidates[0][0].match)
     laid = _laid(candidates, compared)
     best = laid[0][1]
-    plain = Plan.of(Morphology.straight(pad.grid, pad.pitch_mm))
+    plain = Plan.of(Morphology.straight(pad.layout))
     straight = [] if np.allclose(plain.course, plan.course) else _on_plan(plain, learnt, compared, rng, report)
     report("courses", 0, 3)
     found = _fitted(best.pad, learnt, report)
@@ -115,12 +116,13 @@ def _refuse_places(places_mm: Array, pad: Morphology) -> None:
             f"the recording has {len(places_mm)} presses of known place and about one depth, allowed are"
             f" {LEAST_PRESSES} or more"
         )
-    width, height = np.subtract(*np.quantile(places_mm, [0.95, 0.05], axis=0))
-    least = LEAST_SIDE * pad.grid * pad.pitch_mm
-    if min(width, height) < least:
-        raise InputError(
-            f"the presses lie within {width:.0f} x {height:.0f} mm, allowed is what spans {least:.0f} mm both ways"
-        )
+    spans = np.subtract(*np.quantile(places_mm, [0.95, 0.05], axis=0))
+    low, high = np.array(sensed_rectangle(pad.layout))
+    least = LEAST_SIDE * pad.unit_mm * (high - low)
+    if (spans < least).any() and (spans < least[::-1]).any():  # nobody knows yet how the pad was turned
+        wide, tall = least.tolist()
+        allowed = f"{wide:.0f} mm both ways" if wide == tall else f"{wide:.0f} x {tall:.0f} mm"
+        raise InputError(f"the presses lie within {spans[0]:.0f} x {spans[1]:.0f} mm, allowed is what spans {allowed}")
 
 
 def _refuse_stranger(match: float) -> None:
@@ -191,7 +193,7 @@ def _caution(pad: LaidPad, presses: Responses) -> Array:
     """(C,) by how much more than noise counts what is left over: where it is a function of place, PATCHES presses say
     all that is to be known of it."""
     left = pad.left_over(presses)
-    noise = smooth_function(left, pad.plan.pitch_mm).noise ** 2
+    noise = smooth_function(left, pad.plan.unit_mm).noise ** 2
     alike = np.maximum(left.spread - noise, 0)
     return np.sqrt((noise + alike * max(len(presses) / PATCHES, 1)) / (noise + alike))
 
@@ -210,5 +212,5 @@ def _readings(
 def _noise(alone: Array, pad: LaidPad, learnt: Responses, live: Indices) -> Array:
     """(C,) V: of a live channel what no smooth function of place explains of what the pad leaves over."""
     noise = np.nan_to_num(alone)
-    noise[live] = smooth_function(pad.left_over(learnt), pad.plan.pitch_mm).noise
+    noise[live] = smooth_function(pad.left_over(learnt), pad.plan.unit_mm).noise
     return noise

@@ -53,7 +53,7 @@ class Identification:
     def laid_mm(self) -> list[tuple[Array, Array, Mask]]:
         """For each live channel how far its fibre lies beside the plan, to its left, (F,) mm; how sure that is, (F,)
         mm; and which of its elements lie within what was pressed, (F,)."""
-        laid, pitch_mm = self.fit.pad, self.pad.pitch_mm
+        laid, unit_mm = self.fit.pad, self.pad.unit_mm
         pressed = laid.plan.to_grid(laid.frame.to_plan(self.learnt.places_mm))
         low, high = pressed.min(axis=0), pressed.max(axis=0)
         out = []
@@ -62,12 +62,12 @@ class Identification:
             off = laid.course(row)[0] - course
             left = off[:, 1] * tangent[:, 0] - off[:, 0] * tangent[:, 1]
             within = ((course >= low) & (course <= high)).all(axis=1)
-            out.append((pitch_mm * left, pitch_mm * self.fit.unsure(row), within))
+            out.append((unit_mm * left, unit_mm * self.fit.unsure(row), within))
         return out
 
     def twin(self, provenance: Mapping[str, Any] | None = None) -> Twin:
         """What was found, as a twin."""
-        laid, pitch_mm = self.fit.pad, self.pad.pitch_mm
+        laid, unit_mm = self.fit.pad, self.pad.unit_mm
         own = dict(zip(self.live.tolist(), range(len(self.live)), strict=True))
         courses: list[Array | None] = [None] * len(self.pad.knots)
         counts: list[Array | None] = list(courses)
@@ -93,7 +93,7 @@ class Identification:
                 for channel, noise_v in enumerate(self.noise_v)
             ),
             laid.frame,
-            distance * pitch_mm,
+            distance * unit_mm,
             weights[0],
             tuple(courses),
             self.noise,

@@ -14,6 +14,7 @@ import numpy as np
 from design import Morphology
 from design.pad.courses.curves import flatten
 from design.pad.twin import Frame
+from design.settings import Layout, sensed_rectangle
 from sense.recordings.processing.limits import Array, Indices
 
 from .kernels.response import along_fibre, channel_response
@@ -42,15 +43,14 @@ class Plan:
     """Elements of F a fibre, evenly spaced along each.
 
     Attributes:
-        course: (2M, F, 2) their middles. tangent: (2M, F, 2) of unit length. length: (2M, F). pitch_mm, grid: as of the
+        course: (C, F, 2) their middles. tangent: (C, F, 2) of unit length. length: (C, F). layout: as of the
             morphology.
     """
 
     course: Array
     tangent: Array
     length: Array
-    pitch_mm: float
-    grid: int
+    layout: Layout
 
     @classmethod
     def of(cls, pad: Morphology) -> "Plan":
@@ -65,11 +65,21 @@ class Plan:
             course.append((points[:-1] + points[1:]) / 2)
             tangent.append(along / size[:, None])
             length.append(size)
-        return cls(np.array(course), np.array(tangent), np.array(length), pad.pitch_mm, pad.grid)
+        return cls(np.array(course), np.array(tangent), np.array(length), pad.layout)
 
     def to_grid(self, places_mm: Array) -> Array:
         """(Q, 2) mm on the plan, from its middle, to grid units from its corner."""
-        return places_mm / self.pitch_mm + (self.grid + 1) / 2
+        return places_mm / self.unit_mm + self.middle
+
+    @property
+    def unit_mm(self) -> float:
+        """A grid unit, mm."""
+        return self.layout.unit_mm
+
+    @property
+    def middle(self) -> Array:
+        """(2,) of the pad, grid units from its corner."""
+        return np.array(self.layout.extent) / 2
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,7 @@ class LaidPad:
 
     def settled(self) -> "LaidPad":
         """The same pad, with what all its fibres have in common of their ways beside the plan told by the frame."""
-        low, high = 0.5, self.plan.grid + 0.5
+        low, high = sensed_rectangle(self.plan.layout)
         planned = np.concatenate([self.plan.course[fibre] for fibre in self.fibres])
         laid = np.concatenate([self.course(channel)[0] for channel in range(len(self.fibres))])
         within = ((planned >= low) & (planned <= high)).all(axis=1)
@@ -166,10 +176,11 @@ class LaidPad:
         aside = (moved + shift - planned).reshape(len(self.fibres), ELEMENTS, 2)
         basis = along_fibre(np.eye(ASIDE), ELEMENTS)[0][0].T
         coefficients = np.linalg.lstsq(basis, aside.transpose(1, 0, 2).reshape(ELEMENTS, -1), rcond=None)[0]
-        values, middle = self.values.copy(), (self.plan.grid + 1) / 2
+        values, middle = self.values.copy(), self.plan.middle
         values[0] += turn
         # the frame turns about the middle of the pad, the courses about its corner
-        values[1:3] = values[1:3] @ rotation + self.plan.pitch_mm * (middle * (rotation.sum(axis=0) - 1) + shift)
+        off = middle[0] * (rotation.sum(axis=0) - 1) + (middle[1] - middle[0]) * (rotation[1] - [0, 1])
+        values[1:3] = values[1:3] @ rotation + self.plan.unit_mm * (off + shift)
         own = values[SHARED:].reshape(-1, OWN)
         own[:, AWAY] = coefficients.reshape(ASIDE, len(self.fibres), 2).transpose(1, 2, 0).reshape(len(own), -1)
         return replace(self, values=values)
@@ -207,13 +218,13 @@ class LaidPad:
 
     def _placed(self, places_mm: Array) -> tuple[Array, Array]:
         """Places (Q, 2) in grid units of the plan, and their derivatives (Q, 2, 4) by turn, shift and scale."""
-        frame, pitch = self.frame, self.plan.pitch_mm
+        frame, unit_mm = self.frame, self.plan.unit_mm
         turned = frame.turned(places_mm)
         by = np.zeros((len(places_mm), 2, 4))
         by[:, 0, 0], by[:, 1, 0] = -frame.scale * turned[:, 1], frame.scale * turned[:, 0]
         by[:, 0, 1] = by[:, 1, 2] = 1
         by[:, :, 3] = turned
-        return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(places_mm))), by / pitch
+        return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(places_mm))), by / unit_mm
 
 
 def _turn_between(points: Array, others: Array) -> float:

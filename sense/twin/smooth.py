@@ -11,7 +11,7 @@ import numpy as np
 from .responses import Responses
 
 WIDTHS = (0.4, 0.8)
-"""Standard deviations of the kernels that are tried, pitches."""
+"""Standard deviations of the kernels that are tried, grid units."""
 PRESSES = 800
 """Presses that are looked at, at most: the eigenvalues of a matrix of that size are found."""
 RATIOS = np.append(0.0, np.geomspace(1e-2, 1e4, 61))
@@ -30,9 +30,9 @@ class Smooth(NamedTuple):
     certainty: np.ndarray
 
 
-def smooth_function(values: Responses, pitch_mm: float) -> Smooth:
+def smooth_function(values: Responses, unit_mm: float) -> Smooth:
     """The most probable smooth function of place of each channel; NaN and 0 for one with fewer than 10 answers."""
-    places = values.places_mm[:PRESSES] / pitch_mm
+    places = values.places_mm[:PRESSES] / unit_mm
     squares = ((places[:, None, :] - places) ** 2).sum(axis=2)
 
     @cache

@@ -24,11 +24,11 @@ PRESSES = 400
 COARSE = 4
 """Of so many elements of a fibre one is looked at."""
 SHIFTS = (-0.8, -0.4, 0.0, 0.4, 0.8)
-"""Shifts that are tried, in pitches."""
+"""Shifts that are tried, in grid units."""
 REFINED = 24
 """Frames that are moved to where they go best."""
 STEPS = np.array([0.06, 0.25, 0.25, 0.03, 0.15])
-"""First steps by which a frame is moved: turn (rad), shift (pitches), scale, and logarithm of the reach's width."""
+"""First steps by which a frame is moved: turn (rad), shift (grid units), scale, and logarithm of the reach's width."""
 UNLIKELY = 0.002
 """Cost of a change by one such step in all, in shares of the variance explained."""
 
@@ -73,7 +73,7 @@ class Matcher:
         return Wiring(frame, width, fibres, match)
 
     def _correlations(self, signals: Array) -> Array:
-        """(2M, C) of signals (Q, 2M) with the answers."""
+        """(F, C) of signals (Q, F) with the answers."""
         if self._there.all():
             return _centred(signals).T @ self._volts
         columns = [
@@ -94,7 +94,7 @@ def _centred(values: Array, there: Mask | None = None) -> Array:
 
 
 def assigned(correlations: Array) -> tuple[float, tuple[int, ...]]:
-    """The best assignment for correlations (2M, C) of one sign: its mean square, and what each channel reads."""
+    """The best assignment for correlations (F, C) of one sign: its mean square, and what each channel reads."""
     best: tuple[float, tuple[int, ...]] = (-1.0, ())
     for sign in (1, -1):
         squares = np.maximum(sign * correlations, 0) ** 2
@@ -114,13 +114,13 @@ def wirings(
     tried = []
     for mirrored, quarter, x, y in product((False, True), range(4), SHIFTS, SHIFTS):
         lying = Frame(mirrored, 90.0 * quarter)
-        shift = np.array([x, y]) * plan.pitch_mm - _off_middle(middle, lying, plan)
+        shift = np.array([x, y]) * plan.unit_mm - _off_middle(middle, lying, plan)
         tried.append(matcher(replace(lying, shift_mm=tuple(shift.tolist())), WIDTH))
     tried.sort(key=lambda wiring: -wiring.match)
     best: dict[tuple[bool, tuple[int, ...]], Wiring] = {}
     for number, wiring in enumerate(tried[:REFINED]):
         report(number, REFINED)
-        moved = _moved(matcher, wiring, plan.pitch_mm)
+        moved = _moved(matcher, wiring, plan.unit_mm)
         if moved.kind not in best or best[moved.kind].match < moved.match:
             best[moved.kind] = moved
     return sorted(best.values(), key=lambda wiring: -wiring.match)
@@ -129,12 +129,12 @@ def wirings(
 def _off_middle(middle: Array, lying: Frame, plan: Plan) -> Array:
     """The middle of what was pressed, as a shift that is undone where it lies far off the pad's own middle."""
     turned = lying.turned(middle[None])[0]
-    return turned if np.abs(turned).max() > plan.pitch_mm else np.zeros(2)
+    return turned if np.abs(turned).max() > plan.unit_mm else np.zeros(2)
 
 
-def _moved(matcher: Matcher, wiring: Wiring, pitch_mm: float) -> Wiring:
+def _moved(matcher: Matcher, wiring: Wiring, unit_mm: float) -> Wiring:
     """The best wiring near one."""
-    start, unit = wiring.frame, STEPS * [1, pitch_mm, pitch_mm, 1, 1]
+    start, unit = wiring.frame, STEPS * [1, unit_mm, unit_mm, 1, 1]
 
     def at(change: Array) -> Wiring:
         turn, x, y, scale, width = (change * unit).tolist()

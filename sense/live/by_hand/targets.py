@@ -3,7 +3,7 @@
 import numpy as np
 
 from design.common.errors import InputError
-from sense.recordings.press_plan import planned, read_plan
+from sense.recordings.press_plan import free_of, planned, size_of
 from sense.recordings.processing.limits import Array
 from sense.rig.planning.setup import Setup
 
@@ -23,10 +23,12 @@ def targets_of(setup: Setup) -> Array:
     rig = setup.rig
     if rig.plan == "adaptive":
         raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, boustrophedon or a .csv of places")
-    if (file := rig.plan_file) is not None:
-        return read_plan(file, rig.depth_mm).places_mm
-    places_mm = planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.sensed_mm).places_mm
-    return in_rounds(np.rint(places_mm)) if rig.plan == "uniform" else places_mm
+    places_mm = planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size).places_mm
+    if rig.plan != "uniform":
+        return places_mm
+    whole_mm = np.rint(places_mm)
+    free = free_of(setup.pad, size_of(setup.pad, setup.size))(whole_mm)
+    return in_rounds(np.where(free[:, None], whole_mm, places_mm))
 
 
 def in_rounds(places_mm: Array) -> Array:

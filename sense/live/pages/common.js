@@ -19,7 +19,7 @@ function made(name, className, text) {
 
 // Seen from above as the pad lies: with its tracks up, mirrored, x runs to the left.
 function frame(view) {
-  const scale = (SIDE - 2 * MARGIN) / (2 * view.half_mm), right = view.mirrored ? -scale : scale
+  const scale = (SIDE - 2 * MARGIN) / (2 * Math.max(...view.half_mm)), right = view.mirrored ? -scale : scale
   return {
     scale,
     x: mm => SIDE / 2 + (mm - view.middle_mm[0]) * right,
@@ -28,18 +28,19 @@ function frame(view) {
 }
 
 function gridParts(view) {
-  const {scale, x, y} = frame(view), [cx, cy] = view.middle_mm, half = view.half_mm, parts = []
+  const {scale, x, y} = frame(view), [cx, cy] = view.middle_mm, [wide, high] = view.half_mm, half = Math.max(wide, high)
+  const left = x(cx) - wide * scale, below = y(cy - high) + MARGIN - 14, parts = []
   const step = 10 ** Math.floor(Math.log10(half)) / (half / 10 ** Math.floor(Math.log10(half)) < 3 ? 2 : 1)
-  for (let at = Math.ceil((cx - half) / step) * step; at <= cx + half; at += step) {
-    parts.push(drawn("line", {class: "grid", x1: x(at), x2: x(at), y1: y(cy - half), y2: y(cy + half)}))
-    parts.push(drawn("text", {x: x(at), y: SIDE - 14, "text-anchor": "middle"}, +at.toFixed(3)))
+  for (let at = Math.ceil((cx - wide) / step) * step; at <= cx + wide; at += step) {
+    parts.push(drawn("line", {class: "grid", x1: x(at), x2: x(at), y1: y(cy - high), y2: y(cy + high)}))
+    parts.push(drawn("text", {x: x(at), y: below, "text-anchor": "middle"}, +at.toFixed(3)))
   }
-  for (let at = Math.ceil((cy - half) / step) * step; at <= cy + half; at += step) {
-    parts.push(drawn("line", {class: "grid", x1: x(cx - half), x2: x(cx + half), y1: y(at), y2: y(at)}))
-    parts.push(drawn("text", {x: MARGIN - 5, y: y(at) + 4, "text-anchor": "end"}, +at.toFixed(3)))
+  for (let at = Math.ceil((cy - high) / step) * step; at <= cy + high; at += step) {
+    parts.push(drawn("line", {class: "grid", x1: x(cx - wide), x2: x(cx + wide), y1: y(at), y2: y(at)}))
+    parts.push(drawn("text", {x: left - 5, y: y(at) + 4, "text-anchor": "end"}, +at.toFixed(3)))
   }
-  parts.push(drawn("text", {x: SIDE - 8, y: SIDE - 14, "text-anchor": "end"}, "mm"))
-  parts.push(drawn("rect", {class: "grid edge", x: x(cx) - half * scale, y: y(cy + half), width: 2 * half * scale, height: 2 * half * scale}))
+  parts.push(drawn("text", {x: left + 2 * wide * scale + MARGIN - 8, y: below, "text-anchor": "end"}, "mm"))
+  parts.push(drawn("rect", {class: "grid edge", x: left, y: y(cy + high), width: 2 * wide * scale, height: 2 * high * scale}))
   return parts
 }
 

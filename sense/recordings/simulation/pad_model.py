@@ -233,12 +233,12 @@ class LivePad:
         self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, rng: np.random.Generator
     ) -> None:
         self._pad, self._contact = pad, contact
-        self._divider = Divider(2 * pad.grid, rate_hz, rig, rng)
+        self._divider = Divider(len(pad.knots), rate_hz, rig, rng)
         self._known: dict[tuple[float, float], Array] = {}
 
     def volts(self, places_mm: Array, depths_mm: Array) -> Array:
         """(R, C) volts for tips at (R, 2) mm from the pad's centre, (R,) mm below its surface (above: less than 0)."""
-        strained = np.zeros((len(places_mm), 2 * self._pad.grid))
+        strained = np.zeros((len(places_mm), len(self._pad.knots)))
         for row in np.flatnonzero(depths_mm > 0):
             strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._signals(places_mm[row])
         return self._divider(strained)

@@ -5,8 +5,8 @@ import numpy as np
 from design import Contact, Morphology, Twin
 from design.common.errors import MOST_VALUES, InputError, instance, whole
 from design.common.settings import or_default
-from design.settings import Sensed, sensed_rectangle
-from sense.recordings.press_plan import planned_in
+from design.settings import PadSettings
+from sense.recordings.press_plan import free_of, planned_in, size_of, uniform
 from sense.recordings.processing.limits import MAX_FIBRES, Array
 from sense.recordings.recording import Recording
 from sense.settings import RigSettings
@@ -22,7 +22,7 @@ def simulate(
     pad: Morphology | Twin,
     rig: RigSettings | None = None,
     contact: Contact | None = None,
-    sensed_mm: Sensed = "beyond",
+    size: PadSettings | None = None,
     like: Twin | None = None,
 ) -> Recording:
     """Record presses on a simulated pad, where and as deep as `[rig]` plans them.
@@ -33,15 +33,15 @@ def simulate(
         pad: course of the fibres; or a twin, which answers, and is pressed, as the pad it was measured on.
         rig: plan, depths, rate, seed and strengths. contact: what a press deforms. What a twin has measured goes
             before both.
-        sensed_mm: where it is pressed (`PadSettings`).
+        size: where it is pressed, and where it is not; of a twin the latter.
         like: a twin of another pad, which `pad` is to answer like.
 
     Returns:
         The recording, the same for the same arguments.
 
     Raises:
-        InputError: more fibres or readings than a recording may hold, presses beyond the pad, a plan that is adaptive
-            or no file of places, or a twin of which no channel reads a fibre.
+        InputError: more fibres or readings than a recording may hold, presses beyond the pad or in its holes, a plan
+            that is adaptive or no file of places, or a twin of which no channel reads a fibre.
     """
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
     channels = len(pad.channels) if isinstance(pad, Twin) else len(instance("pad", pad, Morphology).knots)
@@ -51,10 +51,10 @@ def simulate(
             "[rig] plan is adaptive, which only a recording in real time is steered by; allowed where presses are "
             "simulated at once are uniform, grid, boustrophedon or a .csv file"
         )
-    model = _modelled(pad, contact, sensed_mm, like)
+    model = _modelled(pad, contact, size, like)
     rig = rig.model_copy(update=model.strengths)
     rng = np.random.default_rng(rig.seed)
-    plan = planned_in(model.pressed_mm, rig, rng)
+    plan = planned_in(model.pressed_mm, rig, rng, model.free)
     values = len(plan) * rig.readings_per_press * channels
     if values > MOST_VALUES:
         raise InputError(
@@ -76,17 +76,13 @@ def simulate(
     )
 
 
-def _modelled(pad: Morphology | Twin, contact: Contact, sensed_mm: Sensed, like: Twin | None) -> SimulatedPad:
+def _modelled(pad: Morphology | Twin, contact: Contact, size: PadSettings | None, like: Twin | None) -> SimulatedPad:
     if isinstance(pad, Twin):
-        return measured(pad)
-    return (
-        planned(pad, contact, sensed_mm)
-        if like is None
-        else measured_alike(pad, instance("like", like, Twin), sensed_mm)
-    )
+        return measured(pad, size)
+    return planned(pad, contact, size) if like is None else measured_alike(pad, instance("like", like, Twin), size)
 
 
-def random_places(pad: Morphology, presses: int, rng: np.random.Generator, sensed_mm: Sensed = "beyond") -> Array:
-    """(Q, 2) places in mm, uniform over what is pressed of the pad (`PadSettings`)."""
-    low, high = pad.to_mm(sensed_rectangle(pad.grid, pad.pitch_mm, sensed_mm))
-    return rng.uniform(low, high, (presses, 2))
+def random_places(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:
+    """(Q, 2) places in mm, uniform over what is pressed of the pad, see `size_of`."""
+    size = size_of(pad, size)
+    return uniform(pad.to_mm(size.sensed), presses, rng, free_of(pad, size))

@@ -9,7 +9,8 @@ import numpy as np
 from design import Contact, Morphology, Twin, signals
 from design.common.errors import InputError
 from design.pad.twin import TwinChannel
-from design.settings import PadSettings, Sensed
+from design.settings import PadSettings
+from sense.recordings.press_plan import Free, free_of, size_of, told_pad
 from sense.recordings.processing.limits import Array
 
 LEAST_APART = 0.3
@@ -21,7 +22,8 @@ class SimulatedPad:
     """A pad of C channels.
 
     Attributes:
-        channels: C. pressed_mm: (2, 2) low and high corner of where it is pressed, as the arm counts.
+        channels: C. pressed_mm: (2, 2) low and high corner of where it is pressed, as the arm counts. free: which
+            places there are.
         answers: (Q, 2) mm as the arm counts to (Q, C) answers of presses at full depth, grid units of fibre, or V.
         noise_v: (C,) V, standard deviation of an answer that no place explains; None where answers are grid units.
         strengths: of the settings of `[rig]`, those that were measured.
@@ -30,39 +32,42 @@ class SimulatedPad:
 
     channels: int
     pressed_mm: Array
+    free: Free
     answers: Callable[[Array], Array]
     noise_v: Array | None
     strengths: dict[str, float]
     source: dict[str, Any]
 
 
-def planned(pad: Morphology, contact: Contact, sensed_mm: Sensed = "beyond") -> SimulatedPad:
-    """A pad as it is planned; `sensed_mm` is where it is pressed (`PadSettings`).
+def planned(pad: Morphology, contact: Contact, size: PadSettings | None = None) -> SimulatedPad:
+    """A pad as it is planned; `size` says where it is pressed.
 
     Raises:
-        InputError: presses beyond the pad.
+        InputError: as `size_of`.
     """
-    size = PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm, sensed_mm=sensed_mm)
+    size = size_of(pad, size)
+    told = size.model_dump(mode="json")
     source = {
         "contact": contact.model_dump(mode="json"),
-        "sensed_mm": size.model_dump(mode="json")["sensed_mm"],
-        "morphology": {"pitch_mm": pad.pitch_mm, "knots": pad.knots.tolist()},
+        "sensed_mm": told["sensed_mm"],
+        "morphology": told_pad(pad),
     }
     return SimulatedPad(
         len(pad.knots),
         pad.to_mm(size.sensed),
+        free_of(pad, size),
         lambda places_mm: signals(pad, pad.to_grid(places_mm), contact),
         None,
         {},
-        source,
+        source | ({"keep_out_mm": told["keep_out_mm"]} if size.keep_out_mm else {}),
     )
 
 
-def measured(twin: Twin) -> SimulatedPad:
+def measured(twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
     """The twin's own pad: fibres as laid and wired, pressed where the arm pressed; a dead channel stays at rest.
 
     Raises:
-        InputError: no channel of the twin reads a fibre.
+        InputError: no channel of the twin reads a fibre; or as `size_of`.
     """
     live = _live(twin)
     columns = [twin.channels.index(channel) for channel in live]
@@ -77,8 +82,15 @@ def measured(twin: Twin) -> SimulatedPad:
         return out
 
     half_mm = _sides_mm(twin) / 2
-    source = planned(twin.morphology, twin.contact()).source | {"sensed_mm": (2 * half_mm).tolist()}
-    return SimulatedPad(len(twin.channels), np.array([-half_mm, half_mm]), answers, *_told(twin, noise_v, source))
+    plan = planned(twin.morphology, twin.contact(), size)
+    source = plan.source | {"sensed_mm": (2 * half_mm).tolist()}
+    return SimulatedPad(
+        len(twin.channels),
+        np.array([-half_mm, half_mm]),
+        lambda places_mm: plan.free(twin.frame.to_plan(places_mm)),
+        answers,
+        *_told(twin, noise_v, source),
+    )
 
 
 def _sides_mm(twin: Twin) -> Array:
@@ -88,21 +100,22 @@ def _sides_mm(twin: Twin) -> Array:
     return np.maximum(sides, 0)
 
 
-def measured_alike(pad: Morphology, twin: Twin, sensed_mm: Sensed = "beyond") -> SimulatedPad:
+def measured_alike(pad: Morphology, twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
     """Another pad as planned, in its own frame, with the reach of the twin, and its median gain and noise.
 
     How its channels will differ nobody knows before it is laid: fibre i is on channel i, all alike.
 
     Raises:
-        InputError: no channel of the twin reads a fibre.
+        InputError: no channel of the twin reads a fibre; or as `size_of`.
     """
     gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live(twin)]).T
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
-    plan = planned(pad, twin.contact(pad.pitch_mm), sensed_mm)
+    plan = planned(pad, twin.contact(pad.unit_mm), size)
     noise_v = np.full(plan.channels, np.median(noises_v))
     return SimulatedPad(
         plan.channels,
         plan.pressed_mm,
+        plan.free,
         lambda places_mm: gain_v * plan.answers(places_mm),
         *_told(twin, noise_v, plan.source),
     )

@@ -134,5 +134,5 @@ def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> It
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     with EmulatedBoard(finger.volts) as board:
         emulated = rig.model_copy(update={"port": board.port})
-        with closing(Arduino.of(emulated, range(2 * pad.grid))) as converter:
+        with closing(Arduino.of(emulated, range(len(pad.knots)))) as converter:
             yield converter, finger

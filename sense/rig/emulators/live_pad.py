@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from design import Contact, Morphology, signals
-from design.settings import Sensed
+from design.settings import PadSettings
 from sense.recordings.press_plan import planned
 from sense.recordings.processing.limits import Array
 from sense.recordings.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
@@ -30,15 +30,15 @@ class SimulatedConverter:
         rig: RigSettings,
         contact: Contact,
         clock: Callable[[], float] = time.monotonic,
-        sensed_mm: Sensed = "beyond",
+        size: PadSettings | None = None,
     ) -> None:
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
-            planned(pad, rig, rng)  # the presses of the recording, drawn before the pad is
+            planned(pad, rig, rng, size)  # the presses of the recording, drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig, self._clock = pad, contact, rig, clock
         self._depths_mm = rig.depths_mm or (rig.depth_mm,)
-        self._sensed_mm: Sensed = sensed_mm
+        self._size = size
         self._finger = rng.spawn(1)[0]
         self._started_s: float | None = None
         self._count = 0
@@ -48,7 +48,7 @@ class SimulatedConverter:
         """Begin; see `Converter`."""
         signals(self._pad, self._pad.to_grid([[0.0, 0.0]]), self._contact)  # compiled before it has to keep up
         self._started_s, self._count = self._clock(), 0
-        fibres = 2 * self._pad.grid
+        fibres = len(self._pad.knots)
         named = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
         return {**named, "rate_hz": self._rig.rate_hz, "supply_v": SUPPLY_V}
 
@@ -72,6 +72,6 @@ class SimulatedConverter:
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
         press, within_s = divmod(at_s, cycle_s)
         if press > self._press:
-            self._press, self._place_mm = press, random_places(self._pad, 1, self._finger, self._sensed_mm)[0]
+            self._press, self._place_mm = press, random_places(self._pad, 1, self._finger, self._size)[0]
         down = min((within_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - within_s) / TRAVEL_S)
         return self._place_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(down, 0.0)

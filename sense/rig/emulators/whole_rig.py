@@ -118,7 +118,7 @@ def emulated_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
     Where the pad lies and where the tip is are as said, or as good as any.
     """
     x, y = rig.pad_mm or (0.0, -400.0)
-    reach = pad.size_mm + rig.clearance_mm
+    reach = _reach_mm(rig, pad)
     return rig.model_copy(
         update={
             "pad_mm": (x, y),
@@ -129,10 +129,15 @@ def emulated_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
     )
 
 
+def _reach_mm(rig: RigSettings, pad: Morphology) -> float:
+    """How far from the middle of a pad a tip may go, however the pad is turned."""
+    return max(pad.layout.size_mm) + rig.clearance_mm
+
+
 def emulated_printer_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
     """`rig` with the pad in the middle of the emulated printer's bed, and the probe beside its nozzle."""
     middle, height = BED_MM / 2, 8.0
-    reach = pad.size_mm + rig.clearance_mm
+    reach = _reach_mm(rig, pad)
     sides = (middle - reach, middle + reach)
     return rig.model_copy(
         update={

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from sense.localizer.localizer import Localizer
 from sense.localizer.locating import locate
-from sense.recordings.press_plan import PressPlan
+from sense.recordings.press_plan import Free, PressPlan, uniform
 from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
 
@@ -22,11 +22,11 @@ class Steering:
 
     Args:
         localizer: calibrated on an earlier recording of the pad. run: run directory that is being written, synced after
-            every press. rng: of the candidates.
+            every press. rng: of the candidates. free: which of them may be pressed.
     """
 
-    def __init__(self, localizer: Localizer, run: Path, rng: np.random.Generator) -> None:
-        self._localizer, self._run, self._rng = localizer, run, rng
+    def __init__(self, localizer: Localizer, run: Path, rng: np.random.Generator, free: Free) -> None:
+        self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
 
     def __call__(self, plan: PressPlan, press: int) -> PressPlan:
         """The plan with its next presses, from `press` on, moved; unchanged between two looks."""
@@ -36,7 +36,7 @@ class Steering:
         errors = np.linalg.norm(locate(self._localizer, recording).places_mm - recording.presses_mm, axis=1)
         places = plan.places_mm.copy()
         high = np.abs(plan.places_mm).max(axis=0)
-        candidates = self._rng.uniform(-high, high, (_CANDIDATES, 2))
+        candidates = uniform(np.array([-high, high]), _CANDIDATES, self._rng, self._free)
         pressed = recording.presses_mm
         for number in range(press, min(press + EVERY, len(plan))):
             places[number] = candidates[np.argmax(uncertainty(candidates, recording.presses_mm, errors, pressed))]

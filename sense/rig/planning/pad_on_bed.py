@@ -10,7 +10,7 @@ from sense.rig.devices.protocols import RigFault
 from sense.settings import RigSettings
 
 FILE, FORMAT = "fabrication.json", "padforge-fabrication/1"
-_LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "pad_mm": 1, "surface_mm": 1, "walls_mm": 1}
+_LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "surface_mm": 1, "walls_mm": 1}
 _SLACK_MM = 1e-6
 
 
@@ -35,11 +35,11 @@ def on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     frame = _frame(folder)
     (x, y), surface = rig.pad_mm or frame["centre_mm"], frame["surface_mm"]
     contact = surface if rig.contact_mm is None else rig.contact_mm
-    half, (width, depth, height) = frame["pad_mm"] / 2, frame["bed_mm"]
+    (right, top), (width, depth, height) = _halves(frame), frame["bed_mm"]
     dx, dy, dz = rig.tcp_mm
     box = (
-        *(max(x - half, dx), min(x + half, width + dx)),
-        *(max(y - half, dy), min(y + half, depth + dy)),
+        *(max(x - right, dx), min(x + right, width + dx)),
+        *(max(y - top, dy), min(y + top, depth + dy)),
         *(max(contact - rig.max_depth_mm, frame["walls_mm"]) - _SLACK_MM, height + dz),
     )
     mirrored = frame["mirrored"] if rig.mirrored is None else rig.mirrored
@@ -60,12 +60,20 @@ def _frame(folder: Path) -> Mapping[str, Any]:
     if not isinstance(frame, Mapping):
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {path} is of a pad without a holder"
         raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
-    read = {name: _numbers(frame.get(name), count) for name, count in _LENGTHS.items()}
+    counts = _LENGTHS | {"pad_mm": 2 if isinstance(frame.get("pad_mm"), list) else 1}
+    read = {name: _numbers(frame.get(name), count) for name, count in counts.items()}
     if wrong := [name for name, value in read.items() if value is None]:
-        raise InputError(f"{path}: frame has no {wrong[0]}, expected {_LENGTHS[wrong[0]]} finite numbers")
+        raise InputError(f"{path}: frame has no {wrong[0]}, expected {counts[wrong[0]]} finite numbers")
     if type(mirrored := frame.get("mirrored", False)) is not bool:
         raise InputError(f"{path}: mirrored of frame is {shown(mirrored)}, expected true or false")
     return read | {"mirrored": mirrored}
+
+
+def _halves(frame: Mapping[str, Any]) -> tuple[float, float]:
+    """Half of what the pad spans along the axes of the bed, on which it lies turned by quarters."""
+    side = frame["pad_mm"]
+    width, height = side if isinstance(side, tuple) else (side, side)
+    return (height / 2, width / 2) if round(frame["angle_deg"] / 90) % 2 else (width / 2, height / 2)
 
 
 def _numbers(value: object, count: int) -> Any:

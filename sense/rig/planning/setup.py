@@ -11,7 +11,7 @@ from design.common.files import provenance, read_json
 
 if TYPE_CHECKING:
     from design.pad.morphology import Morphology
-    from design.settings import Contact, Sensed
+    from design.settings import Contact, PadSettings
     from sense.recordings.press_plan import PressPlan
     from sense.recordings.recorder import Recorder
     from sense.settings import RigSettings
@@ -22,7 +22,7 @@ class Setup:
     """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from.
 
     Attributes:
-        sensed_mm: which part of the pad is pressed (`PadSettings`), unless a file says where.
+        size: which part of the pad is pressed, unless a file says where, and which is not; the default if None.
         folder: of the pad, with what fabricate has written.
     """
 
@@ -32,7 +32,7 @@ class Setup:
     out: Path
     command: str
     inputs: Sequence[Path] = ()
-    sensed_mm: "Sensed" = "beyond"
+    size: "PadSettings | None" = None
     folder: Path = Path()
 
 
@@ -40,12 +40,13 @@ def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
     """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
 
-    from sense.recordings.press_plan import PressPlan, planned
+    from sense.recordings.press_plan import PressPlan, all_free, free_of, planned, size_of
     from sense.recordings.recorder import START
 
     if resume and (setup.out / START).exists():
-        return PressPlan.of(begun_source(setup, rig, KIND)["plan"]["presses"])
-    return planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.sensed_mm)
+        plan = PressPlan.of(begun_source(setup, rig, KIND)["plan"]["presses"])
+        return all_free(plan, setup.out, free_of(setup.pad, size_of(setup.pad, setup.size)))
+    return planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size)
 
 
 KIND = "rig"
@@ -124,9 +125,10 @@ def source_of(
 
 def _told(setup: Setup, rig: "RigSettings") -> dict[str, Any]:
     """Settings, with the inputs of the board as they are wired and the side of the pad as it counts, and the pad."""
+    from sense.recordings.press_plan import told_pad
+
     wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots)), "mirrored": bool(rig.mirrored)})
-    pad = {"pitch_mm": setup.pad.pitch_mm, "knots": setup.pad.knots.tolist()}
-    return {"rig": wired.model_dump(mode="json"), "morphology": pad}
+    return {"rig": wired.model_dump(mode="json"), "morphology": told_pad(setup.pad)}
 
 
 def _plain(about: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from design.common.figures import CURVES, FAINT, INK, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from design.pad.morphology import Morphology
+from design.settings import between_fibres
 from sense.recordings.processing.limits import Array
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
@@ -102,7 +103,7 @@ def force_study(
 
 
 def readings(signals: Array, full: Array, noise_counts: float, rng: np.random.Generator) -> Array:
-    """What a 12-bit converter reads: whole counts of (Q, 2M) signals with noise, 0 and full scale `full` (2M,) at most.
+    """What a 12-bit converter reads: whole counts of (Q, C) signals with noise, 0 and full scale `full` (C,) at most.
 
     A fibre without a full scale was never stretched, and reads its noise.
     """
@@ -111,7 +112,7 @@ def readings(signals: Array, full: Array, noise_counts: float, rng: np.random.Ge
 
 
 def magnitudes(read: Array) -> Array:
-    """Logarithms of readings (Q, 2M) in counts: a deeper press multiplies all signals, and so adds to these."""
+    """Logarithms of readings (Q, C) in counts: a deeper press multiplies all signals, and so adds to these."""
     return np.log1p(read / SOFT)
 
 
@@ -132,7 +133,7 @@ def _found(pad: Morphology, made: _Presses, learning: Learning, seed: int) -> St
     """
     rng = np.random.default_rng([3, seed])
     presses, count = learning.presses, learning.presses + learning.test
-    places = fresh_presses(pad.grid, count, int(rng.integers(2**32)))
+    places = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
     deep = rng.uniform(*made.depths, count)
     signals = indented_signals(pad, places, deep, made.indenter)
     given = magnitudes(readings(signals, signals[:presses].max(axis=0), made.noise_counts, rng))
@@ -159,19 +160,19 @@ def _conclude(
             unknown, told, fixed = next(results), next(results), next(results)
             deep, found = unknown["pressed"][:, 2], np.clip(unknown["found"][:, 2], low, high)
             off = _distances(unknown)
-            force = partial(indenter.force_n, pitch_mm=pad.pitch_mm)
+            force = partial(indenter.force_n, unit_mm=pad.unit_mm)
             span = float(force(high) - force(low))
             rows.append(
                 {
                     "pad": label,
                     "noise_counts": noise,
                     "place_grid": float(off.mean()),
-                    "place_mm": float(off.mean() * pad.pitch_mm),
-                    "place_depth_told_mm": float(_distances(told).mean() * pad.pitch_mm),
-                    "place_one_depth_mm": float(_distances(fixed).mean() * pad.pitch_mm),
+                    "place_mm": float(off.mean() * pad.unit_mm),
+                    "place_depth_told_mm": float(_distances(told).mean() * pad.unit_mm),
+                    "place_one_depth_mm": float(_distances(fixed).mean() * pad.unit_mm),
                     "depth_grid": float(np.abs(found - deep).mean()),
-                    "depth_mm": float(np.abs(found - deep).mean() * pad.pitch_mm),
-                    "depth_guessed_mm": float(np.abs(deep - (low + high) / 2).mean() * pad.pitch_mm),
+                    "depth_mm": float(np.abs(found - deep).mean() * pad.unit_mm),
+                    "depth_guessed_mm": float(np.abs(deep - (low + high) / 2).mean() * pad.unit_mm),
                     "force_n": float(np.abs(force(found) - force(deep)).mean()),
                     "force_percent": float(100 * np.abs(force(found) - force(deep)).mean() / span),
                     "force_guessed_percent": float(100 * np.abs(force((low + high) / 2) - force(deep)).mean() / span),
@@ -182,11 +183,11 @@ def _conclude(
                 {
                     "pad": label,
                     "noise_counts": noise,
-                    "pressed_mm": np.round(deep * pad.pitch_mm, 4).tolist(),
-                    "found_mm": np.round(found * pad.pitch_mm, 4).tolist(),
-                    "middles_mm": ((edges[1:] + edges[:-1]) / 2 * pad.pitch_mm).tolist(),
+                    "pressed_mm": np.round(deep * pad.unit_mm, 4).tolist(),
+                    "found_mm": np.round(found * pad.unit_mm, 4).tolist(),
+                    "middles_mm": ((edges[1:] + edges[:-1]) / 2 * pad.unit_mm).tolist(),
                     "place_mm": [
-                        float(off[own == bin].mean() * pad.pitch_mm) if (own == bin).any() else None
+                        float(off[own == bin].mean() * pad.unit_mm) if (own == bin).any() else None
                         for bin in range(BINS)
                     ],
                 }

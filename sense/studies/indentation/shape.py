@@ -14,7 +14,7 @@ from design.evaluation.localisation_error import fresh_presses
 from design.pad.contact import signals
 from design.pad.indentation import Indenter, indented_signals
 from design.pad.morphology import Morphology
-from design.settings import Contact
+from design.settings import Contact, between_fibres
 from sense.recordings.processing.limits import Array, Indices
 from sense.studies.pads import described
 from sense.studies.study import Findings, Study, Task
@@ -89,10 +89,10 @@ class _Presses:
     seed: int
 
     def made(self) -> tuple[Array, Array, Indices, np.random.Generator]:
-        """What a network is given (Q, 2M), places (Q, 2), the shape's index (Q,), and what to draw further from."""
+        """What a network is given (Q, C), places (Q, 2), the shape's index (Q,), and what to draw further from."""
         rng = np.random.default_rng([4, self.seed, list(SETS).index(self.of)])
         count = self.learnt + self.test
-        places = fresh_presses(self.pad.grid, count, int(rng.integers(2**32)))
+        places = fresh_presses(between_fibres(self.pad.layout), count, int(rng.integers(2**32)))
         shape = rng.integers(len(SETS[self.of]), size=count)
         if self.of == "indenters":
             given = _indented(self.pad, places, shape, rng.uniform(*DEPTHS, count))
@@ -103,8 +103,8 @@ class _Presses:
 
 
 def _indented(pad: Morphology, places: Array, shape: Indices, depths: Array) -> Array:
-    """(Q, 2M) signals of indenters."""
-    given = np.empty((len(places), 2 * pad.grid))
+    """(Q, C) signals of indenters."""
+    given = np.empty((len(places), pad.layout.fibres))
     for index, indenter in enumerate(INDENTERS.values()):
         own = shape == index
         given[own] = indented_signals(pad, places[own], depths[own], indenter)
@@ -112,8 +112,8 @@ def _indented(pad: Morphology, places: Array, shape: Indices, depths: Array) -> 
 
 
 def _printed(pad: Morphology, places: Array, shape: Indices, size: Indices) -> Array:
-    """(Q, 2M) signals of footprints, of SIZES[size]."""
-    given = np.empty((len(places), 2 * pad.grid))
+    """(Q, C) signals of footprints, of SIZES[size]."""
+    given = np.empty((len(places), pad.layout.fibres))
     for index, sides in enumerate(FOOTPRINTS.values()):
         for each, radius in enumerate(SIZES):
             own = (shape == index) & (size == each)
@@ -164,8 +164,8 @@ def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], state
                     "guessed_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
                     "worst": shapes[worst],
                     "worst_percent": float(100 * share[worst]),
-                    "place_mm": float(errors["unknown"] * pad.pitch_mm),
-                    "place_shape_known_mm": float(errors["known"] * pad.pitch_mm),
+                    "place_mm": float(errors["unknown"] * pad.unit_mm),
+                    "place_shape_known_mm": float(errors["known"] * pad.unit_mm),
                 }
             )
             confusions.append({"pad": label, "shapes": of, "names": list(shapes), "counts": counts.tolist()})

@@ -12,6 +12,7 @@ from design.common.figures import CURVES, INK, draw_confusions, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
+from design.settings import between_fibres
 from sense.recordings.processing.limits import Array
 from sense.studies.indentation.force import COUNTS, readings
 from sense.studies.pads import described
@@ -103,7 +104,9 @@ def _counted(pad: Morphology, presses: int, test: int, members: int, hidden: int
 
 def _drawn(pad: Morphology, count: int, contacts: int, rng: np.random.Generator) -> Array:
     """(count, contacts, 2) places."""
-    return fresh_presses(pad.grid, count * contacts, int(rng.integers(2**32))).reshape(count, contacts, 2)
+    return fresh_presses(between_fibres(pad.layout), count * contacts, int(rng.integers(2**32))).reshape(
+        count, contacts, 2
+    )
 
 
 def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> Findings:
@@ -116,16 +119,16 @@ def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], state
             off = unordered_distances(**pair)
             half = np.linalg.norm(pair["pressed"][:, 0] - pair["pressed"][:, 1], axis=1) / 2
             as_drawn = np.linalg.norm(pair["found"] - pair["pressed"], axis=2).mean()
-            curve = _by_distance(off * pad.pitch_mm, 2 * half * pad.pitch_mm)
+            curve = _by_distance(off * pad.unit_mm, 2 * half * pad.unit_mm)
             rows.append(
                 {
                     "pad": label,
                     "way": way,
                     "error_grid": float(off.mean()),
-                    "error_mm": float(off.mean() * pad.pitch_mm),
+                    "error_mm": float(off.mean() * pad.unit_mm),
                     "of_fixed_labels": float(off.mean() / labelled),
-                    "error_by_labels_mm": float(as_drawn * pad.pitch_mm) if way == LABELLED else None,
-                    "midpoint_named_mm": float(half.mean() * pad.pitch_mm),
+                    "error_by_labels_mm": float(as_drawn * pad.unit_mm) if way == LABELLED else None,
+                    "midpoint_named_mm": float(half.mean() * pad.unit_mm),
                     "told_apart_from_mm": _told_apart_from(curve),
                     "accuracy_percent": None,
                     "guessed_percent": None,
@@ -168,7 +171,7 @@ def _told_apart_from(curve: Mapping[str, list[float]]) -> float | None:
 
 def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     text = [
-        "Two contacts press at once, each anywhere over 1..M grid units, and their signals add, without noise. "
+        "Two contacts press at once, each anywhere between the outermost fibres, and their signals add, without noise. "
         f"Networks of {settings['hidden']} neurons, of which the mean of {settings['members']} is taken, learnt from "
         f"{settings['presses']} pairs in at most {settings['epochs']} steps and were tested on {settings['test']} "
         "others. An error is the mean distance of both contacts, taken in the order of the two that makes it less. "

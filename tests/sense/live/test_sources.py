@@ -130,7 +130,8 @@ def test_the_simulated_pad_is_that_of_the_model(model: Path, tmp_path: Path) -> 
         (start["source"] | {"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
         (start["source"] | {"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
         (start["source"] | {"morphology": {}}, "no pad that can be simulated"),
-        (start["source"] | {"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "knots"),
+        (start["source"] | {"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "there are 1 fibres"),
+        (start["source"] | {"morphology": {"pitch_mm": 1, "knots": [[1, 2], [3, 4]]}}, "knots"),
     ):
         (tmp_path / "recording" / "start.json").write_text(json.dumps(start | {"source": source}))
         with pytest.raises(InputError, match=message):

@@ -3,6 +3,7 @@ import pytest
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
+from design.settings import PadSettings
 from sense.recordings.press_plan import PressPlan, planned, read_plan
 from sense.settings import RigSettings
 
@@ -52,10 +53,12 @@ def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row
 def test_plans_keep_to_what_is_pressed_of_the_pad():
     for kind, presses in (("uniform", 500), ("adaptive", 500), ("grid", 9), ("boustrophedon", 9)):
         rig = RigSettings(presses=presses, plan=kind)
-        places = planned(PAD, rig, np.random.default_rng(0), (50.0, 8.0)).places_mm
+        places = planned(PAD, rig, np.random.default_rng(0), PadSettings(sensed_mm=(50.0, 8.0))).places_mm
         np.testing.assert_allclose(np.abs(places).max(axis=0), [25, 4], rtol=0.02)
         assert (np.abs(places) <= [25.001, 4.001]).all()
-    between = planned(PAD, RigSettings(presses=9, plan="grid"), np.random.default_rng(0), "fibres").places_mm
+    between = planned(
+        PAD, RigSettings(presses=9, plan="grid"), np.random.default_rng(0), PadSettings(sensed_mm="fibres")
+    ).places_mm
     assert np.abs(between).max() == 1.5 * 11.25
 
 

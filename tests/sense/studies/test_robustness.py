@@ -137,3 +137,12 @@ def test_a_pad_that_no_press_touches_is_studied_all_the_same(tmp_path: Path) -> 
     document = run(least(PADS, test=300, contact=Contact(radius=1e-6)), tmp_path)
     # Nothing is told, so the middle of the pad is the best guess: half a grid unit off each way at most.
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
+
+
+def test_maps_are_as_wide_and_high_as_what_is_pressed(tmp_path: Path) -> None:
+    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
+    pad = Morphology.straight((3, 2), (8.0, 15.0))
+    document = run(robustness_study({"tall": pad}, lost=0, hidden=4, presses=16, test=10), tmp_path)
+    left, right, low, high = document["maps"][0]["extent"]
+    assert ((right - left) * pad.unit_mm, (high - low) * pad.unit_mm) == pytest.approx((8, 30))
+    assert document["rows"][0]["mean_mm"] == pytest.approx(document["rows"][0]["mean"] * np.sqrt(8 * 15))

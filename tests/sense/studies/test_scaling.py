@@ -41,10 +41,15 @@ def test_what_is_around_a_press_is_the_same_in_every_tile() -> None:
 
 
 def test_presses_are_spread_over_all_cells() -> None:
-    places = spread_presses(9, 8, 0)
+    places = spread_presses(((1, 1), (9, 9)), 8, 0)
     assert set(map(tuple, np.floor(places - 1).astype(int))) == {(x, y) for x in range(8) for y in range(8)}
 
 
 def test_a_grid_that_tiles_do_not_fill_is_refused() -> None:
     with pytest.raises(InputError, match="grids has 6, expected multiples of 4"):
         scaling_study({"square": Morphology.straight(4)}, grids=(4, 6))
+
+
+def test_a_tile_that_is_no_square_is_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"wide has 1 \+ 2 fibres, pitch 8 mm, expected tiles of M \+ M fibres"):
+        scaling_study({"wide": Morphology.straight((1, 2), 8.0)}, grids=(4,))

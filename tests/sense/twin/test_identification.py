@@ -8,10 +8,12 @@ import pytest
 
 from design import InputError, Morphology
 from design.pad.twin import Twin
+from design.settings import PadSettings
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate
 from sense.report.identification_results import identification_lines
 from sense.settings import RigSettings
+from sense.twin import identification, wiring
 from sense.twin.benchmark import printed_pad
 from sense.twin.identification import identify
 from sense.twin.identified_pad import Identification
@@ -141,3 +143,24 @@ def test_how_the_pad_lay_counts_what_rig_had_said_of_it(found: bool, told: bool 
     assert f"laid {side}, turned 0.0 degrees, shifted 0.0, 0.0 mm, scale 1.000" in identification_lines(
         document, Path()
     )
+
+
+def test_a_rectangle_is_identified_whichever_way_it_lay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turned by a quarter, presses span its height where its width was planned."""
+    monkeypatch.setattr(identification, "TRIED", 2)
+    monkeypatch.setattr(wiring, "REFINED", 6)
+    plan = Morphology.random((1, 2), 3, 3, (8.0, 12.0))
+    printed = printed_pad(plan, np.random.default_rng(1), laid_mm=0.2, dead=0)
+    lying = replace(printed, frame=replace(printed.frame, turn_deg=93.0))
+    found = identify(simulate(lying, RigSettings(presses=150, seed=3)), plan, seed=1).twin()
+    assert [channel.fibre for channel in found.channels] == [channel.fibre for channel in lying.channels]
+    assert found.frame.mirrored
+    assert found.frame.turn_deg == pytest.approx(93.0, abs=5)
+    assert found.frame.shift_mm == pytest.approx(lying.frame.shift_mm, abs=1.5)
+
+
+def test_presses_must_span_half_of_a_rectangle_each_way() -> None:
+    plan = Morphology.straight((1, 3), (8.0, 12.0))
+    narrow = PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
+    with pytest.raises(InputError, match="allowed is what spans 12 x 6 mm"):
+        identify(simulate(plan, RigSettings(presses=80), size=narrow), plan)

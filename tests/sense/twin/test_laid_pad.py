@@ -56,7 +56,7 @@ def test_what_all_fibres_share_of_their_way_is_the_frames(pad):
     settled = off.settled()
     assert np.abs(settled.own[:, AWAY]).max() < 1e-6
     assert settled.predict(PLACES) == pytest.approx(off.predict(PLACES), abs=1e-9)
-    assert settled.frame.shift_mm == pytest.approx([1.0 - 0.2 * PLAN.pitch_mm, -2.0 + 0.1 * PLAN.pitch_mm], abs=0.5)
+    assert settled.frame.shift_mm == pytest.approx([1.0 - 0.2 * PLAN.unit_mm, -2.0 + 0.1 * PLAN.unit_mm], abs=0.5)
 
 
 def test_a_turn_that_all_fibres_share_is_the_frames(pad):

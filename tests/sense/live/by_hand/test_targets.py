@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 
 from design import Contact, Morphology
 from design.common.errors import InputError
+from design.settings import PadSettings
 from sense.live.by_hand.targets import ROUND, in_rounds, still_to_make, targets_of
 from sense.rig.planning.setup import Setup
 from sense.settings import RigSettings
@@ -46,3 +48,11 @@ def test_what_is_still_to_make_is_counted_place_by_place() -> None:
     targets = np.array([[1.0, 1], [2, 2], [1, 1], [3, 3]])
     assert still_to_make(targets, np.array([[1.0, 1], [np.nan, np.nan], [3, 3]])).tolist() == [[2, 2], [1, 1]]
     assert still_to_make(targets, targets).shape == (0, 2)
+
+
+def test_whole_millimetres_do_not_lie_in_a_hole() -> None:
+    hole = ((-4.6, -20.0), (4.6, -20.0), (4.6, 20.0), (-4.6, 20.0))
+    places = targets_of(replace(setup(presses=400), size=PadSettings(keep_out_mm=(hole,))))
+    assert len(places) == 400
+    assert not ((np.abs(places) < [4.6, 20.0]).all(axis=1)).any()
+    assert (places == np.rint(places)).mean() > 0.9

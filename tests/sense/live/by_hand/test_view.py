@@ -21,7 +21,7 @@ VIEW = {
 def test_the_pad_is_shown_as_it_is_planned() -> None:
     pad = Morphology.random(2, knots=3, seed=1)
     view = json.loads(json.dumps(pad_view(pad, "out/hand")))
-    assert view["half_mm"] == pad.size_mm / 2
+    assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
     assert len(view["courses"]) == 4
     ends = np.array([[course[0], course[-1]] for course in view["courses"]])
     np.testing.assert_allclose(ends, pad.to_mm(pad.knots[:, [0, -1]]), atol=0.051)
@@ -47,3 +47,11 @@ def test_with_its_tracks_up_the_pad_is_shown_as_it_lies() -> None:
     assert [row[::-1] for row in lying[3 : 3 + ROWS]] == plain[3 : 3 + ROWS]
     assert lying[0] == plain[0]
     assert pad_view(pad, "hand", True)["courses"] == pad_view(pad, "hand")["courses"]
+
+
+def test_a_map_of_a_rectangle_is_as_wide_and_high_as_the_pad() -> None:
+    pad = Morphology.straight((1, 5), 8.0)  # 48 mm wide and 16 mm high
+    lines = view_lines(pad_view(pad, "hand") | VIEW | {"target": (24.0, 8.0), "refused": (-24.0, -8.0)})
+    edges = [row for row, line in enumerate(lines) if line.startswith("+")]
+    assert (len(lines[edges[0]]), edges[1] - edges[0] - 1) == (COLUMNS + 2, ROWS // 3)
+    assert (lines[edges[0] + 1][COLUMNS], lines[edges[1] - 1][1]) == ("O", "x")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from design import InputError, Morphology, signals, signals_quantized
-from design.settings import PUBLISHED_CONTACT
+from design.settings import PUBLISHED_CONTACT, PadSettings
 from sense import RigSettings, simulate
 from sense.recordings.simulation.pad_model import (
     ADC_STEPS,
@@ -45,13 +45,13 @@ def test_it_has_the_published_form() -> None:
 
 
 def test_presses_keep_to_what_is_sensed_and_the_recording_says_what_that_is() -> None:
-    places = simulate(PAD, RigSettings(presses=400), sensed_mm=(50, 8)).presses_mm
+    places = simulate(PAD, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8))).presses_mm
     assert (np.abs(places) <= [25.001, 4.001]).all()
     np.testing.assert_allclose(np.abs(places).max(axis=0), [25, 4], rtol=0.02)
-    assert simulate(PAD, RigSettings(presses=1), sensed_mm=(50, 8)).source["sensed_mm"] == [50, 8]
+    assert simulate(PAD, RigSettings(presses=1), size=PadSettings(sensed_mm=(50, 8))).source["sensed_mm"] == [50, 8]
     assert simulate(PAD, RigSettings(presses=1)).source["sensed_mm"] == "beyond"
     with pytest.raises(InputError, match=r"sensed_mm: got .*the pad itself is 56\.25 mm"):
-        simulate(PAD, RigSettings(presses=1), sensed_mm=(57, 8))
+        simulate(PAD, RigSettings(presses=1), size=PadSettings(sensed_mm=(57, 8)))
 
 
 def test_touched_fibres_answer_and_others_do_not() -> None:

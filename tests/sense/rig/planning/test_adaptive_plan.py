@@ -52,7 +52,9 @@ def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
     small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=60, lost=0)
     localizer, _ = calibrate(Recording.open(tmp_path / "known"), small)
     with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
-        steering = Steering(localizer, tmp_path / "run", np.random.default_rng(5))
+        steering = Steering(
+            localizer, tmp_path / "run", np.random.default_rng(5), lambda places_mm: np.ones(len(places_mm), bool)
+        )
         Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(plan, steer=steering)
     made = Recording.open(tmp_path / "run").presses_mm
     assert np.array_equal(made[:EVERY], plan.places_mm[:EVERY])

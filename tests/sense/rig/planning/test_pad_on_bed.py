@@ -30,7 +30,7 @@ def folder(tmp_path_factory) -> Path:
 def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
     rig = on_bed(RIG, folder)
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
-    half = PAD.size_mm / 2
+    half = PAD.layout.size_mm[0] / 2
     assert rig.box_mm == pytest.approx((100 - half, 100 + half, 90 - half, 90 + half, 3.0, 130.0), abs=1e-5)
     require_safe_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
 
@@ -53,7 +53,7 @@ def test_what_rig_says_counts_more(folder):
     rig = on_bed(said, folder)
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg) == ((50.0, 60.0), 9.0, 90.0)
     assert rig.box_mm is not None
-    assert rig.box_mm[0] == 50 - PAD.size_mm / 2
+    assert rig.box_mm[0] == 50 - PAD.layout.size_mm[0] / 2
     everything = rig.model_copy(update={"tcp_mm": None})
     assert on_bed(everything, folder / "nowhere") is everything
 
@@ -99,4 +99,19 @@ def test_a_damaged_side_is_named(folder, tmp_path):
     document["frame"]["mirrored"] = "up"
     (tmp_path / "fabrication.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match="mirrored of frame is 'up', expected true or false"):
+        on_bed(RIG, tmp_path)
+
+
+@pytest.mark.parametrize(("angle_deg", "halves"), [(0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))])
+def test_the_workspace_over_a_rectangle_is_as_wide_and_high_as_that(tmp_path, angle_deg, halves):
+    frame = {"bed_mm": [200, 180, 150], "centre_mm": [100, 90], "angle_deg": angle_deg, "mirrored": True}
+    frame |= {"pad_mm": [60.0, 20.0], "surface_mm": 8, "walls_mm": 3}
+    document = {"format": "padforge-fabrication/1", "frame": frame}
+    (tmp_path / "fabrication.json").write_text(json.dumps(document))
+    (right, top), box = halves, on_bed(RIG, tmp_path).box_mm
+    assert box is not None
+    assert box[:4] == (100 - right, 100 + right, 90 - top, 90 + top)
+    frame["pad_mm"] = [60.0, 20.0, 5.0]
+    (tmp_path / "fabrication.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="frame has no pad_mm, expected 2 finite numbers"):
         on_bed(RIG, tmp_path)

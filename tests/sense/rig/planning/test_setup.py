@@ -9,7 +9,7 @@ import pytest
 
 from design.common.errors import InputError
 from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT
+from design.settings import PUBLISHED_CONTACT, PadSettings
 from sense.recordings.press_plan import planned
 from sense.recordings.recorder import START
 from sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
@@ -38,6 +38,20 @@ def test_a_resumed_recording_keeps_its_plan(tmp_path):
     first = plan_of(setup(tmp_path / "run"), RIG, resume=True)
     other = RIG.model_copy(update={"seed": 9, "presses": 3})
     assert plan_of(setup(tmp_path / "run"), other, resume=True).document() == first.document()
+
+
+def test_a_recording_of_a_rectangle_is_resumed_but_for_holes_that_were_made_since(tmp_path):
+    pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
+    plan = planned(pad, RIG, np.random.default_rng(0))
+    with recorder_of(setup(tmp_path, pad), RIG, plan, tmp_path, False, DEVICES):
+        pass
+    assert plan_of(setup(tmp_path, pad), RIG, resume=True).document() == plan.document()
+    with pytest.raises(InputError, match="another pad"):
+        plan_of(setup(tmp_path, Morphology.straight((1, 3), (8.0, 15.0))), RIG, resume=True)
+    x, y = plan.places_mm[1].tolist()
+    hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
+    with pytest.raises(InputError, match=r"press 2, at .* lies in a keep-out"):
+        plan_of(replace(setup(tmp_path, pad), size=PadSettings(keep_out_mm=(hole,))), RIG, resume=True)
 
 
 def test_it_is_told_where_other_presses_are_asked_for_than_the_plan_has(tmp_path):
