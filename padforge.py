@@ -22,6 +22,7 @@ import design
 import fabricate
 import sense
 from design.benchmarking.cli import bench_command
+from design.cli import compare_command
 from design.cli import design as design_group
 from design.common.command_line import (
     INTERRUPTED,
@@ -32,8 +33,9 @@ from design.common.command_line import (
     seed_option,
     spec_option,
 )
-from design.common.errors import InputError
+from design.common.errors import Fault, InputError
 from fabricate.cli import fabricate as fabricate_group
+from fabricate.cli import mould_costs
 from sense.cli.main import sense as sense_group
 from sense.studies.cli import study as study_group
 
@@ -130,6 +132,7 @@ def cli(context: click.Context) -> None:
 
 for group in (design_group, fabricate_group, sense_group, study_group, bench_command(BENCHES)):
     cli.add_command(group)
+design_group.add_command(compare_command(mould_costs))
 
 
 @cli.command("init")
@@ -206,7 +209,7 @@ def _check_ahead(spec: "Spec", out: Path) -> None:
 
     for model in _sections().values():
         spec.section(model)
-    FabricationSettings.from_spec(spec).require_consistent(spec.section(PadSettings).pitch_mm)
+    FabricationSettings.from_spec(spec).require_consistent(spec.section(PadSettings).layout)
     learning = spec.section(LocalizerSettings)
     split_presses(spec.section(RigSettings).presses, learning.split, learning.test_share, np.random.default_rng(0))
     refuse_replacing(out / "recording")
@@ -249,11 +252,12 @@ def write_report(folder: Path) -> Path:
 
     Raises:
         InputError: no stage has left anything, or a file is damaged.
+        Fault: there are files of another pad among them, which the page tells first.
     """
-    from design.common.files import as_written, read_json, write_text
+    from design.common.files import as_written, write_text
     from design.common.page.elements import PageSection, page
     from design.report.contact_section import contact_sections
-    from design.report.sections import design_sections, provenance_row, provenance_section
+    from design.report.sections import design_sections, provenance_row, provenance_section, stage_pages
     from fabricate.report.sections import fabrication_sections
     from sense.report import sections as sensed
     from sense.report.identification_results import identification_sections
@@ -267,14 +271,7 @@ def write_report(folder: Path) -> Path:
         ("fibre-loss", folder / "fibre_loss.json", sensed.fibre_loss_sections),
         ("contacts", folder / "contacts.json", contact_sections),
     )
-    sections: list[PageSection] = []
-    origins: list[list[object]] = []
-    for name, path, made_of in stages:
-        if path.exists():
-            document = read_json(path, f"padforge-{name}/1")
-            with as_written(path):
-                sections += made_of(folder, document)
-                origins.append(provenance_row(folder, name, document))
+    sections, origins, strange = stage_pages(folder, stages)
     studies: list[str] = []
     for path, document in sensed.find_studies(folder):
         with as_written(path):
@@ -287,6 +284,8 @@ def write_report(folder: Path) -> Path:
     lead = "Fibres, mould and calibration of one soft strain-sensor pad."
     title = f"Pad report: {folder.resolve().name}"
     write_text(folder / "report.html", page(title, lead, [*sections, provenance_section(origins)]))
+    if strange:
+        raise Fault(f"{folder / 'report.html'}: {'; '.join(strange)}")
     return folder / "report.html"
 
 
