@@ -157,13 +157,14 @@ def _closeness(near: Tensor, gap: float) -> Tensor:
 
 def _disorder(travel: Tensor, cross: Tensor, least: float, layout: Layout) -> Tensor:
     """How much less than `least` a fibre lies above its lower neighbour in the family, as a share of it."""
-    above = []
-    for rows, extent in zip(layout.families, layout.extent, strict=True):
-        at = torch.linspace(0, extent, math.ceil(ORDER_PER_UNIT * extent) + 1, dtype=torch.float64)
-        if rows.stop - rows.start > 1:
-            above.append(pchip_sample(travel[rows], cross[rows], at)[0].diff(dim=0).flatten())
-    apart = torch.cat(above)
-    return _closeness(apart, least) / apart.numel()
+    points = math.ceil(ORDER_PER_UNIT * max(layout.extent)) + 1
+    along = [
+        torch.linspace(0, extent, points, dtype=torch.float64).expand(count, -1)
+        for extent, count in zip(layout.extent, layout.counts, strict=True)
+    ]
+    above = pchip_sample(travel, cross, torch.cat(along))[0].diff(dim=0)
+    within = [row for rows in layout.families for row in range(rows.start, rows.stop - 1)]
+    return _closeness(above[within], least) / (len(within) * points)
 
 
 def _too_many(count: Tensor, limit: float) -> Tensor:
