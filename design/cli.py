@@ -13,6 +13,7 @@ from design.common.command_line import (
     out_option,
     pad_folder,
     profile_option,
+    scheduler_option,
     seed_option,
     show_result,
     spec_option,
@@ -39,7 +40,7 @@ twin_option = click.option(
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Where presses are told apart.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="End with the best after S seconds.")
 @click.option("--resume", is_flag=True, help="Go on where a search into the same folder was broken off.")
-@click.option("--scheduler", metavar="ADDRESS", help="Run the starts on a Dask cluster, which is trusted wholly.")
+@scheduler_option
 @seed_option
 @out_option("out/pad")
 @json_option

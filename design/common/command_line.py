@@ -25,6 +25,9 @@ spec_option = click.option(
     type=click.Path(dir_okay=False, path_type=Path),
     help="Settings file (default: pad.toml in the current folder, if there is one).",
 )
+scheduler_option = click.option(
+    "--scheduler", metavar="ADDRESS", help="Work on a Dask cluster, trusted wholly: what it sends runs here."
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice (default: that of the settings, 0)."

@@ -45,11 +45,13 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             names: tuple[str, ...],
             seed: int | None,
             jobs: int | None,
+            scheduler: str | None,
             resume: bool,
             out: Path,
             as_json: bool,
             **options: Any,
         ) -> None:
+            from design.common.computing import cluster
             from design.common.files import refuse_unwritable
 
             from .study import run, study_lines
@@ -63,7 +65,8 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
                     bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
 
                 try:
-                    document = run(made, out, jobs=jobs, resume=resume, progress=report)
+                    with cluster(scheduler) as executor:
+                        document = run(made, out, jobs=jobs, executor=executor, resume=resume, progress=report)
                 except KeyboardInterrupt:
                     bar.stop()
                     print("padforge: interrupted; --resume goes on from what was finished", file=sys.stderr, flush=True)
@@ -75,6 +78,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             click.argument("names", metavar=f"[{of}]...", nargs=-1),
             common.seed_option,
             click.option("--jobs", type=click.IntRange(1, 256), help="Tasks at once (default: one a core)."),
+            common.scheduler_option,
             click.option("--resume", is_flag=True, help="Go on where a study into the same folder was broken off."),
             common.out_option("out/study"),
             common.json_option,

@@ -3,10 +3,11 @@
 import csv
 import hashlib
 import io
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,7 @@ def run(
     out: Path,
     *,
     jobs: int | None = None,
+    executor: Executor | None = None,
     resume: bool = False,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, Any]:
@@ -78,7 +80,9 @@ def run(
     Results of tasks are kept in `out` until all are done.
 
     Args:
-        out: folder. jobs: tasks at once; as many as there are cores if None. resume: whether to go on from tasks that
+        out: folder. jobs: tasks at once; as many as there are cores, or as the executor has it, if None.
+        executor: of the `concurrent.futures` kind, such as a cluster's; the threads of this machine if None.
+        resume: whether to go on from tasks that
             an earlier run into the same folder has done; else they are thrown away.
         progress: called with (tasks done, tasks in all, the last one's name).
 
@@ -97,7 +101,7 @@ def run(
     order = hashlib.sha256("\n".join(task.name for task in study.tasks).encode()).hexdigest()[:16]
     with _alone(out, study.name):
         kept = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
-        findings = study.conclude(_done(study.tasks, kept, jobs or os.cpu_count() or 1, resume, progress))
+        findings = study.conclude(_done(study.tasks, kept, (executor, jobs), resume, progress))
         document = _document(study, findings)
         with staged(out) as folder:
             save_figure(study.draw(document), folder / f"{study.name}.png")
@@ -136,18 +140,28 @@ def _document(study: Study, findings: Findings) -> dict[str, Any]:
 
 
 def _done(
-    tasks: Sequence[Task], kept: Checkpoints, jobs: int, resume: bool, progress: Callable[[int, int, str], None]
+    tasks: Sequence[Task],
+    kept: Checkpoints,
+    on: tuple[Executor | None, int | None],
+    resume: bool,
+    progress: Callable[[int, int, str], None],
 ) -> list[State]:
-    """The results of all tasks, those that are kept not made again."""
+    """The results of all tasks, by so many at once on an executor, those that are kept not made again."""
+    executor, jobs = on
     states = kept.begin(resume)
     progress(len(states), len(tasks), "")
-    missing = [(number, task.make) for number, task in enumerate(tasks) if number not in states]
-    with one_torch_thread():
-        for number, state in run_tasks(missing, at_once=jobs):
-            states[number] = state
-            kept.save(number, state)
-            progress(len(states), len(tasks), tasks[number].name)
+    missing = [(number, partial(_made, task.make)) for number, task in enumerate(tasks) if number not in states]
+    for number, state in run_tasks(missing, executor, at_once=jobs):
+        states[number] = state
+        kept.save(number, state)
+        progress(len(states), len(tasks), tasks[number].name)
     return [states[number] for number in range(len(tasks))]
+
+
+def _made(make: Callable[[], State]) -> State:
+    """A task's result, wherever it is made."""
+    with one_torch_thread():
+        return make()
 
 
 def table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:

@@ -2,8 +2,12 @@
 
 import csv
 import json
+import os
+import signal
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -103,6 +107,29 @@ def test_a_study_broken_off_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     assert done[0] >= 2
     assert again == whole
     assert (tmp_path / "whole" / "robustness.png").read_bytes() == (tmp_path / "broken" / "robustness.png").read_bytes()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_loses_a_worker_finds_the_same(tmp_path: Path) -> None:
+    """Its only one: another is started in its place, and goes on."""
+    distributed = pytest.importorskip("distributed")
+    study = least({"a": Morphology.straight(1), "b": Morphology.random(1, 1)})
+    here = run(study, tmp_path / "here")
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        victim = next(iter(client.run(os.getpid).values()))
+
+        def progress(done: int, total: int, name: str) -> None:
+            if done == 1:
+                os.kill(victim, signal.SIGKILL)
+
+        executor = client.get_executor(pure=False, retries=10)
+        there = run(study, tmp_path / "there", executor=cast(Executor, executor), progress=progress)
+        with pytest.raises(ProcessLookupError):
+            os.kill(victim, 0)
+    assert there["rows"] == here["rows"]
 
 
 def test_pads_in_another_order_are_another_study(tmp_path: Path) -> None:
