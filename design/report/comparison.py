@@ -4,7 +4,7 @@ import itertools
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from design.pad.courses.curves import crossings, lengths
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
+from .contact_section import contact_of
 from .files import run_search
 
 if TYPE_CHECKING:
@@ -42,6 +43,11 @@ class Variant:
     name: str
     spec: Spec
     pad: Morphology | None = None
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder that it goes to."""
+        return re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
 
 
 def variants(sources: Sequence[Path], vary: Sequence[str], load: Callable[[Path | None], Spec]) -> list[Variant]:
@@ -68,9 +74,9 @@ def variants(sources: Sequence[Path], vary: Sequence[str], load: Callable[[Path 
                 tables.setdefault(section, {})[key] = value
             said = [f"{key} {str(value).strip('()').replace(', ', ' x ')}" for _, key, value in chosen]
             found.append(Variant(", ".join([name, *said] if name else said) or "defaults", spec.replaced(tables)))
-    names = [variant.name for variant in found]
-    if len(set(names)) < len(names):
-        raise InputError(f"{next(name for name in names if names.count(name) > 1)}: one of this name is there already")
+    folders = [variant.folder for variant in found]
+    if len(set(folders)) < len(folders):
+        raise InputError(f"{max(folders, key=folders.count)}: one of this name is there already, expected each once")
     if not 2 <= len(found) <= MOST_VARIANTS:
         raise InputError(f"these are {len(found)} pads to compare, allowed are 2 to {MOST_VARIANTS}")
     for variant in found:  # before minutes are spent on another
@@ -101,18 +107,24 @@ def compare(pads: Sequence[Variant], out: Path, run: SearchRun, seed: int | None
     fibres of the same layout (`errors_by_contact`).
 
     Args:
-        run: how each search runs; resumed, designs that are done are not searched again.
+        run: how each search runs.
         seed: of searches, noise and networks; that of `[search]` if None.
 
     Returns:
         The document: a row a variant, with errors in mm by 0, 1, ... lost fibres.
+
+    Raises:
+        KeyboardInterrupt: a search was interrupted; the pads before it are in their folders.
     """
     rows = []
     for variant in pads:
-        folder = out / re.sub(r"[^\w.+-]+", "-", variant.name)
+        folder = out / variant.folder
         pad = variant.pad
         if pad is None:
-            pad = run_search(variant.spec, folder, {"seed": seed}, run=replace(run))[1].morphology
+            found = run_search(variant.spec, folder, {"seed": seed}, run=run)[1]
+            if found.stopped == "interrupted":
+                raise KeyboardInterrupt  # of all of it, not of this search alone
+            pad = found.morphology
         rows.append(_row(variant, pad, seed) | dict(making(pad, variant.spec, folder)))
     made_by = provenance("padforge design compare", seed or 0, packages=("torch",))
     document = {"format": FORMAT, "noise": NOISE, "rows": rows, "provenance": made_by}
@@ -124,7 +136,7 @@ def compare(pads: Sequence[Variant], out: Path, run: SearchRun, seed: int | None
 def _row(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
     settings = variant.spec.section(SearchSettings, seed=seed)
     size = variant.spec.section(PadSettings, **pad.layout.settings)
-    contact = variant.spec.section(Contact) if variant.spec.given(Contact) else settings.usual_contact
+    contact = contact_of(variant.spec, settings)
     with stage("compare"):
         found = errors_by_contact(pad, {"believed": contact}, size.sensed_mm, settings.seed)
     errors = {each.pad: [pad.unit_mm * error.mean for error in each.errors] for each in found}

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 
+def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:
+    """What is designed for: the contact that `spec` states, or the usual one of such a search."""
+    return spec.section(Contact) if spec.given(Contact) else settings.usual_contact
+
+
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
     """Errors of a pad and of straight fibres under the contact of `spec` and others, into `contacts.json` in `out`.
 
@@ -29,7 +34,7 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
 
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)
-    believed = spec.section(Contact) if spec.given(Contact) else settings.usual_contact
+    believed = contact_of(spec, settings)
     with stage("contacts"):
         found = errors_by_contact(pad, contacts_in_question(believed), size.sensed_mm, settings.seed)
     rows = [

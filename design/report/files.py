@@ -15,6 +15,7 @@ from design.optimisers.search import SearchResult, SearchRun, search
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
+from .contact_section import contact_of
 from .plan_drawing import draw_plan
 from .twin_settings import settings_for_twin
 
@@ -43,7 +44,7 @@ def run_search(
         twin: a `twin.json`, for whose reach, noise and sensed rectangle to search.
     """
     spec, inputs = (spec, []) if twin is None else (settings_for_twin(spec, twin), [twin])
-    pad, contact, rules = spec.section(PadSettings), spec.section(Contact), spec.section(RulesSettings)
+    pad, rules = spec.section(PadSettings), spec.section(RulesSettings)
     begin = None
     if origin == "straight":
         begin = Morphology.straight(pad.layout)
@@ -51,7 +52,7 @@ def run_search(
         begin, inputs = Morphology.load(origin), [*inputs, Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
-    contact = contact if spec.given(Contact) else settings.usual_contact
+    contact = contact_of(spec, settings)
     with progress() as bar:
         run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
         result = search(pad, contact, settings, rules, origin=begin, run=run)

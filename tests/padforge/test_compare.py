@@ -1,10 +1,12 @@
 """`padforge design compare`: which pad to make."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
-from design import Morphology
+from design import Morphology, Spec
+from design.report import comparison
 from tests.padforge.program import called
 
 
@@ -40,6 +42,27 @@ def test_values_in_turn_are_designed_each_in_its_folder(tmp_path):
     assert "1 lost (mm)" in result.out
     pad = Morphology.load(tmp_path / "c" / folders[2] / "morphology.json")
     assert (pad.layout.counts, pad.pitch_mm) == ((2, 2), (8.0, 12.0))
+
+
+def test_no_two_pads_share_a_folder_and_none_leaves_that_of_the_comparison(tmp_path):
+    for name in ("a b.json", "a-b.json"):
+        Morphology.straight(1).save(tmp_path / name)
+    result = called("design", "compare", "a b.json", "a-b.json", cwd=tmp_path)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "a-b: one of this name" in result.err
+    assert comparison.Variant("..", Spec({})).folder == "pad"
+
+
+def test_ctrl_c_ends_the_comparison_and_not_one_search_alone(tmp_path, monkeypatch):
+    begun = []
+
+    def interrupted(spec, folder, *arguments, **options):
+        begun.append(folder)
+        return {}, SimpleNamespace(stopped="interrupted")
+
+    monkeypatch.setattr(comparison, "run_search", interrupted)
+    result = called("design", "compare", "--vary", "pad.grid=1,2", cwd=tmp_path)
+    assert (result.code, len(begun)) == (130, 1)
 
 
 @pytest.mark.parametrize(
