@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import BeforeValidator, Field, PlainSerializer, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from design.common.settings import Settings
+from design.common.settings import Settings, as_tuple, none_as
 
 PUBLISHED = "published"
 
@@ -82,15 +82,10 @@ PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
 Material = TypeVar("Material", Silicone, Fibre)
 
 
-def _of_preset(value: object) -> object:
-    value = None if value == "preset" else value
-    return tuple(value) if isinstance(value, list) else value
-
-
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^|\x00-\x1f]*$")]
 """One line, and a cell of a table."""
 Positive = Annotated[float, Field(gt=0, le=1e6)]
-OfPreset = BeforeValidator(_of_preset), PlainSerializer(lambda value: "preset" if value is None else value)
+OfPreset = BeforeValidator(as_tuple), *none_as("preset")
 """A key that is "preset" where it is not set, None in the model."""
 
 

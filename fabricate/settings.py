@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
 from design.common.errors import InputError, instance
-from design.common.settings import Settings, Spec
+from design.common.settings import Settings, Spec, as_tuple, none_as
 from design.settings import Layout, PadSettings, RulesSettings
 
 from .materials import FibreSettings, SiliconeSettings
@@ -84,17 +84,15 @@ class PrinterSettings(Settings):
         return round(layers) > 0 and abs(layers - round(layers)) <= 1e-6
 
 
-def _tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
-Place = Annotated[tuple[Coordinate, Coordinate], BeforeValidator(_tuple)]
-Box = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(_tuple)]
+Place = Annotated[tuple[Coordinate, Coordinate], BeforeValidator(as_tuple)]
+Box = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(as_tuple)
+]
 Pose = Annotated[
     tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | None,
-    BeforeValidator(lambda value: None if value == "unknown" else _tuple(value)),
-    PlainSerializer(lambda pose: "unknown" if pose is None else pose),
+    BeforeValidator(as_tuple),
+    *none_as("unknown"),
 ]
 
 

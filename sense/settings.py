@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from design.common.errors import InputError
-from design.common.settings import Settings
+from design.common.settings import Settings, as_tuple, none_as
 
 Features = Literal["full", "causal", "early", "published"]
 Method = Literal["masked", "published"]
@@ -16,26 +16,13 @@ Split = Literal["random", "chronological"]
 PLANS = ("uniform", "grid", "boustrophedon", "adaptive")
 
 
-def _unknown(value: object) -> object:
-    return None if value == "unknown" else value
-
-
-def _unwatched(value: object) -> object:
-    return None if value == "unwatched" else value
-
-
-def _tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
 def _plan(value: str) -> str:
     if value not in PLANS and not value.lower().endswith(".csv"):
         raise PydanticCustomError("plan", "expected uniform, grid, boustrophedon, adaptive or a .csv file of places")
     return value
 
 
-Unknown = PlainSerializer(lambda value: "unknown" if value is None else value)
-Unwatched = PlainSerializer(lambda value: "unwatched" if value is None else value)
+Unknown, Unwatched = none_as("unknown"), none_as("unwatched")
 Millimetres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Depth = Annotated[float, Field(gt=0, le=50)]
@@ -70,7 +57,7 @@ class RigSettings(Settings):
         default=40, ge=8, le=100_000, description="readings in the cycle of a press: down at its half, up at its end"
     )
     depth_mm: float = Field(default=5.0, gt=0, le=50, description="depth of a press, mm")
-    depths_mm: Annotated[tuple[Depth, ...], BeforeValidator(_tuple)] = Field(
+    depths_mm: Annotated[tuple[Depth, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="depths that presses take in turn, in place of depth_mm"
     )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the places and of the simulated pad")
@@ -83,48 +70,48 @@ class RigSettings(Settings):
     board: str = Field(default="due", min_length=1, max_length=100, description="what reads the fibres, by its name")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
     baud: int = Field(default=921_600, ge=9600, le=20_000_000, description="of a line board; USB boards take any")
-    printer_port: Annotated[
-        Annotated[str, Field(min_length=1, max_length=4096)] | None, BeforeValidator(_unknown), Unknown
-    ] = Field(default=None, description='serial port of the 3D printer, or "unknown"')
+    printer_port: Annotated[Annotated[str, Field(min_length=1, max_length=4096)] | None, *Unknown] = Field(
+        default=None, description='serial port of the 3D printer, or "unknown"'
+    )
     printer_baud: int = Field(
         default=115_200, ge=9600, le=2_000_000, description="speed of the 3D printer's port, baud"
     )
     converter_rate_hz: float = Field(
         default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz"
     )
-    channels: Annotated[tuple[Input, ...], BeforeValidator(_tuple)] = Field(
+    channels: Annotated[tuple[Input, ...], BeforeValidator(as_tuple)] = Field(
         default=(), max_length=512, description="input of the board that each fibre is on, from 0; [] in order"
     )
     box_mm: Annotated[
         tuple[Millimetres, Millimetres, Millimetres, Millimetres, Millimetres, Millimetres] | None,
-        BeforeValidator(lambda value: _tuple(_unknown(value))),
-        Unknown,
+        BeforeValidator(as_tuple),
+        *Unknown,
     ] = Field(default=None, description='workspace [x0, x1, y0, y1, z0, z1] in the base frame, or "unknown"')
-    contact_mm: Annotated[Millimetres | None, BeforeValidator(_unknown), Unknown] = Field(
+    contact_mm: Annotated[Millimetres | None, *Unknown] = Field(
         default=None, description='height of the pad\'s surface in the base frame, or "unknown"'
     )
-    pad_mm: Annotated[
-        tuple[Millimetres, Millimetres] | None, BeforeValidator(lambda value: _tuple(_unknown(value))), Unknown
-    ] = Field(default=None, description='the pad\'s centre [x, y] in the base frame, mm, or "unknown"')
+    pad_mm: Annotated[tuple[Millimetres, Millimetres] | None, BeforeValidator(as_tuple), *Unknown] = Field(
+        default=None, description='the pad\'s centre [x, y] in the base frame, mm, or "unknown"'
+    )
     pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="from the base's y axis to the pad's")
-    mirrored: Annotated[bool | None, BeforeValidator(_unknown), Unknown] = Field(
+    mirrored: Annotated[bool | None, *Unknown] = Field(
         default=None,
         description='tracks up, so that x runs the other way: true, false, or "unknown": a holder\'s, or false',
     )
-    tool_rad: Annotated[tuple[Angle, Angle, Angle], BeforeValidator(_tuple)] = Field(
+    tool_rad: Annotated[tuple[Angle, Angle, Angle], BeforeValidator(as_tuple)] = Field(
         default=(0.0, 3.141592653589793, 0.0), description="rotation vector of the tool, pointing down, radians"
     )
     tcp_mm: Annotated[
         tuple[Millimetres, Millimetres, Millimetres] | None,
-        BeforeValidator(lambda value: _tuple(_unknown(value))),
-        Unknown,
+        BeforeValidator(as_tuple),
+        *Unknown,
     ] = Field(default=None, description='the tip [x, y, z] from the flange, as set on the controller, or "unknown"')
     max_depth_mm: float = Field(default=6.0, gt=0, le=50, description="no press is deeper, mm")
     clearance_mm: float = Field(default=10.0, ge=1, le=500, description="height above the surface between presses, mm")
     travel_mm_s: float = Field(default=100.0, gt=0, le=500, description="speed between presses, mm/s")
     press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
     acceleration_mm_s2: float = Field(default=500.0, gt=0, le=3000, description="acceleration, mm/s^2")
-    max_force_n: Annotated[Force | None, BeforeValidator(_unwatched), Unwatched] = Field(
+    max_force_n: Annotated[Force | None, *Unwatched] = Field(
         default=60.0, description='force at which the arm is stopped, N; "unwatched" for an arm that tells none (CB3)'
     )
 

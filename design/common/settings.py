@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
 from .errors import InputError, instance, mapping, shown
 from .errors import path as as_path
@@ -45,6 +45,15 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 def as_tuple(value: object) -> object:
     """A list, as files have it, as the tuple that a frozen model holds; anything else as it is."""
     return tuple(value) if isinstance(value, list) else value
+
+
+def none_as(word: str) -> tuple[BeforeValidator, PlainSerializer]:
+    """For `Annotated[... | None, *none_as("unknown")]`: a key that is this word where the model holds None."""
+
+    def read(value: object) -> object:
+        return None if isinstance(value, str) and value == word else value
+
+    return BeforeValidator(read), PlainSerializer(lambda value: word if value is None else value)
 
 
 class Spec:

@@ -4,20 +4,11 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from design.common.settings import Settings, as_tuple
+from design.common.settings import Settings, as_tuple, none_as
 
-
-def _circle(value: object) -> object:
-    return None if isinstance(value, str) and value == "circle" else value
-
-
-Sides = Annotated[
-    Annotated[int, Field(ge=3, le=4096)] | None,
-    BeforeValidator(_circle),
-    PlainSerializer(lambda sides: "circle" if sides is None else sides),
-]
+Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *none_as("circle")]
 
 
 MEASURED_REACH = (

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from design.common.settings import Settings, as_tuple
+from design.common.settings import Settings, as_tuple, none_as
 
 from .layout import Layout
 
@@ -48,24 +48,8 @@ def _side_lengths(value: object) -> object:
     return as_tuple(value)
 
 
-def _as_grid(value: object) -> object:
-    return None if isinstance(value, str) and value == "grid" else value
-
-
-def _flat(value: object) -> object:
-    return None if isinstance(value, str) and value == "flat" else value
-
-
-BentRadius = Annotated[
-    Annotated[float, Field(ge=1, le=1e6)] | None,
-    BeforeValidator(_flat),
-    PlainSerializer(lambda radius: "flat" if radius is None else radius),
-]
-Count = Annotated[
-    Annotated[int, Field(ge=0, le=256)] | None,
-    BeforeValidator(_as_grid),
-    PlainSerializer(lambda count: "grid" if count is None else count),
-]
+BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *none_as("flat")]
+Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *none_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
 

@@ -2,20 +2,11 @@
 
 from typing import Annotated
 
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import Field
 
-from design.common.settings import Settings
+from design.common.settings import Settings, none_as
 
-
-def _any(value: object) -> object:
-    return None if isinstance(value, str) and value == "any" else value
-
-
-MaxCrossings = Annotated[
-    Annotated[int, Field(ge=0)] | None,
-    BeforeValidator(_any),
-    PlainSerializer(lambda most: "any" if most is None else most),
-]
+MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *none_as("any")]
 
 
 class RulesSettings(Settings):
