@@ -100,7 +100,8 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     step = 1e-4
     around = (places[:, None] + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
     found = signals(pad, around, contact).reshape(len(places), 5, -1)
-    if not found.any():
+    found = found[..., found.any(axis=(0, 1))]  # fibres between the places, most of a large pad's, tell nothing
+    if not found.size:
         return 0.0
     sigma = noise * found.max() / LEVELS
     mean = found[:, 0] / sigma
@@ -118,10 +119,14 @@ def _mean_exponential(mean: Array, spread: Array, own: Array, rows: NDArray[np.i
     The mean covariance of two cells is I + W W^T with W = [spread_a, spread_b] / sqrt 2, four columns, so its
     determinant and inverse are those of a 4 x 4 matrix.
     """
-    both = np.concatenate(np.broadcast_arrays(spread[rows, None], spread[None]), axis=-1) / np.sqrt(2)
+    half = spread / np.sqrt(2)
     gap = mean[rows, None] - mean[None]
-    inner = np.eye(4) + np.einsum("abki,abkj->abij", both, both)
-    along = np.einsum("abki,abk->abi", both, gap)
+    inner = np.empty((*gap.shape[:2], 4, 4))  # I + W^T W, by blocks of the two cells
+    alone = np.eye(2) + half.transpose(0, 2, 1) @ half
+    inner[..., :2, :2], inner[..., 2:, 2:] = alone[rows, None], alone
+    inner[..., :2, 2:] = np.tensordot(half[rows], half, axes=(1, 1)).transpose(0, 2, 1, 3)
+    inner[..., 2:, :2] = inner[..., :2, 2:].swapaxes(-1, -2)
+    along = np.concatenate([gap @ half[rows], (gap.swapaxes(0, 1) @ half).swapaxes(0, 1)], axis=-1)  # W^T gap
     square = (gap**2).sum(axis=-1) - (along * np.linalg.solve(inner, along[..., None])[..., 0]).sum(axis=-1)
     distance = square / 8 + (np.linalg.slogdet(inner)[1] - (own[rows, None] + own[None]) / 2) / 2
     return np.exp(-distance).mean(axis=1)

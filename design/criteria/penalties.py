@@ -23,6 +23,7 @@ PER_SPAN = 12
 ORDER_PER_UNIT = 40
 BLUR = 0.1  # standard deviation of the mollified crossing count, grid units
 LEAST_CLEARANCE = 0.1  # from keep-outs, grid units, of which what comes nearer is a share
+FIBRES_AT_ONCE = 32  # that are sampled for their order
 MOST_PAIRS = 10**8  # of samples that are compared at once: some GB
 
 
@@ -162,7 +163,10 @@ def _disorder(travel: Tensor, cross: Tensor, least: float, layout: Layout) -> Te
         torch.linspace(0, extent, points, dtype=torch.float64).expand(count, -1)
         for extent, count in zip(layout.extent, layout.counts, strict=True)
     ]
-    above = pchip_sample(travel, cross, torch.cat(along))[0].diff(dim=0)
+    at = torch.cat(along)
+    # a few fibres at a time: what a large pad's take does not leave the processor's cache then
+    parts = zip(travel.split(FIBRES_AT_ONCE), cross.split(FIBRES_AT_ONCE), at.split(FIBRES_AT_ONCE), strict=True)
+    above = torch.cat([pchip_sample(*part)[0] for part in parts]).diff(dim=0)
     within = [row for rows in layout.families for row in range(rows.start, rows.stop - 1)]
     return _closeness(above[within], least) / (len(within) * points)
 

@@ -16,6 +16,9 @@ from design.settings import PUBLISHED_CONTACT, Contact, Counts, Layout, between_
 
 from .information import LEVELS
 
+WEIGHTS = (1.0, 1e-7, 5e-6)
+"""Published alpha, beta and gamma."""
+
 
 @dataclass(frozen=True)
 class PublishedTerms:
@@ -47,7 +50,7 @@ def published_terms(
     contact: Contact | None = None,
     presses: ArrayLike | None = None,
     samples: int = 2000,
-    weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
+    weights: tuple[float, float, float] = WEIGHTS,
     layout: Layout | None = None,
 ) -> list[PublishedTerms]:
     """Terms of formula (5), as the published code computes them, for every pad of a population.
@@ -64,8 +67,9 @@ def published_terms(
     samples = as_samples(samples, travel.shape[1])
     if presses is None:
         layout = pads.layout if isinstance(pads, Morphology) else layout
-        presses = published_presses(layout or ends.horizontals)
-    places = as_presses(presses)[0]
+        places = published_presses(layout or ends.horizontals)
+    else:
+        places = as_presses(presses)[0]
     shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT))
     found = np.zeros((len(travel), 3))
 
@@ -81,13 +85,15 @@ def published_objective(
     contact: Contact | None = None,
     presses: ArrayLike | None = None,
     samples: int = 2000,
-    weights: tuple[float, float, float] = (1.0, 1e-7, 5e-6),
+    weights: tuple[float, float, float] = WEIGHTS,
 ) -> float:
     """Formula (5) for one pad: alpha / (1 + entropy) + beta Z + gamma C; arguments as in `published_terms`."""
     return published_terms(instance("pad", pad, Morphology), contact, presses, samples, weights)[0].objective
 
 
 def _weights(weights: tuple[float, float, float]) -> list[float]:
+    if weights is WEIGHTS:
+        return [*weights]
     found = reals("weights", weights, 1e12)
     if found.shape != (3,):
         raise InputError(f"weights have shape {found.shape}, expected three numbers: alpha, beta, gamma")

@@ -42,11 +42,13 @@ def ambiguities(
 
     presses = free_presses(size)
     found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
+    touched = found.any(dim=1)  # no other fibre tells presses apart: on a large pad most are between the presses
+    found = found[touched]
     places = torch.tensor(presses, dtype=torch.float32)
     fibres = len(pad.knots)
     spread = []
     for k in range(min(len(loss_shares(lost)), fibres)):
-        kept = torch.tensor(loss_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)
+        kept = torch.tensor(loss_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)[:, touched]
         equal = torch.full((len(kept),), 1 / len(kept))
         spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
     return spread

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from .exact_signals import local_cubic, make_scratch, stretches_inside
+from .pchip import piece_of
 from .press import EPS, INVERSE, MANHATTAN, UNIFORM, in_frame, touched_range, weigh
 from .quadrature import HALVINGS, across, kronrod, precise
 
@@ -45,7 +46,7 @@ def _normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, floa
     last = len(breaks) - 1
     if last < 0:
         return t, v
-    k = min(max(np.searchsorted(breaks, t) - 1, 0), last - 1)
+    k = piece_of(t, breaks, last)
     width = breaks[k + 1] - breaks[k]
     x = (t - breaks[k]) / width
     above = abs(upper[k] + x * (upper[k + 1] - upper[k]) - v)
@@ -133,11 +134,10 @@ def _span(
     Args:
         shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `variations`, all overwritten.
     """
-    span, chains, radius = work[0], shape[0], shape[2].radius
-    tolerance = 4 * EPS * (abs(cv) + radius)
+    span, tolerance = work[0], 4 * EPS * (abs(cv) + shape[2].radius)
     s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
-    for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
+    for i in range(stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
         a, b = scratch[4][i]
         _inner(a, b, s0, d[j], d[j + 1], shape, work, scratch[3], change)
         for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
@@ -178,7 +178,7 @@ def signals_gradient(
             first, last = touched_range(cv, reach[family], strays[family], ends, family)
             for f in range(first, last):
                 t, v, d = travel[f], cross[f], slope[f]
-                j = max(np.searchsorted(t, ct + reach[family, 0], side="right") - 1, 0)
+                j = piece_of(ct + reach[family, 0], t, n)
                 while j < n - 1 and t[j] < ct + reach[family, 1]:
                     if min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:
                         _span(t, v, d, j, ct, cv, shape, scratch, work, change)

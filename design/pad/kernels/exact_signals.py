@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .pchip import piece_of
 from .press import EPS, INVERSE, in_frame, touched_range
 from .quadrature import HALVINGS, across, length_element
-from .roots import SCRATCH, roots_in_unit
+from .roots import SCRATCH, roots_in_unit, sort
 
 _PROBES = (0.5, 0.22, 0.78)
 _CLEAR = 1e6  # tolerances a value must be away from zero to be believed without a second look
 
 
 @njit(cache=True, error_model="numpy")
-def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: int, work: Any, p: Any) -> int:
+def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
     """Append to out[count:] where the span crosses the circle of `radius` in (a, b), as parameters s."""
     w = b - a
     t0, t1 = span[0] + span[1] * a, span[1] * w
@@ -44,7 +45,7 @@ def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: 
 
 @njit(cache=True, error_model="numpy")
 def _line_roots(
-    span: Any, a: float, b: float, at_a: float, at_b: float, tolerance: float, out: Any, count: int, work: Any, p: Any
+    span: Any, a: float, b: float, at_a: float, at_b: float, tolerance: float, out: Any, count: Any, work: Any, p: Any
 ) -> int:
     """Append to out[count:] where the span crosses a line that runs from `at_a` at s = a to `at_b` at s = b."""
     w = b - a
@@ -59,7 +60,7 @@ def _line_roots(
 
 
 @njit(cache=True, error_model="numpy")
-def _keep(stretches: Any, count: int, begin: float, end: float) -> int:
+def _keep(stretches: Any, count: Any, begin: float, end: float) -> int:
     """Append [begin, end] to stretches[:count], joined to the last one where they meet; returns the new count."""
     if count > 0 and stretches[count - 1, 1] == begin:
         stretches[count - 1, 1] = end
@@ -69,19 +70,11 @@ def _keep(stretches: Any, count: int, begin: float, end: float) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> int:
+def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> Any:
     """`stretches_inside` of a circle."""
     roots, work, p, _, stretches = scratch
-    # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
-    t0, t1, v0, v1 = span[0] + span[1] * a, span[0] + span[1] * b, across(span, a), across(span, b)
-    far_t, far_v = max(abs(t0), abs(t1)), max(abs(v0), abs(v1))
-    if far_t * far_t + far_v * far_v < radius * radius:
-        return _keep(stretches, 0, a, b)
-    near_t, near_v = max(t0, -t1, 0.0), max(min(v0, v1), -max(v0, v1), 0.0)
-    if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
-        return 0
-    count = circle_roots(span, a, b, radius, roots, 0, work, p)
-    found, begin = 0, a
+    count = circle_roots(span, a, b, radius, roots, np.int64(0), work, p)
+    found, begin = np.int64(0), a
     for i in range(count + 1):
         end = b if i == count else roots[i]
         # no sign changes between roots, but a touch may lie there: the largest of three values has the sign
@@ -101,19 +94,59 @@ def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: floa
 
 
 @njit(cache=True, error_model="numpy")
-def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, tolerance: float, scratch: Any) -> int:
+def _between_lines(
+    span: Any, here: float, after: float, lines: Any, near: Any, tolerance: float, found: Any, scratch: Any
+) -> Any:
+    """Append to the `found` stretches where the span is between two lines, upper and lower, that are near."""
+    roots, work, p, _, stretches = scratch
+    (u0, u1, l0, l1), count = lines, np.int64(0)
+    if near[0]:
+        count = _line_roots(span, here, after, u0, u1, tolerance, roots, count, work, p)
+    if near[1]:
+        count = _line_roots(span, here, after, l0, l1, tolerance, roots, count, work, p)
+    sort(roots, count)
+    begin = here
+    for i in range(count + 1):
+        end = after if i == count else roots[i]
+        above, below = 0.0, 0.0
+        for share in _PROBES:
+            s = begin + share * (end - begin)
+            x, at = (s - here) / (after - here), across(span, s)
+            to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
+            above = to_upper if abs(to_upper) > abs(above) else above
+            below = to_lower if abs(to_lower) > abs(below) else below
+            if min(abs(above), abs(below)) > _CLEAR * tolerance:
+                break
+        if above >= -tolerance and below >= -tolerance:
+            found = _keep(stretches, found, begin, end)
+        begin = end
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float, scratch: Any) -> Any:
     """Stretches of [a, b] on which the span lies inside the press, ascending, into the last of `scratch`.
 
     Args:
-        span: (6,) r, h, e0..e3. chains: (3, B) breakpoints t, upper v, lower v of a polygon; B = 0 for a circle.
+        span: (6,) r, h, e0..e3.
+        shape: of `in_frame`; its chains are (3, B) breakpoints t, upper v, lower v of a polygon, B = 0 for a circle.
         tolerance: how far outside still counts as on the boundary.
         scratch: of `make_scratch`.
 
     Returns:
         How many stretches there are.
     """
-    roots, work, p, _, stretches = scratch
-    r, h = span[0], span[1]
+    stretches = scratch[4]
+    (chains, reach, law), r, h = shape, span[0], span[1]
+    radius, inner = law.radius, reach[4]
+    # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
+    t0, t1, v, v1 = r + h * a, r + h * b, across(span, a), across(span, b)
+    far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v1))
+    if far_t * far_t + far_v * far_v < inner * inner:
+        return _keep(stretches, np.int64(0), a, b)
+    near_t, near_v = max(t0, -t1, 0.0), max(min(v, v1), -max(v, v1), 0.0)
+    if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
+        return 0
     breaks, upper, lower = chains
     last = len(breaks) - 1
     a = max(a, ((-radius if last < 0 else breaks[0]) - r) / h)
@@ -122,40 +155,27 @@ def stretches_inside(span: Any, a: float, b: float, chains: Any, radius: float, 
         return 0
     if last < 0:
         return _inside_circle(span, a, b, radius, tolerance, scratch)
-    found, here, v = 0, a, across(span, a)
-    k = min(max(np.searchsorted(breaks, r + h * a, side="right") - 1, 0), last - 1)
+    found, here, v, k = np.int64(0), a, across(span, a), piece_of(r + h * a, breaks, last)
     while here < b:
         after = b if k == last - 1 else min(b, (breaks[k + 1] - r) / h)
         if after <= here:
             k += 1
             continue
-        v_after = across(span, after)
+        v_after, t0, t1 = across(span, after), r + h * here, r + h * after
+        far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v_after))
+        if far_t * far_t + far_v * far_v < inner * inner:  # as for the whole span: no chain is near
+            found, here, v, k = _keep(stretches, found, here, after), after, v_after, k + 1
+            continue
         width = breaks[k + 1] - breaks[k]
-        x0, x1 = (r + h * here - breaks[k]) / width, (r + h * after - breaks[k]) / width
+        x0, x1 = (t0 - breaks[k]) / width, (t1 - breaks[k]) / width
         u0, u1 = upper[k] + (upper[k + 1] - upper[k]) * x0, upper[k] + (upper[k + 1] - upper[k]) * x1
         l0, l1 = lower[k] + (lower[k + 1] - lower[k]) * x0, lower[k] + (lower[k + 1] - lower[k]) * x1
         least, most = min(v, v_after), max(v, v_after)
         if most <= min(u0, u1) and least >= max(l0, l1):
             found = _keep(stretches, found, here, after)
         elif least <= max(u0, u1) + tolerance and most >= min(l0, l1) - tolerance:
-            count = _line_roots(span, here, after, u0, u1, tolerance, roots, 0, work, p)
-            count = _line_roots(span, here, after, l0, l1, tolerance, roots, count, work, p)
-            roots[:count].sort()
-            begin = here
-            for i in range(count + 1):
-                end = after if i == count else roots[i]
-                above, below = 0.0, 0.0
-                for share in _PROBES:
-                    s = begin + share * (end - begin)
-                    x, at = (s - here) / (after - here), across(span, s)
-                    to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
-                    above = to_upper if abs(to_upper) > abs(above) else above
-                    below = to_lower if abs(to_lower) > abs(below) else below
-                    if min(abs(above), abs(below)) > _CLEAR * tolerance:
-                        break
-                if above >= -tolerance and below >= -tolerance:
-                    found = _keep(stretches, found, begin, end)
-                begin = end
+            near = most >= min(u0, u1), least <= max(l0, l1)
+            found = _between_lines(span, here, after, (u0, u1, l0, l1), near, tolerance, found, scratch)
         here, v = after, v_after
         k += 1
     return found
@@ -167,7 +187,7 @@ def _stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> fl
     roots, work, p, stack, _ = scratch
     if law.weight != INVERSE:
         return length_element(span, a, b, law, stack)
-    count = circle_roots(span, a, b, law.radius / 100, roots, 0, work, p)
+    count = circle_roots(span, a, b, law.radius / 100, roots, np.int64(0), work, p)
     total, begin = 0.0, a
     for i in range(count):
         total += length_element(span, begin, roots[i], law, stack)
@@ -205,18 +225,16 @@ def fibre_signal(
         t, v, d: (n,) knots and slopes. shape: of `in_frame`; its extents (5,) are least and greatest t, least and
             greatest v, radius of the circle inside.
     """
-    chains, reach, law = shape
-    radius, n = law.radius, len(t)
-    begin, end = ct + reach[0], ct + reach[1]
+    _, reach, law = shape
+    n, begin, end = len(t), ct + reach[0], ct + reach[1]
     if end <= t[0] or begin >= t[n - 1]:
         return 0.0, 0
-    tolerance = 4 * EPS * (abs(cv) + radius)
-    total, visited = 0.0, 0
-    j = max(np.searchsorted(t, begin, side="right") - 1, 0)
+    tolerance = 4 * EPS * (abs(cv) + law.radius)
+    total, visited, j = 0.0, 0, piece_of(begin, t, n)
     while j < n - 1 and t[j] < end:
         if min(v[j], v[j + 1]) <= cv + reach[3] + tolerance and max(v[j], v[j + 1]) >= cv + reach[2] - tolerance:
             s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
-            for i in range(stretches_inside(span, -s0, 1 - s0, chains, radius, tolerance, scratch)):
+            for i in range(stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
                 total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], law, scratch)
             visited += 1
         j += 1

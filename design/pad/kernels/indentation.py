@@ -134,7 +134,7 @@ def _span_lengthening(
     far_t, far_v = max(abs(t0), abs(t1)), max(abs(v0), abs(v1))
     count = 0
     if near_t**2 + near_v**2 < a * a < far_t**2 + far_v**2:
-        count = circle_roots(span, low, high, a, roots, 0, work, p)
+        count = circle_roots(span, low, high, a, roots, np.int64(0), work, p)
     total, begin = 0.0, low
     for i in range(count + 1):
         end = high if i == count else roots[i]

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .exact_gradient import variations
+from .pchip import extremes
 from .press import MANHATTAN, profile_of, profile_weights
 
 Array = NDArray[np.float64]
@@ -93,7 +94,8 @@ def fibre_elements(
     fibres, n = travel.shape
     low, high = np.empty(2), np.empty(2)
     for axis in range(2):
-        low[axis], high[axis] = presses[:, axis].min() - end, presses[:, axis].max() + end
+        least, largest = extremes(presses[:, axis])
+        low[axis], high[axis] = least - end, largest + end
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
     total = 0
     for f in range(fibres):
@@ -132,7 +134,7 @@ def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def _piece(square: float, profile: Any, piece: int) -> int:
+def _piece(square: float, profile: Any, piece: Any) -> int:
     """The row of a profile that holds at squared distance `square`, sought from the one of an element nearby."""
     while piece > 0 and square < profile[piece, 0]:
         piece -= 1
@@ -149,13 +151,13 @@ def element_signals(travel: Any, cross: Any, elements: Any, presses: Any, end: f
         travel, cross: (F, n) knots. elements: of `fibre_elements`. end, profile: of the reach.
     """
     fibres, n = travel.shape
-    looked_at, piece = 0, 0
+    looked_at, piece = 0, np.int64(0)
     for f in range(fibres):
         t, v, first, along = travel[f], cross[f], elements.starts[f], 0 if f < elements.horizontals else 1
-        bottom, top = v.min() - end, v.max() + end
+        bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, total = presses[q, along], presses[q, 1 - along], 0.0
-            for j in range(n - 1 if bottom < cv < top else 0):
+            for j in range(n - 1 if bottom - end < cv < top + end else 0):
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
                 looked_at += 1
@@ -177,13 +179,13 @@ def _gains(
 ) -> None:
     """How sum(upstream * signals) changes with each element's travel, cross and length, into out (3, E), 0 before."""
     fibres, n = travel.shape
-    piece = 0
+    piece = np.int64(0)
     for f in range(fibres):
         t, v, first, along = travel[f], cross[f], elements.starts[f], 0 if f < elements.horizontals else 1
-        bottom, top = v.min() - end, v.max() + end
+        bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, up = presses[q, along], presses[q, 1 - along], upstream[q, f]
-            for j in range(n - 1 if bottom < cv < top else 0):
+            for j in range(n - 1 if bottom - end < cv < top + end else 0):
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
                 for k in range(first[j], first[j + 1]):

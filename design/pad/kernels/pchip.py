@@ -8,6 +8,28 @@ from numba import njit
 
 
 @njit(cache=True, error_model="numpy")
+def piece_of(at: float, edges: Any, pieces: int) -> int:
+    """Which of so many pieces, that begin at ascending edges (pieces or more,), holds at `at`; the first if none."""
+    low, high = 0, pieces
+    while high - low > 1:
+        middle = (low + high) // 2
+        if edges[middle] <= at:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, error_model="numpy")
+def extremes(values: Any) -> tuple[float, float]:
+    """The least and the largest of (n,) values."""
+    least = largest = values[0]
+    for value in values:
+        least, largest = min(least, value), max(largest, value)
+    return least, largest
+
+
+@njit(cache=True, error_model="numpy")
 def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
     """Slope at an end knot from the two spans next to it: three-point rule, kept shape-preserving."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)

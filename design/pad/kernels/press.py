@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .pchip import piece_of
+
 Array = NDArray[np.float64]
 
 EPS = 2.0**-52
@@ -57,22 +59,9 @@ def weigh(square: float, law: Any) -> float:
         return 1 / (radius + square)
     if weight == INVERSE:
         return 1 / max(math.sqrt(square), radius / 100)
-    piece = profile[profile_piece(square, profile)]
+    piece = profile[piece_of(square, profile[:, 0], len(profile))]
     x = square - piece[0]
     return piece[1] + x * (piece[2] + x * (piece[3] + x * piece[4]))
-
-
-@njit(cache=True, error_model="numpy")
-def profile_piece(square: float, profile: Any) -> int:
-    """The row of a profile that holds at squared distance `square`."""
-    low, high = 0, len(profile)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if profile[middle, 0] <= square:
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 @lru_cache(maxsize=64)
@@ -86,7 +75,7 @@ def profile_of(reach: tuple[tuple[float, float], ...]) -> Array:
 
     distance, weight = np.array(reach).T
     spline = CubicSpline(distance**2, weight, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
-    return np.column_stack([spline.x[:-1], spline.c[::-1].T])
+    return np.ascontiguousarray(np.column_stack([spline.x[:-1], spline.c[::-1].T]))  # one order: compiled once
 
 
 def profile_weights(profile: Array, end: float, distance: Array) -> Array:
@@ -140,7 +129,8 @@ def family_strays(cross: Any, ends: Any) -> Any:
         for f in range(fibres):
             family, first, _, apart = family_of(f, ends)
             level = (f - first + 1) * apart
-            out[p, family] = max(out[p, family], level - cross[p, f].min(), cross[p, f].max() - level)
+            for at in cross[p, f]:
+                out[p, family] = max(out[p, family], abs(at - level))
     return out
 
 

@@ -11,6 +11,20 @@ SCRATCH = (DEPTH + 2, MAX_DEGREE + 3)
 
 
 @njit(cache=True, error_model="numpy")
+def sort(values: Any, count: Any) -> None:
+    """Sort values[:count] in place, by Shell's method: numpy's sort takes a second to compile."""
+    gap = count
+    while gap > 1:
+        gap = max(gap * 5 // 11, 1)
+        for i in range(gap, count):
+            value, j = values[i], i
+            while j >= gap and values[j - gap] > value:
+                values[j] = values[j - gap]
+                j -= gap
+            values[j] = value
+
+
+@njit(cache=True, error_model="numpy")
 def _bracketed(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
     """The one sign change of p in (low, high): Newton's method, bisected where it would leave the bracket."""
     u = 0.5 * (low + high)
@@ -35,7 +49,7 @@ def _bracketed(p: Any, degree: int, low: float, high: float, rising: bool) -> fl
 
 
 @njit(cache=True, error_model="numpy")
-def roots_in_unit(p: Any, degree: int, tolerance: float, out: Any, count: int, work: Any) -> int:
+def roots_in_unit(p: Any, degree: int, tolerance: float, out: Any, count: Any, work: Any) -> int:
     """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
 
     Bernstein coefficients with no change of sign exclude a root, with one change hold exactly one; else the interval

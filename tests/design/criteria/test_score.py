@@ -1,9 +1,12 @@
 """Scores of pads, whatever their size."""
 
 import pytest
+import torch
 
 from design import InputError, Morphology
-from design.criteria.score import score
+from design.criteria.ambiguity import ambiguity, full_scale
+from design.criteria.score import ambiguities, free_presses, score
+from design.pad.contact import signals
 from design.settings import PUBLISHED_CONTACT, PadSettings
 
 
@@ -25,3 +28,15 @@ def test_a_pad_is_scored_where_it_is_pressed():
     assert score(pad, lost=1) == beyond
     with pytest.raises(InputError, match="the pad itself is 45 mm wide"):
         score(pad, size=PadSettings(sensed_mm=(46, 20)))
+
+
+def test_fibres_that_no_press_touches_change_no_ambiguity():
+    """Of 64 x 64 fibres a lattice of presses misses most, which `ambiguities` leaves out."""
+    pad, contact, size = Morphology.straight(64), PUBLISHED_CONTACT, PadSettings(grid=64)
+    presses = free_presses(size)
+    found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
+    assert not found.any(dim=1).all()
+    noise = 0.01 * full_scale(found)
+    places, one = torch.tensor(presses, dtype=torch.float32), torch.ones(1)
+    whole = ambiguity(found, places, torch.ones(1, len(found)), one, noise).item()
+    assert ambiguities(pad, contact, 0, 0.01, size) == pytest.approx([whole], rel=1e-6)

@@ -8,7 +8,7 @@ from numba import njit
 
 from ..pchip import pchip_sample
 from ..press import in_frame
-from ..roots import SCRATCH, roots_in_unit
+from ..roots import SCRATCH, roots_in_unit, sort
 from .sampled_signals import fibre_quantized
 
 
@@ -25,7 +25,7 @@ def to_levels(signals: Any, levels: int, out: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def row_entropy(rows: Any, first: int, end: int) -> float:
+def row_entropy(rows: Any, first: Any, end: int) -> float:
     """Joint entropy in bits of the rows of (Q, C), columns first..end: equal rows are counted by sorted hash."""
     count = len(rows)
     if count == 0:
@@ -37,7 +37,7 @@ def row_entropy(rows: Any, first: int, end: int) -> float:
             code = (code ^ np.uint64(np.int64(rows[q, c]))) * np.uint64(1099511628211)
             code ^= code >> np.uint64(29)
         hashes[q] = code
-    hashes.sort()
+    sort(hashes, count)
     entropy, run = 0.0, 0
     for q in range(count):
         run += 1
@@ -96,7 +96,7 @@ def published_terms(
             pchip_sample(t, v, step, curves[f])
             fibre_quantized(t, v, curves[f], step, presses, family, own, signals[:, f])
         to_levels(signals, levels, scaled)
-        out[p, 0] = row_entropy(scaled, 0, horizontals) + row_entropy(scaled, horizontals, fibres)
+        out[p, 0] = row_entropy(scaled, np.int64(0), horizontals) + row_entropy(scaled, horizontals, fibres)
         out[p, 1] = second_differences(scaled)
         out[p, 2] = disorder(curves, horizontals)
 
@@ -124,7 +124,7 @@ def area_above(t: Any, v: Any, d: Any, other_t: Any, other_v: Any, other_d: Any)
             p[:] = 0.0
             _cubic_on(t, v, d, i, a, b - a, 1.0, p)
             _cubic_on(other_t, other_v, other_d, j, a, b - a, -1.0, p)
-            count = roots_in_unit(p, 3, 1e-15 * (abs(v[i]) + abs(v[i + 1])), roots, 0, work)
+            count = roots_in_unit(p, 3, 1e-15 * (abs(v[i]) + abs(v[i + 1])), roots, np.int64(0), work)
             roots[count] = 1.0
             start, before = 0.0, 0.0
             for r in range(count + 1):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from ..pchip import pchip_sample
+from ..pchip import extremes, pchip_sample, piece_of
 from ..press import MANHATTAN, UNIFORM, in_frame, weigh
 
 
@@ -28,9 +28,9 @@ def _between_chains(dt: float, dv: float, chains: Any) -> bool:
     breaks, upper, lower = chains
     if not breaks[0] <= dt <= breaks[-1]:
         return False
-    k = min(max(np.searchsorted(breaks, dt), 1), len(breaks) - 1)
-    x = (dt - breaks[k - 1]) / (breaks[k] - breaks[k - 1])
-    return lower[k - 1] + x * (lower[k] - lower[k - 1]) <= dv <= upper[k - 1] + x * (upper[k] - upper[k - 1])
+    k = piece_of(dt, breaks, len(breaks) - 1)
+    x = (dt - breaks[k]) / (breaks[k + 1] - breaks[k])
+    return lower[k] + x * (lower[k + 1] - lower[k]) <= dv <= upper[k] + x * (upper[k + 1] - upper[k])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
@@ -115,7 +115,8 @@ def fibre_quantized(t: Any, v: Any, curve: Any, step: float, presses: Any, famil
     for j in range(n - 1):
         starts[j] = math.ceil(t[j] / step)
     starts[n - 1] = segments
-    bottom, top = v.min() - reach[3], v.max() - reach[2]
+    low, high = extremes(v)
+    bottom, top = low - reach[3], high - reach[2]
     looked_at = 0
     for q in range(len(presses)):
         ct, cv = presses[q, family], presses[q, 1 - family]
@@ -125,7 +126,7 @@ def fibre_quantized(t: Any, v: Any, curve: Any, step: float, presses: Any, famil
         first = max(0, math.ceil((ct + reach[0]) / step) - 1)
         last = min(segments, math.floor((ct + reach[1]) / step) + 2)
         low, high = cv + reach[2], cv + reach[3]
-        j = max(np.searchsorted(t, first * step, side="right") - 2, 0)
+        j = max(piece_of(first * step, t, n) - 1, 0)
         while j < n - 1 and starts[j] < last:
             a, b = max(first, starts[j]), min(last, starts[j + 1])
             if a < b and min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:

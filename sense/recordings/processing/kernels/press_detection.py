@@ -154,13 +154,13 @@ def _way_from(fibres: Any, last: Any) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _tell(events: Any, count: int, down: bool, reading: int) -> int:
+def _tell(events: Any, count: Any, down: bool, reading: int) -> int:
     events[count, 0], events[count, 1] = down, reading
     return count + 1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _judge(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: int) -> int:
+def _judge(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
     """Tell a change that is under way, as soon as it is clear what it is; the new count of events."""
     known = pad.presses >= LEARNT and pad.agreement > AGREEING
     along = _agreement(fibres) if known else 1.0
@@ -191,7 +191,7 @@ def _press(fibres: Any, kept: float) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _conclude(fibres: Any, pad: Any, time_s: float, events: Any, count: int) -> int:
+def _conclude(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
     """Take a change that has settled as what it was told to be; the new count of events."""
     if pad.told == TOUCH and _share(fibres, fibres.farthest) < 0.5:  # a tap: it was released meanwhile
         pad.state = FREE
@@ -217,7 +217,7 @@ def _conclude(fibres: Any, pad: Any, time_s: float, events: Any, count: int) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _look(fibres: Any, pad: Any, time_s: float, doubt: Any, sure: Any, events: Any, count: int) -> int:
+def _look(fibres: Any, pad: Any, time_s: float, doubt: Any, sure: Any, events: Any, count: Any) -> int:
     """Take a look that is complete; the new count of events."""
     if not pad.changing:
         advance(fibres, pad, time_s)
@@ -226,7 +226,8 @@ def _look(fibres: Any, pad: Any, time_s: float, doubt: Any, sure: Any, events: A
         elif changes(fibres, pad, time_s, doubt, sure):
             pad.changing, pad.told = True, NOTHING
             pad.farthest, pad.farthest_s, pad.after_farthest = 0.0, time_s, -1
-            fibres.origin[:] = fibres.level
+            for fibre in fibres:  # one by one: assigning slices compiles what words an error about their shapes
+                fibre.origin = fibre.level
     if pad.changing:
         for fibre in fibres:
             if np.isnan(fibre.look):  # missing now: as it was last seen in this change
@@ -243,13 +244,14 @@ def _look(fibres: Any, pad: Any, time_s: float, doubt: Any, sure: Any, events: A
             count = _conclude(fibres, pad, time_s, events, count)
             restart(fibres, pad, time_s)
             pad.changing = False
-    fibres.before[:] = fibres.look
+    for fibre in fibres:
+        fibre.before = fibre.look
     pad.look_s = time_s
     return count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def find(fibres: Any, pad: Any, times_s: Any, readings: Any, doubt: Any, sure: Any, events: Any) -> int:
+def find(fibres: Any, pad: Any, times_s: Any, readings: Any, doubt: Any, sure: Any, events: Any) -> Any:
     """Take (n,) times and (n, C) readings in V, NaN where missing, going on from those before.
 
     Args:
@@ -259,7 +261,7 @@ def find(fibres: Any, pad: Any, times_s: Any, readings: Any, doubt: Any, sure: A
     Returns:
         How many events there are.
     """
-    count = 0
+    count = np.int64(0)
     for r in range(len(times_s)):
         if take(fibres, pad, readings[r], times_s[r]):
             count = _look(fibres, pad, times_s[r], doubt, sure, events, count)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design.pad.kernels.roots import SCRATCH, roots_in_unit
+from design.pad.kernels.roots import SCRATCH, roots_in_unit, sort
 
 
 def found(coefficients: list[float], tolerance: float = 1e-14) -> list[float]:
@@ -55,3 +55,11 @@ def test_a_touch_within_the_tolerance_is_no_root():
     touch = [1 / 9 - 1e-13, -2 / 3, 1.0]
     assert len(found(touch, tolerance=0.0)) == 2
     assert found(touch, tolerance=1e-11) == []
+
+
+@given(st.lists(st.floats(-1e9, 1e9), max_size=40), st.integers(0, 40))
+def test_as_many_as_told_are_sorted_and_the_others_stay(values, count):
+    count = min(count, len(values))
+    found = np.array(values, dtype=float)
+    sort(found, count)
+    assert found.tolist() == sorted(values[:count]) + values[count:]
