@@ -17,7 +17,10 @@ from .recordings.formats.csv_recording import export_csv as export_csv
 from .recordings.formats.csv_recording import import_csv as import_csv
 from .recordings.formats.hdf5 import export_hdf5 as export_hdf5
 from .recordings.formats.hdf5 import import_hdf5 as import_hdf5
+from .recordings.formats.lerobot import export_lerobot as export_lerobot
 from .recordings.formats.published_mat import import_mat as import_mat
+from .recordings.formats.ros.exporting import export_bag as export_bag
+from .recordings.formats.ros.importing import import_bag as import_bag
 from .recordings.import_export import open_recording as open_recording
 from .recordings.processing.filters import running_median as running_median
 from .recordings.processing.filters import stretches as stretches

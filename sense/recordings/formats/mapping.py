@@ -56,7 +56,7 @@ def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part
 
     Raises:
         InputError: no mapping, a quantity that is not `allowed` or named twice, one of two that belong together, two
-            that say the same, or no `time` or `fibres`; the message names the part.
+            that say the same, or no `time` (where it is allowed) or `fibres`; the message names the part.
     """
     if len(text) > _LONGEST:
         raise InputError(f"mapping has {len(text)} characters, allowed are {_LONGEST}")
@@ -65,9 +65,10 @@ def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part
     for quantity in named:
         if quantity != "fibres" and named.count(quantity) > 1:
             raise InputError(f"mapping {shown(text)} names {quantity} twice, expected once")
-    for needed in ("time", "fibres"):
-        if needed not in named:
-            raise InputError(f"mapping {shown(text)} does not name {needed}, expected time and fibres in each")
+    needed = [quantity for quantity in ("time", "fibres") if quantity in allowed]
+    for quantity in needed:
+        if quantity not in named:
+            raise InputError(f"mapping {shown(text)} does not name {quantity}, expected {' and '.join(needed)} in each")
     for one, other in (("x", "y"), ("begun", "lifted")):
         if (one in named) != (other in named):
             raise InputError(f"mapping {shown(text)} names one of {one} and {other}, expected both or neither")

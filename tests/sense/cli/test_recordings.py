@@ -1,7 +1,9 @@
 import json
 from pathlib import Path
 
+import pytest
 import scipy.io
+from mcap.reader import make_reader
 
 from sense import Recording, export_csv
 
@@ -42,3 +44,67 @@ def test_what_a_file_lacks_at_its_end_is_said(padforge_sense, recording: Recordi
     assert Recording.open("out/cut/recording").source["note"] in note
     assert padforge_sense("export", "cut.mat", "cut.csv")[2] == note
     assert padforge_sense("export", "out/cut/recording", "again.csv")[2] == ""
+
+
+def topics(path: str) -> dict[str, int]:
+    """How many messages each topic of a bag has."""
+    with Path(path).open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        counts = summary.statistics.channel_message_counts
+        return {channel.topic: counts[number] for number, channel in summary.channels.items()}
+
+
+def test_a_bag_goes_out_with_what_a_model_says_and_comes_back(
+    padforge_sense, recording: Recording, model: Path
+) -> None:
+    code, out, err = padforge_sense("export", str(model / "recording"), "r.mcap", "--model", str(model))
+    assert (code, err) == (0, "")
+    assert out == f"{model / 'recording'} -> r.mcap\n"
+    presses = len(recording.begun)
+    assert topics("r.mcap") == {
+        "/pad/recording": 1,
+        "/pad/readings": len(recording.readings),
+        "/pad/pressed": 2 * presses,
+        "/pad/place": presses,
+        "/pad/touches": presses,
+    }
+    code, out, err = padforge_sense("import", "r.mcap")
+    assert (code, err) == (0, "")
+    assert out.startswith("300 presses, 12000 readings")
+    assert Recording.open("out/r/recording").digest == recording.digest
+    assert padforge_sense("locate", "--model", str(model), "r.mcap", "--out", "places.csv")[0] == 0
+
+
+def test_health_is_told_where_a_model_knows_it(enough) -> None:
+    assert enough("export", "rec", "r.mcap", "--model", "model")[0] == 0
+    assert topics("r.mcap")["/pad/health"] >= 1
+
+
+def test_a_dataset_is_a_folder_that_the_format_names(padforge_sense, recording: Recording, model: Path) -> None:
+    code, out, _ = padforge_sense(
+        "export", str(model / "recording"), "set", "--format", "lerobot", "--model", str(model)
+    )
+    assert code == 0
+    assert out.endswith(" -> set\n")
+    info = json.loads(Path("set/meta/info.json").read_text())
+    assert info["total_episodes"] == len(recording.begun)
+    assert "observation.touch" in info["features"]
+    code, _, err = padforge_sense("export", str(model / "recording"), "set", "--format", "lerobot")
+    assert (code, err.startswith("padforge: set: exists and is not empty")) == (2, True)
+
+
+@pytest.mark.parametrize("name", ["set", "r.bag", "r.h5"])
+def test_what_a_name_cannot_hold_is_one_line(padforge_sense, model: Path, name: str) -> None:
+    code, _, err = padforge_sense("export", str(model / "recording"), name, "--model", str(model))
+    assert code == 2
+    assert err.count("\n") == 1
+    assert ("allowed are .csv, .h5, .mcap, or --format lerobot" in err) == (name != "r.h5")
+
+
+def test_folders_that_are_no_bags_are_one_line(padforge_sense) -> None:
+    Path("nothing").mkdir()
+    code, _, err = padforge_sense("import", "nothing")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "or a rosbag2 folder" in err

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from design.common.errors import InputError
-from sense import Recording, export_csv, import_csv, import_mat, open_recording
+from sense import Recorder, Recording, export_csv, import_csv, import_mat, open_recording
 from sense.cli.main import sense
-from sense.recordings.import_export import export_file
+from sense.recordings.import_export import arm_states, export_file
 from tests.helpers.effort import few
 
 
@@ -24,7 +24,7 @@ def holed(recording: Recording) -> Recording:
     return Recording(readings, recording.times_s, places, recording.begun, recording.lifted, recording.source)
 
 
-@pytest.mark.parametrize("name", ["run", "run.csv", "run.h5"])
+@pytest.mark.parametrize("name", ["run", "run.csv", "run.h5", "run.mcap"])
 def test_what_is_missing_stays_missing_and_nothing_else_is(recording: Recording, tmp_path: Path, name: str) -> None:
     holes = holed(recording)
     if name == "run":
@@ -53,7 +53,7 @@ def unrelated(folder: Path) -> dict[str, bytes]:
     }
 
 
-@pytest.mark.parametrize("end", ["mat", "csv", "h5"])
+@pytest.mark.parametrize("end", ["mat", "csv", "h5", "mcap", "db3"])
 def test_files_of_another_kind_are_one_line_and_no_recording(tmp_path: Path, end: str) -> None:
     for name, content in unrelated(tmp_path).items():
         file = tmp_path / f"{name.strip('.')}.{end}"
@@ -85,3 +85,15 @@ def test_a_folder_for_a_file_and_a_file_for_a_folder_are_one_line(recording: Rec
     for path in (tmp_path, tmp_path / "file" / "r.csv"):
         with pytest.raises(InputError, match="cannot be written"):
             export_csv(recording, path)
+
+
+def test_states_of_an_arm_are_read_from_a_run_directory_that_has_them(tmp_path: Path) -> None:
+    states = np.arange(30.0).reshape(3, 10)
+    with Recorder(tmp_path / "run", 1, {}, {}) as recorder:
+        recorder.append([0.0, 1.0], [[1.0], [2.0]])
+        recorder.append_states(states)
+    np.testing.assert_array_equal(arm_states(tmp_path / "run"), states)
+    with Recorder(tmp_path / "none", 1, {}, {}) as recorder:
+        recorder.append([0.0, 1.0], [[1.0], [2.0]])
+    assert arm_states(tmp_path / "none") is None
+    assert arm_states(tmp_path / "run.csv") is None

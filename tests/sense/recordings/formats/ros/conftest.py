@@ -1,0 +1,32 @@
+"""A recording in which everything is there that a bag can hold, or is missing somewhere."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import Morphology
+from sense import Recording, RigSettings, simulate
+from sense.recordings.formats.ros.exporting import export_bag
+
+
+@pytest.fixture(scope="session")
+def eight() -> Recording:
+    """Eight presses: of one the place is unknown, of another its depth, of a third its force; readings are missing."""
+    plain = simulate(Morphology.straight(2), RigSettings(presses=8, depths_mm=(1.0, 2.3, 0.7)))
+    readings, places, depths = (np.array(each) for each in (plain.readings, plain.presses_mm, plain.depths_mm))
+    readings[5, 1] = readings[70] = places[2] = depths[3] = np.nan
+    forces = np.linspace(0, 3, 8) ** 2 / 7
+    forces[4] = np.nan
+    return replace(
+        plain, readings=readings, presses_mm=places, depths_mm=depths, reached_mm=depths + 1 / 30, forces_n=forces
+    )
+
+
+@pytest.fixture(scope="session")
+def bag(eight: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its bag."""
+    path = tmp_path_factory.mktemp("bag") / "eight.mcap"
+    export_bag(eight, path)
+    return path

@@ -1,0 +1,229 @@
+"""Recordings out of bags: exported ones that were changed since, and bags of others that a mapping tells."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader
+
+from design.common.errors import InputError
+from sense import Recording, import_mat, open_recording
+from sense.recordings.formats.ros.exporting import export_bag
+from sense.recordings.formats.ros.importing import import_bag
+from sense.recordings.import_export import import_file
+
+from .foreign import STORE, Message, array, make, pose, wrench, write_bag
+
+READINGS, PRESSED, PLACE, FORCE = "/pad/readings", "/pad/pressed", "/pad/place", "/pad/force"
+
+
+def changed(bag: Path, folder: Path, change: Callable[[str, float, Any], bool]) -> Path:
+    """The bag with those messages that `change`, which may alter them, keeps."""
+
+    def messages() -> Iterator[Message]:
+        with Reader(bag) as reader:
+            for connection, stamp, data in reader.messages():
+                message = STORE.deserialize_cdr(data, connection.msgtype)
+                if change(connection.topic, stamp / 1e9, message):
+                    yield connection.topic, stamp / 1e9, message
+
+    return write_bag(folder, messages())
+
+
+def close(found: Recording, expected: Recording) -> None:
+    """See that a recording is another one, but for what messages round off, and for depths at unknown places."""
+    expected = replace(expected, depths_mm=np.where(expected.known, expected.depths_mm, np.nan))
+    np.testing.assert_array_equal(found.readings, expected.readings)
+    np.testing.assert_array_equal([found.begun, found.lifted], [expected.begun, expected.lifted])
+    for name in ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12, atol=1e-9)
+
+
+def test_messages_alone_are_the_recording_but_for_roundings(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    found = import_bag(changed(bag, tmp_path / "bag", lambda topic, *_: topic != "/pad/recording"))
+    close(found, eight)
+    assert found.source == {"kind": "ros", "file": "bag.mcap"}
+
+
+def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path: Path) -> None:
+    mirrored = replace(eight, source={"rig": {"mirrored": True}})
+    export_bag(mirrored, tmp_path / "r.mcap")
+    assert import_bag(tmp_path / "r.mcap").mirrored
+    heights: list[float] = []
+
+    def seen(topic: str, _: float, message: Any) -> bool:
+        heights.extend([message.pose.pose.position.z] if topic == PLACE else [])
+        return topic != "/pad/recording"
+
+    close(import_bag(changed(tmp_path / "r.mcap", tmp_path / "bag", seen)), eight)
+    np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.known]) / 1000)
+
+
+def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    first, end = (int(stamps) for stamps in (eight.begun[1] + 3, eight.begun[6] + 2))
+    span = eight.times_s[[first, end]] + [-1e-6, 1e-6]
+    kept = lambda topic, time, _: topic == "/pad/recording" or span[0] <= time <= span[1]  # noqa: E731
+    found = import_bag(changed(bag, tmp_path / "bag", kept))
+    assert found.source["note"] == "was changed since it was exported; /pad/recording is left out"
+    names = ("presses_mm", "depths_mm", "reached_mm", "forces_n")
+    part = replace(
+        eight,
+        readings=eight.readings[first : end + 1],
+        times_s=eight.times_s[first : end + 1],
+        begun=eight.begun[2:7] - first,
+        lifted=np.append(eight.lifted[2:6] - first, end + 1 - first),
+        **{name: getattr(eight, name)[2:7] for name in names},
+    )
+    close(found, part)
+
+
+def test_what_is_edited_counts(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    def moved(topic: str, _: float, message: Any) -> bool:
+        if topic == PLACE:
+            message.pose.pose.position.x += 0.001
+        return True
+
+    found = import_bag(changed(bag, tmp_path / "moved", moved))
+    np.testing.assert_allclose(found.presses_mm[:, 0], eight.presses_mm[:, 0] + 1)
+
+    def louder(topic: str, _: float, message: Any) -> bool:
+        if topic == READINGS:
+            message.data = message.data + 0.5
+        return True
+
+    found = import_bag(changed(bag, tmp_path / "louder", louder))
+    assert found == replace(eight, readings=eight.readings + 0.5)
+    assert found.source["note"] == "readings are not those that were exported"
+
+
+def test_presses_are_found_where_no_message_tells_them(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    found = import_bag(changed(bag, tmp_path / "bag", lambda topic, *_: topic == READINGS))
+    assert found.source["presses"] == "found"
+    assert len(found.presses_mm) >= 7
+    assert not found.known.any()
+
+
+def lab() -> Iterator[Message]:
+    """Readings at 50 Hz; from 1 s on a press every second, 0.4 s long, told first, at (n, -n) cm and of 2 n newton."""
+    yield "/camera", 0.0, make("String", "no picture")
+    for step in range(300):
+        time = step / 50
+        number = step // 50
+        if step % 50 == 0 and number:
+            yield "/probe", time - 0.001, pose(number / 100, -number / 100)
+            yield "/wrench", time - 0.001, wrench(0.0, 1.2 * number, -1.6 * number)
+        if step % 50 in (0, 20) and number:
+            yield "/down", time - 0.001, make("Bool", step % 50 == 0)
+        yield "/skin/all", time, array("Float32MultiArray", np.array([number, step, 512], np.float32))
+        yield "/skin/1", time, make("Int16", number)
+        yield "/skin/2", time + 0.001, make("Float64", step / 2)
+        yield "/at/y", time, make("UInt8", number)
+        yield "/at/x", time + 0.001, make("Float32", step)
+
+
+ALL = "fibres=/skin/all:mV,places=/probe,force=/wrench,press=/down"
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "packed", "folder", "sqlite3 folder"])
+def test_a_bag_of_others_comes_in_by_a_mapping(tmp_path: Path, form: str) -> None:
+    bag = write_bag(tmp_path / "lab", lab(), "sqlite3" if "sqlite3" in form else "mcap", form == "packed")
+    found = import_file(bag.parent if "folder" in form else bag, ALL)
+    n = np.arange(1, 6)
+    np.testing.assert_allclose(found.times_s, np.arange(300) / 50)
+    np.testing.assert_allclose(found.readings[123], [0.002, 0.123, 0.512])
+    np.testing.assert_allclose(found.presses_mm, np.column_stack([10 * n, -10 * n]))
+    np.testing.assert_allclose(found.forces_n, 2 * n)
+    assert found.begun.tolist() == (50 * n).tolist()
+    assert found.lifted.tolist() == (50 * n + 20).tolist()
+    assert found.source["mapping"] == ALL
+
+
+def test_topics_of_one_number_are_fibres_too_and_hold_until_the_next(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "lab", lab())
+    found = import_bag(bag, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y")
+    np.testing.assert_allclose(found.readings[60], [0.01, 59 / 200])  # the second one comes after the first
+    assert np.isnan(found.readings[0, 1])
+    middle = (found.begun + found.lifted) // 2
+    np.testing.assert_allclose(found.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 50)]))
+
+
+@pytest.mark.parametrize(
+    ("mapping", "reason"),
+    [
+        ("", r"has no topic /pad/readings; a mapping tells .* there are '/camera', '/skin/all', .* '/probe'"),
+        ("fibres=/skin", r"fibres is '/skin', expected one of '/camera', '/skin/all'"),
+        ("fibres=/camera", r"fibres is '/camera' of 'std_msgs/msg/String', expected std_msgs/msg/Float32MultiArray"),
+        ("fibres=/skin/all,places=/wrench", r"places is '/wrench' of .*WrenchStamped', expected geometry_msgs/"),
+        ("fibres=/skin/all,press=/skin/1", r"press is '/skin/1' of 'std_msgs/msg/Int16', expected std_msgs/msg/Bool"),
+        ("fibres=/skin/all,time=/skin/1", "mapping has 'time=/skin/1', expected QUANTITY=NAME"),
+        ("places=/probe", "does not name fibres, expected fibres in each"),
+        ("fibres=/skin/all,fibres=/skin/1,places=/probe:furlong", "unit of places is 'furlong'"),
+    ],
+)  # fmt: skip
+def test_a_mapping_that_does_not_fit_is_one_clear_line(tmp_path: Path, mapping: str, reason: str) -> None:
+    bag = write_bag(tmp_path / "lab", lab())
+    with pytest.raises(InputError, match=reason) as refusal:
+        import_bag(bag, mapping)
+    assert "\n" not in str(refusal.value)
+
+
+def test_arrays_that_change_their_length_and_topics_that_say_nothing_are_refused(tmp_path: Path) -> None:
+    kinds = {"other": array("Float64MultiArray", np.ones(3)), "none": array("Float64MultiArray", np.ones(0))}
+    for name, message in kinds.items():
+        bag = write_bag(tmp_path / name, [("/f", 0.1, array("Float64MultiArray", np.ones(2))), ("/f", 0.2, message)])
+        with pytest.raises(InputError, match=r"fibres is '/f': (data has 2 values in some|message 1 has no data)"):
+            import_bag(bag, "fibres=/f")
+    readings = [("/f", 0.1 * step, array("Float64MultiArray", np.ones(2))) for step in range(9)]
+    for name, pressed in (("never", [(0.2, False)]), ("before", [(0.0, True), (0.1, False)])):
+        bag = write_bag(tmp_path / name, [*readings, *(("/down", time, make("Bool", on)) for time, on in pressed)])
+        with pytest.raises(InputError, match="press is nowhere true after the first reading"):
+            import_bag(bag, "fibres=/f,press=/down")
+
+
+def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(InputError, match=r"ends in '', allowed are \.mat, \.csv, .*or a rosbag2 folder"):
+        import_file(tmp_path)
+    assert open_recording(folder)
+    bag = write_bag(tmp_path / "lab", lab())
+    (bag.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  compression_mode: FILE\n")
+    with pytest.raises(InputError, match="lab: is compressed by FILE, expected none or by chunk"):
+        import_file(bag.parent, ALL)
+    (bag.parent / "metadata.yaml").write_text("")
+    assert import_file(bag.parent, ALL).fibres == 3
+    bag.unlink()
+    with pytest.raises(InputError, match=r"has metadata\.yaml, but no file that ends in \.mcap or \.db3"):
+        import_file(bag.parent, ALL)
+
+
+def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
+    messages = list(lab())
+    for number, part in enumerate((messages[:400], messages[400:])):
+        bag = write_bag(tmp_path / f"part_{number}", part)
+        (tmp_path / "bag").mkdir(exist_ok=True)
+        bag.rename(tmp_path / "bag" / bag.name)
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    assert import_file(tmp_path / "bag", ALL) == import_file(write_bag(tmp_path / "lab", messages), ALL)
+
+
+def test_sixty_thousand_readings_go_out_and_come_back_to_the_bit_within_two_seconds(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    begun = 40 * np.arange(1500) + 20
+    times, readings = np.cumsum(random.uniform(0.06, 0.09, 60_000)), random.normal(2, 0.3, (60_000, 8))
+    recording = Recording(readings, times, random.uniform(-20, 20, (1500, 2)), begun, begun + 19)
+    import_bag(write_bag(tmp_path / "imports", lab()), ALL)
+    start = process_time()
+    export_bag(recording, tmp_path / "r.mcap")
+    again = import_bag(tmp_path / "r.mcap")
+    took_s = process_time() - start
+    assert again.digest == recording.digest
+    assert took_s < 2
+
+
+def test_the_published_recording_comes_back_to_the_bit(published: Path, tmp_path: Path) -> None:
+    recording = import_mat(published / "para5_long_first4500.mat")
+    export_bag(recording, tmp_path / "r.mcap")
+    assert import_bag(tmp_path / "r.mcap").digest == recording.digest

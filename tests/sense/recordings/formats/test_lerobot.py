@@ -1,0 +1,204 @@
+"""LeRobot datasets: each is checked for what the reader of lerobot 0.6 takes for granted of format v3.0."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from design import Morphology
+from design.common.errors import InputError
+from sense import Recording, RigSettings, simulate
+from sense.recordings.formats import lerobot
+from sense.recordings.formats.lerobot import export_lerobot
+from sense.recordings.formats.model_findings import ModelFindings
+from sense.recordings.import_export import export_file
+
+COUNTED = {"timestamp": "float32"} | dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
+STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
+
+
+@pytest.fixture(scope="module")
+def eight() -> Recording:
+    """A recording of eight presses, one of them at an unknown place, with a reading that is missing."""
+    plain = simulate(Morphology.straight(2), RigSettings(presses=8))
+    readings, places = np.array(plain.readings), np.array(plain.presses_mm)
+    readings[5, 1] = places[2] = np.nan
+    return replace(plain, readings=readings, presses_mm=places)
+
+
+def checked(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
+    """What a dataset says of itself, its columns and its episodes, after all that the format asks for was looked at."""
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert info["fps"] > 0
+    assert info["data_path"] == "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    assert info["video_path"] is None
+    assert {name: info["features"][name]["dtype"] for name in COUNTED} == COUNTED
+    episodes = pq.read_table(sorted((folder / "meta" / "episodes").glob("*/*.parquet"))).to_pylist()
+    assert info["splits"] == {"train": f"0:{len(episodes)}"}
+    assert info["total_episodes"] == len(episodes)
+    tasks = pq.read_table(folder / "meta" / "tasks.parquet")
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]  # pandas has the text as index
+    assert tasks["task_index"].to_pylist() == list(range(info["total_tasks"]))
+    columns = read_columns(folder, info, episodes)
+    check_counts(info, columns, episodes, tasks["task"].to_pylist())
+    check_statistics(folder, info, columns, episodes)
+    return info, columns, episodes
+
+
+def read_columns(folder: Path, info: dict[str, Any], episodes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """All frames, from the files in which the episodes say that they lie, a group of rows for each episode."""
+    parts: list[dict[str, np.ndarray]] = []
+    path = folder
+    files = sorted({(each["data/chunk_index"], each["data/file_index"]) for each in episodes})
+    assert len(files) == len(list((folder / "data").glob("*/*.parquet")))
+    for chunk, file in files:
+        path = folder / info["data_path"].format(chunk_index=chunk, file_index=file)
+        table = pq.read_table(path)
+        assert set(table.column_names) == set(info["features"])
+        held = [each for each in episodes if (each["data/chunk_index"], each["data/file_index"]) == (chunk, file)]
+        assert [each["episode_index"] for each in held] == sorted(set(table["episode_index"].to_pylist()))
+        assert pq.ParquetFile(path).num_row_groups == len(held)
+        parts.append({name: np.array(table[name].to_pylist()) for name in table.column_names})
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    schema = pq.read_schema(path)
+    for name, about in info["features"].items():
+        kind = schema.field(name).type
+        wanted = tuple(about["shape"])
+        assert "/" not in name
+        number = {"float32": "float", "int64": "int64"}[about["dtype"]]
+        assert str(kind) == (number if wanted == (1,) else f"fixed_size_list<element: {number}>[{wanted[0]}]")
+        assert columns[name].shape[1:] == (() if wanted == (1,) else wanted)
+        assert about["names"] is None or len(about["names"]) == wanted[0]
+    return columns
+
+
+def check_counts(
+    info: dict[str, Any], columns: dict[str, np.ndarray], episodes: list[dict[str, Any]], tasks: list[str]
+) -> None:
+    assert columns["index"].tolist() == list(range(info["total_frames"]))
+    end = 0
+    for number, episode in enumerate(episodes):
+        assert episode["episode_index"] == number
+        assert (episode["dataset_from_index"], episode["dataset_to_index"]) == (end, end + episode["length"])
+        rows = slice(end, end := end + episode["length"])
+        assert set(columns["episode_index"][rows]) == {number}
+        assert columns["frame_index"][rows].tolist() == list(range(episode["length"]))
+        np.testing.assert_allclose(columns["timestamp"][rows] * info["fps"], np.arange(episode["length"]), atol=1e-4)
+        assert {tasks[at] for at in columns["task_index"][rows]} == set(episode["tasks"])
+        assert episode["meta/episodes/chunk_index"] == episode["meta/episodes/file_index"] == 0
+    assert end == info["total_frames"]
+
+
+def check_statistics(
+    folder: Path, info: dict[str, Any], columns: dict[str, np.ndarray], episodes: list[dict[str, Any]]
+) -> None:
+    whole = json.loads((folder / "meta" / "stats.json").read_text())
+    assert set(whole) == set(info["features"])
+    for name, values in columns.items():
+        assert set(whole[name]) == STATISTICS
+        rows = values.reshape(len(values), -1).astype(float)
+        spans = [(each["dataset_from_index"], each["dataset_to_index"]) for each in episodes]
+        told = [{key: each[f"stats/{name}/{key}"] for key in STATISTICS} for each in episodes]
+        for (start, end), about in zip([(0, len(rows)), *spans], [whole[name], *told], strict=True):
+            part = rows[start:end]
+            assert about["count"] == [len(part)]
+            for key, expected in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
+                np.testing.assert_allclose(about[key], expected(part, axis=0), rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(about["q90"], np.nanquantile(part, 0.9, axis=0), rtol=1e-5)
+
+
+def test_a_dataset_has_all_that_the_format_asks_for(eight: Recording, tmp_path: Path) -> None:
+    export_file(eight, tmp_path / "set", "lerobot")
+    info, columns, episodes = checked(tmp_path / "set")
+    assert info["fps"] == 13
+    assert len(episodes) == 7
+    assert info["features"]["observation.state"]["names"] == [f"fibre_{i}_v" for i in range(4)]
+    assert info["features"]["action"]["names"] == ["x_mm", "y_mm", "depth_mm", "down"]
+    assert [file.name for file in tmp_path.iterdir()] == ["set"]
+    kept = np.delete(np.arange(8), 2)
+    for press, episode in zip(kept, episodes, strict=True):
+        rows = slice(episode["dataset_from_index"], episode["dataset_to_index"])
+        action = columns["action"][rows]
+        told = [*eight.presses_mm[press], eight.depths_mm[press]]
+        np.testing.assert_allclose(action[:, :3], np.tile(told, (len(action), 1)), rtol=1e-6)
+        down = np.flatnonzero(action[:, 3])
+        first = (0 if press == 0 else (eight.lifted[press - 1] + eight.begun[press]) // 2) + down[0]
+        assert (first, len(down)) == (eight.begun[press], eight.lifted[press] - eight.begun[press])
+        start = first - down[0]
+        state = columns["observation.state"][rows]
+        np.testing.assert_array_equal(state, eight.readings[start : start + len(state)].astype(np.float32))
+        times = eight.times_s[start : start + len(state)]
+        np.testing.assert_allclose(columns["observation.time"][rows], times - times[0], atol=1e-5)
+
+
+def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recording, tmp_path: Path) -> None:
+    known = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm), forces_n=np.arange(8.0))
+    touches = ModelFindings(
+        np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), np.full(8, np.nan), np.full(8, np.nan)
+    )
+    export_lerobot(known, tmp_path / "set", touches)
+    info, columns, _ = checked(tmp_path / "set")
+    assert info["total_frames"] == len(known.readings)
+    assert info["features"]["observation.touch"]["names"] == ["x_mm", "y_mm", "r90_mm", "found"]
+    over = columns["observation.touch"][:, 3] == 1
+    assert set(map(tuple, columns["observation.touch"][over])) == {(3.0, 3.0, 2.5, 1.0)}
+    assert not columns["observation.touch"][~over].any()
+    assert not (over & (columns["action"][:, -1] == 1)).any()
+    assert columns["observation.force"].max() == 7
+
+
+@pytest.mark.parametrize(("slower", "fps"), [(1.0, 13), (10.0, 1.34), (0.05, 268)])
+def test_rates_are_whole_numbers_unless_that_is_far_off(
+    eight: Recording, tmp_path: Path, slower: float, fps: float
+) -> None:
+    export_lerobot(replace(eight, times_s=eight.times_s * slower), tmp_path / "set")
+    info, _, _ = checked(tmp_path / "set")
+    assert info["fps"] == pytest.approx(fps, rel=0.02)
+    assert isinstance(info["fps"], int) == (slower < 2)
+
+
+def test_long_recordings_go_to_several_files_and_one_fibre_is_a_number(
+    eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lerobot, "_MB", 50)
+    monkeypatch.setattr(lerobot, "CHUNK_FILES", 2)
+    export_lerobot(replace(eight, readings=eight.readings[:, :1]), tmp_path / "set")
+    info, _, episodes = checked(tmp_path / "set")
+    assert info["features"]["observation.state"]["shape"] == [1]
+    assert {(each["data/chunk_index"], each["data/file_index"]) for each in episodes} == {
+        (0, 0),
+        (0, 1),
+        (1, 0),
+        (1, 1),
+    }
+
+
+def test_a_folder_appears_whole_or_not_at_all(
+    eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(lerobot, "write_json", full)
+        with pytest.raises(InputError, match=r"set: cannot be written \(No space left"):
+            export_lerobot(eight, tmp_path / "set")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "set").mkdir()
+    export_lerobot(eight, tmp_path / "set")
+    with pytest.raises(InputError, match="set: exists and is not empty"):
+        export_lerobot(eight, tmp_path / "set")
+    unknown = replace(eight, presses_mm=np.full((8, 2), np.nan))
+    with pytest.raises(InputError, match="no place of a press is known"):
+        export_lerobot(unknown, tmp_path / "other")
+
+
+def test_without_pyarrow_it_is_one_line(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"set: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):
+        export_lerobot(eight, tmp_path / "set")
