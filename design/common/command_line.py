@@ -5,7 +5,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .errors import Fault, InputError
+from .errors import Fault, InputError, what_to_install
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -108,8 +108,12 @@ def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> No
 INTERRUPTED = 130
 
 
-def run_to_end(command: click.Command, name: str) -> int:
-    """Run a command line on the arguments of this process; its exit code, with one line on stderr where it failed."""
+def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
+    """Run a command line on the arguments of this process; its exit code, with one line on stderr where it failed.
+
+    Args:
+        extras: what has to be installed for its commands, by the first word of each; for others it is all of these.
+    """
     _prepare()
     try:
         _require_words(sys.argv[1:])
@@ -127,6 +131,11 @@ def run_to_end(command: click.Command, name: str) -> int:
         return _fail(name, str(fault), fault.exit_code)
     except OSError as error:
         return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
+    except ModuleNotFoundError as error:
+        message = what_to_install(error, extras.get("".join(sys.argv[1:2]), ",".join(dict.fromkeys(extras.values()))))
+        if message is None:
+            raise
+        return _fail(name, message, 2)
     except MemoryError as error:
         return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})", 2)
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from numbers import Integral, Real
@@ -34,6 +35,36 @@ class Fault(Exception):  # noqa: N818  of things outside the program, not an err
 
     exit_code = 1
 
+
+def what_to_install(error: ModuleNotFoundError, wanted: str = "") -> str | None:
+    """What makes up for a library that is missing, on one line; None if no extra of padforge brings it.
+
+    What extras bring is read from what is installed of padforge itself, so that it is said in one place.
+
+    Args:
+        wanted: extras, with commas between them, that whatever was tried needs in any case.
+    """
+    from importlib.metadata import PackageNotFoundError, requires
+
+    module = (error.name or "").partition(".")[0]
+    library = _LIBRARIES.get(module, module)
+    try:
+        needs = requires("padforge") or ()
+    except PackageNotFoundError:
+        return None
+    by = [re.search(r"""extra == ['"]([\w-]+)""", need) for need in needs if re.match(rf"{library}\b(?![-\w])", need)]
+    extras = [found[1] for found in by if found and found[1] not in ("all", "test", "figures")]
+    if not extras:
+        return None
+    extra = wanted if {*wanted.split(",")} & {*extras} else extras[0]
+    return f"this needs {library}, which is not installed: pip install 'padforge[{extra}]'"
+
+
+_LIBRARIES = {
+    **{"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"},
+    **dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde"),
+}
+"""Libraries by the module they bring, where the names differ."""
 
 MOST_VALUES = 2**28
 """Most numbers an array may hold that a public function is given or makes: 2 GiB of them."""

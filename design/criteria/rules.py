@@ -4,6 +4,7 @@ The search has a differentiable penalty for some of them (`penalties`); what cou
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -18,6 +19,8 @@ from design.pad.morphology import Morphology
 from design.settings import Layout, PadSettings, RulesSettings
 
 _TOLERANCE_MM = 1e-3
+_REMEMBERED = 256
+"""Bends and folds of fibres that are known without another look: whoever draws one fibre leaves the others."""
 _FOLD_TOLERANCE = 1e-4  # of the gap where that is more: all points within a gap of each other are compared
 
 _FINEST_TURN = 1e-4
@@ -97,16 +100,27 @@ def tight_bends(pad: Morphology, limit: float, bent_radius_mm: float | None = No
     turned = np.abs(np.diff(extreme_headings(slopes))).sum(axis=1)
     around = 0.0 if bent_radius_mm is None else window / bent_radius_mm  # most that it turns so, in a window
     found = []
-    for fibre in np.flatnonzero(turned + around > angle):
-        # An end of the window that falls between two points is off by less than the turn from one to the other.
-        points, headings = traced_curve(spans[fibre], slopes[fibre], step=max(angle / 200, _FINEST_TURN))
-        points = pad.to_mm(points)
-        across = pad.layout.family(int(fibre)) * np.pi / 2
-        rolled = 0.0 if bent_radius_mm is None else rolled_turns(points, headings - across, bent_radius_mm)
-        radius, place = bend_radius(points, headings, window, rolled)
+    for fibre in map(int, np.flatnonzero(turned + around > angle)):
+        course = spans[fibre].tobytes(), slopes[fibre].tobytes()
+        radius, place = _least_bend(*course, pad.layout.family(fibre), pad.unit_mm, window, limit, bent_radius_mm)
         if radius < limit:
-            found.append(Violation("min_bend_radius_mm", (int(fibre) + 1,), radius, limit, _place(place)))
+            found.append(Violation("min_bend_radius_mm", (fibre + 1,), radius, limit, _place(pad.to_mm(place))))
     return found
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _least_bend(
+    spans: bytes, slopes: bytes, family: int, unit_mm: float, window: float, limit: float, bent_radius_mm: float | None
+) -> tuple[float, Array]:
+    """`bend_radius` in mm of one fibre, of its Bezier spans in grid units, and where it is, grid units."""
+    # An end of the window that falls between two points is off by less than the turn from one to the other.
+    curve = np.frombuffer(spans).reshape(-1, 4, 2), np.frombuffer(slopes).reshape(-1, 3)
+    points, headings = traced_curve(*curve, step=max(window / limit / 200, _FINEST_TURN))
+    points = points * unit_mm
+    across = family * np.pi / 2
+    rolled = 0.0 if bent_radius_mm is None else rolled_turns(points, headings - across, bent_radius_mm)
+    radius, place = bend_radius(points, headings, window, rolled)
+    return radius, place / unit_mm
 
 
 def _gaps(lines: list[Array], layout: Layout, limit: float) -> list[Violation]:
@@ -133,10 +147,15 @@ def _folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]
         lines = [pad.to_mm(points) for points in flatten(pad, _FOLD_TOLERANCE * limit / pad.unit_mm)]
     found = []
     for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
-        fold = fold_gap(lines[fibre], limit)
+        fold = _least_fold(lines[fibre].tobytes(), limit)
         if fold is not None:
             found.append(Violation("min_gap_mm", (int(fibre) + 1,), fold[0], limit, _place(fold[1])))
     return found
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _least_fold(line: bytes, limit: float) -> tuple[float, Array] | None:
+    return fold_gap(np.frombuffer(line).reshape(-1, 2), limit)
 
 
 def _crossings(pad: Morphology, rules: RulesSettings) -> list[Violation]:

@@ -30,15 +30,17 @@ def draw_plan(
     half, longer = max(width, height), 6.4 / max(width, height)
     figure = Figure(figsize=(max(longer * width, 4.8), max(longer * height, 2.4)), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
-    axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT))
+    axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT, gid="pad"))
     for corners in keep_out_mm:
         axes.add_patch(Polygon(np.array(corners), facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
     for fibre, points in enumerate(flatten(pad, 1e-3)):
         horizontal = not pad.layout.family(fibre)
         x, y = pad.to_mm(points).T
-        axes.plot(x, y, color=HORIZONTAL if horizontal else VERTICAL, linewidth=1.6, solid_capstyle="round")
+        color, gid = (HORIZONTAL, "horizontal") if horizontal else (VERTICAL, "vertical")
+        gid += f"-{fibre + 1 - pad.layout.families[not horizontal].start}"  # so that a drawing can be read again
+        (line,) = axes.plot(x, y, color=color, linewidth=1.6, solid_capstyle="round", gid=gid)
+        line.get_path().should_simplify = False
         ha, va, dx, dy = ("left", "center", 0.02, 0) if horizontal else ("center", "bottom", 0, 0.02)
-        color = HORIZONTAL if horizontal else VERTICAL
         axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
     places = [(pad.to_mm(c.place), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)]
     for same, size, color in ((False, 10, INK), (True, 40, ALARM)):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from design.common.page.elements import resource
+from design.common.page.shipped import resource
 from fabricate.mesh_files import read_mesh
 
 from .fibre_layers import COLOURS, FAMILIES

@@ -154,7 +154,8 @@ def _fill() -> None:
     Path("bad.toml").write_text("[pad]\ngrid = 'x'\n")
     for command in (
         ("design", "--out", "pad"),
-        ("fabricate", "pad/morphology.json", "--formats", "stl,3mf"),
+        ("design", "show", "pad/morphology.json", "--out", "plan.svg"),
+        ("fabricate", "pad/morphology.json", "--formats", "stl,3mf,dxf"),
         ("sense", "record", "--morphology", "pad/morphology.json", "--out", "pad/recording"),
         ("sense", "calibrate", "pad/recording", "--out", "pad"),
         ("sense", "export", "pad/recording", "presses.csv"),
@@ -163,6 +164,7 @@ def _fill() -> None:
     ):
         ended = call(*command, limit_s=120)
         assert ended.code == 0, ended
+    Path("pad/tracks.dxf").rename("plan.dxf")
     Path("empty").mkdir()
     Path("folder.json").mkdir()
     Path("folder.toml").mkdir()

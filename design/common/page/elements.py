@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -20,6 +19,8 @@ from markdown_it.tree import SyntaxTreeNode
 
 from design.common.errors import InputError
 from design.common.files import read_bytes
+
+from .shipped import resource
 
 _HERE = "design.common.page"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
@@ -92,11 +93,6 @@ def _element(kind: str, *content: object) -> str:
     """An element of `elements.html`."""
     elements: Any = _templates().get_template("elements.html").module
     return getattr(elements, kind)(*content)
-
-
-def resource(package: str, name: str) -> str:
-    """The text of a file that a package ships."""
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def heading(text: str) -> str:

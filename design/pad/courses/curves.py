@@ -76,11 +76,12 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
     if counts.sum() > MOST_POINTS:
         raise InputError(f"tolerance is {tolerance:g}: that takes {counts.sum()} points, allowed are {MOST_POINTS}")
-    lines = []
-    for spans, steps in zip(curves, counts, strict=True):
-        pieces = [cubic(span, np.arange(n) / n) for span, n in zip(spans, steps, strict=True)]
-        lines.append(np.vstack([*pieces, spans[-1, -1:]]))
-    return lines
+    steps = counts.ravel()
+    starts = np.cumsum(steps) - steps  # a pad's spans at once: many take no longer than a few
+    u = (np.arange(steps.sum()) - np.repeat(starts, steps)) / np.repeat(steps, steps)
+    points = cubic(np.repeat(curves.reshape(-1, 4, 2), steps, axis=0), u)
+    fibres = np.split(points, starts.reshape(counts.shape)[1:, 0])
+    return [np.vstack([line, spans[-1, -1:]]) for line, spans in zip(fibres, curves, strict=True)]
 
 
 def lengths(pad: Morphology) -> Array:

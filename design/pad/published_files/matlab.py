@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 
 from design.common.errors import InputError
 from design.common.files import read_bytes, require_file
@@ -37,7 +36,7 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
     """
     try:
         content = _load_hdf5(path) if _is_hdf5(path) else _load_elements(path)
-    except InputError:
+    except (InputError, ModuleNotFoundError):
         raise
     except Exception as error:  # both readers raise whatever a torn stream leads them to
         raise InputError(f"{path}: not a readable MATLAB file, torn or of another kind ({error})") from error
@@ -73,10 +72,18 @@ def _load_hdf5(path: Path) -> dict[str, Any]:
 
 
 def _load_elements(path: Path) -> dict[str, Any]:
+    import scipy.io  # noqa: F401  here, not first in the child that tries: this process is to have it loaded
+
     stored = read_bytes(path)
     _refuse_swollen(stored)
     _refuse_crashing(stored)
-    return scipy.io.loadmat(io.BytesIO(stored))
+    return _loaded(stored)
+
+
+def _loaded(stored: bytes) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    return loadmat(io.BytesIO(stored))
 
 
 def _refuse_swollen(stored: bytes) -> None:
@@ -104,7 +111,7 @@ def _refuse_crashing(stored: bytes) -> None:
             faulthandler.disable()
             warnings.simplefilter("ignore")
             _limit_memory()
-            scipy.io.loadmat(io.BytesIO(stored))
+            _loaded(stored)
         except MemoryError:
             failed = 1
         except BaseException:  # it is for the parent to tell

@@ -183,8 +183,6 @@ def test_parameters_of_another_kind_are_refused(para):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a child process that is a copy of this one")
 def test_a_file_that_breaks_the_compiled_reader_is_refused(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "bad.mat", {"para": np.zeros(1)})
-    monkeypatch.setattr(
-        "design.pad.published_files.matlab.scipy.io.loadmat", lambda file: os.kill(os.getpid(), signal.SIGSEGV)
-    )
+    monkeypatch.setattr("scipy.io.loadmat", lambda file: os.kill(os.getpid(), signal.SIGSEGV))
     with pytest.raises(InputError, match=r"bad\.mat: not a readable MATLAB file.*the reader breaks down over it"):
         Morphology.load(tmp_path / "bad.mat")

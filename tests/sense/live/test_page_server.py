@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from design.common.errors import InputError
-from sense.live import page_server
-from sense.live.page_server import HOST, LivePage
+from design.common.page.local_page import local_page
+from design.common.page.local_page.listening import HOST
+from sense.live.page_server import LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
@@ -57,7 +58,7 @@ def told(page: LivePage) -> Iterator[Iterator[dict]]:
 
 def test_a_browser_leaves_the_port_of_http_out(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
     assert get(page, "/", "localhost").status == 403
-    monkeypatch.setattr(page_server, "HTTP_PORT", port_of(page))
+    monkeypatch.setattr(local_page, "HTTP_PORT", port_of(page))
     assert [get(page, "/", name).status for name in ("localhost", HOST, "elsewhere")] == [200, 200, 403]
 
 
@@ -67,6 +68,7 @@ def test_the_page_is_served_and_allows_its_own_script_alone(name: str) -> None:
         response = get(page, "/")
         text = response.read().decode()
     assert "common." not in text
+    assert "local_page." not in text
     assert response.status == 200
     assert text.startswith("<!doctype html>")
     policy = response.headers["Content-Security-Policy"]
@@ -265,7 +267,7 @@ def test_a_browser_shows_where_to_press_and_says_what_is_said(asking: LivePage, 
 def test_a_browser_shows_the_pad_as_it_lies(asking: LivePage, browser: Chromium, mirrored: bool) -> None:
     asking.show(HAND | {"target": [11.0, -2.0], "mirrored": mirrored})
     browser.open(asking.url)
-    browser.wait_for("document.querySelector('.press .ring')")
+    browser.wait_for("document.querySelector('.press .ring') != null")
     centre = "(({x, y, width, height}) => [x + width / 2, y + height / 2])(document.querySelector('{}').getBBox())"
     ring, edge = (browser.ask(centre.replace("{}", part)) for part in (".press .ring", "#pad .edge"))
     width = browser.ask("document.querySelector('#pad .edge').getBBox().width")

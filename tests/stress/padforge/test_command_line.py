@@ -115,6 +115,10 @@ COMMANDS: dict[tuple[str, ...], tuple[list[tuple[str, ...]], dict[str, tuple[str
     ("design", "show"): ([MORPHOLOGY], {"--spec": SPEC, "--out": ("new.svg", "new.png")}),
     ("design", "check"): ([MORPHOLOGY], {"--spec": SPEC, "--json": None}),
     ("design", "score"): ([MORPHOLOGY], {"--spec": SPEC}),
+    ("design", "import"): (
+        [("plan.svg", "plan.dxf")],
+        {"--spec": SPEC, "--tolerance-mm": ("0.05", "1e-3", "10"), "--out": FOLDER, "--json": None},
+    ),
     ("fabricate",): (
         [MORPHOLOGY],
         {"--formats": ("stl", "3mf,svg", "", "dxf,png"), "--spec": SPEC, "--out": FOLDER, "--json": None},

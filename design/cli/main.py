@@ -19,6 +19,9 @@ from design.common.command_line import (
     spec_option,
 )
 
+from .drawing import import_
+from .editing import edit
+
 if TYPE_CHECKING:
     from design.report.comparison import Making
 
@@ -70,6 +73,8 @@ def design(
     padforge design --from out/pad/morphology.json    improves on a pad
     padforge design --twin out/pad/twin.json          for what presses of a printed pad have shown
     padforge design check out/pad/morphology.json     exit 1 if a rule is broken
+    padforge design edit out/pad/morphology.json      fibres drawn by hand, in a browser
+    padforge design import plan.svg                   fibres drawn elsewhere
 
     Writes morphology.json, design.json, design.svg and design.png. Exit 1 if the best pad breaks a rule. Ctrl-C ends
     with the best so far (exit 130); that and a kill leave what --resume goes on from.
@@ -121,8 +126,7 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     """
     from design.criteria.rules import check_rules
     from design.pad.morphology import Morphology
-
-    from .settings import PadSettings, RulesSettings
+    from design.settings import PadSettings, RulesSettings
 
     pad, settings = Morphology.load(morphology), load_spec(spec)
     size = settings.section(PadSettings, **pad.layout.settings)
@@ -148,8 +152,7 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     from design.evaluation.expected_error import error_terms, expected_errors
     from design.pad.morphology import Morphology
     from design.report.twin_settings import settings_for_twin
-
-    from .settings import Contact, PadSettings, RulesSettings, SearchSettings
+    from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
     if twin is not None:
@@ -162,6 +165,10 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
         terms |= error_terms(expected_errors(pad, *asked, size))
     found = [asdict(violation) for violation in check_rules(pad, rules, size)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)
+
+
+design.add_command(edit)
+design.add_command(import_)
 
 
 def compare_command(making: "Making") -> click.Command:

@@ -1,0 +1,1 @@
+"""Drawing fibres by hand, in a browser of this machine."""

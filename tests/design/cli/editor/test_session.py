@@ -1,0 +1,153 @@
+"""A pad being drawn: what is asked for is done, within what a pad allows; what cannot be done changes nothing."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
+from design.cli.editor.answers import Answers
+from design.cli.editor.session import Session
+from design.cli.main import design
+from design.criteria.score import ambiguities
+
+
+def session(tmp_path, pad=None, **size):
+    shown, source = [], None
+    if pad is not None:
+        source = tmp_path / "pad.json"
+        pad.save(source)
+        size = dict(pad.layout.settings)
+    judged = Answers(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(lost=1))
+    begun = Session(judged, source, tmp_path / "out.json", shown.append)
+    begun.begin()
+    return begun, shown
+
+
+def ask(begun, **edit):
+    return begun.edit(json.dumps(edit).encode())
+
+
+def move(begun, fibre, knot, x_mm, y_mm, gesture=""):
+    return ask(begun, do="move", fibre=fibre, knot=knot, x_mm=x_mm, y_mm=y_mm, gesture=gesture)
+
+
+def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
+    pad = Morphology.random((2, 3), 4, 1, (9.0, 12.0))
+    _, shown = session(tmp_path, pad)
+    assert [view["ready"] for view in shown] == [False, True]
+    view = shown[-1]
+    size = PadSettings().of(pad.layout)
+    assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
+    assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, SearchSettings().noise, size), abs=3e-4)
+    assert np.mean(view["map"], axis=1) == pytest.approx(view["ambiguity"], abs=1e-4)
+    assert np.array(view["fibres"][4]["knots"]) == pytest.approx(pad.to_mm(pad.knots[4]), abs=1e-4)
+    assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
+
+
+def test_a_knot_goes_where_it_is_taken_within_its_neighbours_and_the_pad(tmp_path):
+    begun, _ = session(tmp_path, grid=2, pitch_mm=10.0)
+    knots = np.array(move(begun, 1, 3, 0.7, 4.0)["fibres"][0]["knots"])
+    assert knots[3] == pytest.approx([0.7, 4.0])
+    knots = np.array(move(begun, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
+    assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
+    assert knots[3, 1] == -15
+    knots = np.array(move(begun, 3, 1, 900.0, -900.0)["fibres"][2]["knots"])
+    assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
+
+
+def test_drags_are_undone_at_once_and_done_again(tmp_path):
+    begun, shown = session(tmp_path, grid=2)
+    first = shown[-1]["fibres"]
+    for y_mm in (1.0, 2.0, 3.0):
+        move(begun, 1, 2, -5.0, y_mm, "drag 1")
+    after = move(begun, 1, 2, -5.0, 4.0, "drag 2")
+    assert (after["unsaved"], after["can_undo"], after["can_redo"]) == (True, True, False)
+    assert ask(begun, do="undo")["fibres"][0]["knots"][2][1] == pytest.approx(3.0)
+    undone = ask(begun, do="undo")
+    assert (undone["fibres"], undone["unsaved"], undone["can_undo"]) == (first, False, False)
+    assert ask(begun, do="undo")["fibres"] == first
+    ask(begun, do="redo")
+    assert ask(begun, do="redo")["fibres"] == after["fibres"]
+    assert [view["number"] for view in shown[1:]] == list(range(1, len(shown)))
+
+
+def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
+    begun, shown = session(tmp_path, Morphology.random(2, 5, 3))
+    before = shown[-1]
+    more = ask(begun, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
+    fibre, knot = more["at"]
+    assert (fibre, len(more["fibres"][1]["knots"])) == (1, 8)
+    assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
+    for each in (0, 2, 3):
+        assert more["fibres"][each]["knots"] == before["fibres"][each]["knots"]
+    assert len(ask(begun, do="add", fibre=2)["fibres"][1]["knots"]) == 9
+    ask(begun, do="undo")
+    fewer = ask(begun, do="remove", fibre=2, knot=knot)
+    assert fewer["fibres"][1]["knots"] == before["fibres"][1]["knots"]
+
+
+def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
+    begun, _ = session(tmp_path, Morphology.random(2, 3, 3))
+    ask(begun, do="add", fibre=1)
+    move(begun, 1, 1, -10.0, 2.0)
+    saved = begun.save(b"{}")
+    assert (saved["unsaved"], saved["told"]) == (False, f"saved to {tmp_path / 'out.json'}")
+    pad = Morphology.load(tmp_path / "out.json")
+    assert pad.to_mm(pad.knots[0])[1] == pytest.approx(saved["fibres"][0]["knots"][1], abs=1e-4)
+    assert saved["fibres"][0]["knots"][1][1] == 2.0
+    assert pad.provenance["command"] == "padforge design edit"
+    assert list(pad.provenance["inputs"]) == ["pad.json"]
+    broken = [str(found) for found in check_rules(pad, RulesSettings())]
+    assert [rule["text"] for rule in saved["rules"]] == broken
+    checked = CliRunner().invoke(design, ["check", str(tmp_path / "out.json")], catch_exceptions=False)
+    assert checked.output.splitlines() == broken
+    assert (begun.unsaved, ask(begun, do="undo")["unsaved"]) == (False, True)
+
+
+HOSTILE = (
+    *(b"", b"nonsense", b"[]", b"null", b"4", b"[" * 4000, b'{"do":' * 600, b'"\\ud800"', b"\xff\xfe", b"9" * 4000),
+    *(b"{}", b'{"do": "shell"}', b'{"do": ["move"]}', b'{"do": "move"}', b'{"do": "remove", "fibre": 1}'),
+    *(b'{"do": "remove", "fibre": 1, "knot": %d}' % knot for knot in (-1, 0, 6, 10**30)),
+    *(b'{"do": "add", "fibre": %s}' % fibre for fibre in (b"0", b"5", b"1.5", b"true", b"NaN", b'"1"', b"[1]")),
+    *(
+        b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0}' % x_mm
+        for x_mm in (b"NaN", b"Infinity", b"1e999", b"1e7", b'"0"', b"[]", b"true", b"9" * 400)
+    ),
+    b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0, "gesture": "%s"}' % (b"x" * 50),
+    b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0, "gesture": {}}',
+)
+
+
+@pytest.mark.parametrize("body", HOSTILE, ids=lambda body: repr(body[:40]))
+def test_what_cannot_be_done_changes_nothing(tmp_path, body):
+    begun, shown = session(tmp_path, grid=2)
+    with pytest.raises(InputError) as refused:
+        begun.edit(body)
+    assert len(str(refused.value).splitlines()) == 1
+    assert len(str(refused.value)) < 300
+    assert len(shown) == 2
+    assert ask(begun, do="undo")["fibres"] == shown[1]["fibres"]
+
+
+def test_a_fibre_has_no_more_knots_than_it_may_and_none_where_there_is_no_room(tmp_path):
+    begun, _ = session(tmp_path, grid=1)
+    for _ in range(59):
+        ask(begun, do="add", fibre=1)
+    with pytest.raises(InputError, match="64 knots"):
+        ask(begun, do="add", fibre=1)
+    for _ in range(64):
+        ask(begun, do="remove", fibre=1, knot=1)
+    with pytest.raises(InputError, match="no knot"):
+        ask(begun, do="remove", fibre=1, knot=1)
+    assert ask(begun, do="add", fibre=1)["at"] == (0, 1)
+
+
+def test_a_disk_that_refuses_is_told_and_nothing_is_lost(tmp_path):
+    begun, _ = session(tmp_path, grid=1)
+    move(begun, 1, 1, 0.0, 3.0)
+    (tmp_path / "out.json").mkdir()
+    with pytest.raises(InputError, match=r"out.json: cannot be written"):
+        begun.save(b"{}")
+    assert begun.unsaved

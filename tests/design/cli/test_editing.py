@@ -1,0 +1,255 @@
+"""`padforge design edit` from outside: as a program with its page, asked over HTTP and drawn on in a browser."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from design import Morphology
+from design.cli.editing import edit
+from design.cli.main import design
+from tests.helpers.chromium import CHROMIUM, Chromium
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="Ctrl-C is a signal here")
+PATIENCE_S = 120
+"""Kernels may have to be compiled first."""
+
+
+class Program:
+    """The command at work."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        words = ("-m", "padforge", "design", "edit", "--port", "0", *arguments)
+        root = Path(__file__).resolve().parents[3]
+        where = {"cwd": folder, "env": os.environ | {"PYTHONPATH": str(root)}}
+        self.process = subprocess.Popen([sys.executable, *words], stderr=subprocess.PIPE, text=True, **where)
+        assert self.process.stderr is not None
+        self.said = self.process.stderr.readline()
+        self.url = re.findall(r"http://\S+/", self.said)[0]
+        self.origin = self.url.rstrip("/")
+
+    def post(self, path: str, body: bytes, **headers: str) -> tuple[int, bytes]:
+        connection = HTTPConnection(self.origin.removeprefix("http://"), timeout=PATIENCE_S)
+        connection.request("POST", path, body, {"Origin": self.origin} | headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+
+    def ask(self, **edit: Any) -> dict[str, Any]:
+        status, answer = self.post("/edit", json.dumps(edit).encode())
+        assert status == 200, answer
+        return json.loads(answer)
+
+    def end(self) -> tuple[int, str]:
+        """Its exit code, and what else it has said, after Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        _, said = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, said
+
+
+@pytest.fixture
+def pad(tmp_path: Path) -> Path:
+    path = tmp_path / "pad.json"
+    Morphology.straight(2, 10.0).save(path)
+    Morphology.random(2, 3, 7, 10.0).save(path)
+    return path
+
+
+@pytest.fixture
+def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
+    program = Program(tmp_path, "pad.json")
+    try:
+        yield program
+    finally:
+        program.process.kill()
+        program.process.communicate()
+
+
+def test_what_is_hostile_is_refused_and_the_pad_is_as_it_was(program: Program, tmp_path: Path, pad: Path) -> None:
+    before = pad.read_bytes()
+    first = program.ask(do="undo")
+    port = program.origin.rpartition(":")[2]
+    move = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0}'
+    refused = [
+        program.post("/edit", move, Origin="http://elsewhere.example"),
+        program.post("/edit", move, Host="elsewhere.example", Origin="http://elsewhere.example"),
+        program.post("/edit", move, Origin=f"http://127.0.0.1:{int(port) + 1}"),
+        program.post("/save", b"{}", Origin="null"),
+        program.post("/shell", move),
+        program.post("/edit", b" " * 100_000 + move),
+        program.post("/edit", b"[" * 4000),
+        program.post("/edit", move.replace(b'"x_mm": 0', b'"x_mm": NaN')),
+        program.post("/edit", move.replace(b'"knot": 1', b'"knot": 99')),
+        program.post("/edit", move.replace(b'"fibre": 1', b'"fibre": 0')),
+        program.post("/edit", b'{"do": "move", "a": ' + b'{"a": ' * 500 + b"1" + b"}" * 501),
+        program.post("/edit", b"\x00\xff"),
+    ]
+    assert [status for status, _ in refused] == [403, 403, 403, 403, 404, 413, 400, 400, 400, 400, 400, 400]
+    assert not any(b"Traceback" in answer for _, answer in refused)
+    after = program.ask(do="undo")
+    assert after["fibres"] == first["fibres"]
+    code, said = program.end()
+    assert (code, "Traceback" in said, "not kept" in said) == (130, False, False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.json"]
+    assert pad.read_bytes() == before
+
+
+def test_it_saves_beside_the_pad_and_tells_what_is_not_kept(program: Program, tmp_path: Path, pad: Path) -> None:
+    assert "saves to pad-edited.json" in program.said
+    program.ask(do="add", fibre=1)
+    assert program.post("/save", b"{}")[0] == 200
+    program.ask(do="undo")
+    code, said = program.end()
+    assert (code, said.splitlines()[0]) == (130, "what was drawn since the last save is not kept")
+    assert Morphology.load(tmp_path / "pad-edited.json").knots.shape == (4, 6, 2)
+    assert Morphology.load(pad).knots.shape == (4, 5, 2)
+
+
+def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None:
+    program = Program(tmp_path, "pad.json", "--out", "pad.json")
+    assert program.said.endswith("saves to pad.json in place of what it has\n")
+    program.ask(do="add", fibre=1)
+    assert program.post("/save", b"{}")[0] == 200
+    code, said = program.end()
+    assert (code, "not kept" in said) == (130, False)
+    assert Morphology.load(pad).knots.shape == (4, 6, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["missing.json"], "missing.json"),
+        (["pad.json", "--out", "pad.mat"], r"--out is pad.mat, allowed is a name that ends in \.json"),
+        (["pad.json", "--out", "pad.json/x.json"], r"pad.json: cannot be written"),
+    ],
+)
+def test_mistakes_are_told_before_a_page_is_there(
+    tmp_path: Path, pad: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = CliRunner().invoke(edit, arguments)
+    assert re.search(told, str(ended.exception))
+
+
+def test_it_takes_no_torch() -> None:
+    code = "import design.cli.editor.session, sys; sys.exit('torch' in sys.modules)"
+    root = Path(__file__).resolve().parents[3]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+CENTRE = "(r => [r.x + r.width / 2, r.y + r.height / 2])(document.querySelectorAll('{}')[{}].getBoundingClientRect())"
+TEXT = "document.getElementById('{}').innerText"
+
+
+@pytest.fixture
+def browser(program: Program, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    with Chromium(tmp_path_factory.mktemp("profile"), "--disable-gpu") as browser:
+        browser.open(program.url, 1100, 900)
+        browser.wait_for("document.getElementById('link').textContent == 'ready'", PATIENCE_S)
+        yield browser
+
+
+def drag(browser: Chromium, begin: list[float], way: tuple[float, float], steps: int = 8) -> None:
+    x, y = begin
+    held = {"button": "left", "buttons": 1, "clickCount": 1}
+    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **held)
+    for step in range(1, steps + 1):
+        at = {"x": x + way[0] * step / steps, "y": y + way[1] * step / steps}
+        browser.call("Input.dispatchMouseEvent", type="mouseMoved", **at, **held)
+        time.sleep(0.02)
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + way[0], y=y + way[1], button="left")
+
+
+def control_key(browser: Chromium, key: str, modifiers: int = 2) -> None:
+    for kind in ("rawKeyDown", "keyUp"):
+        browser.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers)
+
+
+def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
+    first = {name: browser.ask(TEXT.format(name)) for name in ("rules", "ambiguity")}
+    colours = "[...document.querySelectorAll('#map rect')].map(each => each.getAttribute('fill-opacity')).join()"
+    coloured = browser.ask(colours)
+    begin = browser.ask(CENTRE.format(".knot .dot", 0))
+    drag(browser, begin, (20, -60))
+    browser.wait_for("document.getElementById('told').textContent.startsWith('not saved yet')")
+    browser.wait_for("!busy && !waiting.length")
+    assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx([begin[0] + 20, begin[1] - 60], abs=1)
+    for name, before in first.items():
+        assert browser.ask(TEXT.format(name)) != before
+    assert browser.ask(colours) != coloured
+    assert browser.ask("document.querySelectorAll('#places path').length") > 0
+    control_key(browser, "z")
+    browser.wait_for("document.getElementById('undo').disabled")
+    assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx(begin, abs=0.5)
+    assert browser.ask(TEXT.format("rules")) == first["rules"]
+    control_key(browser, "Z", modifiers=10)
+    browser.wait_for("document.getElementById('redo').disabled")
+    control_key(browser, "s")
+    browser.wait_for("document.getElementById('told').textContent == 'saved to pad-edited.json'")
+    checked = CliRunner().invoke(design, ["check", str(tmp_path / "pad-edited.json")], catch_exceptions=False)
+    assert checked.output.splitlines() == browser.ask(TEXT.format("rules")).splitlines()
+    assert browser.complaints == []
+    assert {address for address in browser.requests if not address.startswith("data:")} <= {
+        program.url + path for path in ("", "events", "edit", "save")
+    }
+
+
+def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: Chromium) -> None:
+    browser.ask("document.getElementById('fibre').focus()")
+    for _ in range(12):  # once round the page, to the first knot
+        browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key="Tab", windowsVirtualKeyCode=9)
+        if browser.ask("document.activeElement.classList.contains('knot')"):
+            break
+    label = "document.activeElement.getAttribute('aria-label')"
+    assert browser.ask(label).startswith("fibre 1, knot 1 of 3")
+    y_mm = "view.fibres[chosen.fibre].knots[chosen.knot][1]"
+    before = browser.ask(y_mm)
+    step = 0.5 if before < 14 else -0.5
+    key = "ArrowUp" if step > 0 else "ArrowDown"
+    browser.press(key)
+    browser.wait_for(f"Math.abs({y_mm} - {before + step}) < 1e-3")
+    browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key=key, modifiers=8)
+    browser.wait_for(f"Math.abs({y_mm} - {before + 1.1 * step}) < 1e-3")
+    browser.press("Insert")
+    browser.wait_for("view.fibres[0].knots.length == 6")
+    assert browser.ask(label).startswith("fibre 1, knot")
+    browser.press("Delete")
+    browser.wait_for("view.fibres[0].knots.length == 5")
+    browser.press("PageDown")
+    assert browser.ask(label).startswith("fibre 2, knot")
+    x, y = browser.ask(CENTRE.format(".knot .dot", 5))
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=True)
+    browser.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+    for step in range(1, 6):
+        touched = [{"x": x, "y": y + 4 * step}]
+        browser.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=touched)
+        time.sleep(0.02)
+    browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    browser.wait_for("!busy && !waiting.length")
+    lowered = browser.ask(CENTRE.format(".knot .dot", 5))[1] - y
+    assert lowered == pytest.approx(20, abs=6)  # the first bit may count as a tap
+
+
+def test_another_page_follows_and_one_that_was_away_comes_back(program: Program, browser: Chromium) -> None:
+    moved = program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
+    shown = "view.fibres[0].knots[1][1]"
+    browser.wait_for(f"{shown} == 3.25")
+    browser.open("about:blank")
+    program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=-3.5)
+    browser.open(program.url, 360, 740)
+    browser.wait_for(f"view && {shown} == -3.5", PATIENCE_S)
+    assert browser.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
+    assert moved["number"] < browser.ask("view.number")
+    program.end()
+    browser.wait_for("document.getElementById('link').textContent == 'ended in the terminal'")

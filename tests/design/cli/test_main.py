@@ -1,0 +1,139 @@
+"""Commands of design: where their results go."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from design import Contact, InputError, Morphology, SearchRun, Spec, Twin, score, search
+from design.cli.main import design
+from design.common.files import sha256
+from design.common.settings import commented_toml
+from design.criteria.score import ambiguities
+from design.evaluation.expected_error import error_terms, expected_errors
+from design.pad.twin import Frame, TwinChannel
+from design.report.twin_settings import settings_for_twin
+from design.settings import PadSettings, SearchSettings
+
+QUICK = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
+
+
+def test_straight_fibres_are_told_beside_what_was_found(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pad.toml").write_text(QUICK)
+    told = CliRunner().invoke(design, [], catch_exceptions=False).output.splitlines()
+    document = json.loads((tmp_path / "out/pad/design.json").read_text())
+    straight = ambiguities(Morphology.straight(2), Contact(), 1, SearchSettings().noise, PadSettings(grid=2))
+    assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
+    assert set(document["straight"]) == {name for name in document["terms"] if name.startswith("ambiguity")}
+    assert told[1].startswith(
+        "  ambiguity {ambiguity_lost_0:#.3g} / {ambiguity_lost_1:#.3g} ".format(**document["terms"])
+    )
+    assert told[2].split() == f"{straight[0]:#.3g} / {straight[1]:#.3g} with straight fibres".split()
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    """Of a pad of grid 2 and pitch 10 mm, pressed somewhat beyond its outer fibres."""
+    path, gain = tmp_path_factory.mktemp("twin") / "twin.json", (0.1, 0.02, 0.9)
+    channels = tuple(TwinChannel(channel, fibre, *gain) for channel, fibre in enumerate((2, 0, None)))
+    reach = np.array([0.0, 2, 5, 8, 11, 15]), np.array([1, 0.95, 0.6, 0.25, 0.05, 0])
+    laid = (np.array([[-15.0, -5], [15, -5]]), None, np.array([[-5.0, -15], [-5, 15]]), None)
+    Twin(Morphology.straight(2, 10.0), channels, Frame(), *reach, laid, 0.03, (18.0, 31.5), 500).save(path)
+    return path
+
+
+QUICK_TWIN = QUICK.replace("[pad]\ngrid = 2\n", "")
+
+
+def designed(*arguments, spec=QUICK_TWIN):
+    """What `padforge design` ends with in this folder, and its design.json."""
+    Path("pad.toml").write_text(spec)
+    ended = CliRunner().invoke(design, [str(each) for each in arguments], catch_exceptions=False)
+    return ended, json.loads(Path("out/pad/design.json").read_text())
+
+
+def test_a_pad_is_designed_for_the_twin_of_a_printed_one(tmp_path, monkeypatch, twin):
+    """Its reach, noise and sensed rectangle, as far as that lies on the pad, and its size: all but what is stated."""
+    monkeypatch.chdir(tmp_path)
+    ended, document = designed("--twin", twin)
+    assert ended.exit_code in (0, 1)
+    used = document["provenance"]["settings"]
+    known = Twin.load(twin)
+    assert Contact.model_validate_json(json.dumps(used["contact"])) == known.contact()
+    assert used["search"]["noise"] == 0.03
+    assert (used["pad"]["grid"], used["pad"]["pitch_mm"], used["pad"]["sensed_mm"]) == (2, 10, [18, 30])
+    assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
+    pad = Morphology.load("out/pad/morphology.json")
+    asked = {"lost": 1, "noise": 0.03, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
+    expected = error_terms(expected_errors(pad, known.contact(), **asked))
+    assert document["terms"] == pytest.approx(score(pad, known.contact(), **asked) | expected, rel=1e-9)
+    scored = CliRunner().invoke(design, ["score", "out/pad/morphology.json", "--twin", str(twin)])
+    assert json.loads(scored.output)["terms"] == pytest.approx(document["terms"], rel=1e-9)
+    wider = designed("--twin", twin, spec=QUICK_TWIN + "[pad]\npitch_mm = 20.0\n")[1]["provenance"]["settings"]
+    assert wider["contact"]["reach"][-1] == [0.75, 0]
+    assert (wider["pad"]["pitch_mm"], wider["pad"]["sensed_mm"]) == (20, [18, 31.5])
+
+
+class KilledError(Exception):
+    """Stands for a kill in mid-search."""
+
+
+def test_a_search_for_a_twin_is_resumed(tmp_path, monkeypatch, twin):
+    monkeypatch.chdir(tmp_path)
+    long = QUICK_TWIN.replace("steps = 3", "steps = 60")
+    whole = designed("--twin", twin, spec=long)[1]
+
+    def killed(*step):
+        raise KilledError
+
+    spec = settings_for_twin(Spec.load(Path("pad.toml")), twin)
+    pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
+    with pytest.raises(KilledError):
+        search(pad, contact, settings, run=SearchRun(killed, Path("out/pad/search")))
+    with pytest.raises(InputError, match="begun with contact reach"):
+        designed("--resume", spec=long + "[pad]\ngrid = 2\npitch_mm = 10.0\nsensed_mm = [18.0, 30.0]\n")
+    _, resumed = designed("--twin", twin, "--resume", spec=long)
+    assert resumed["terms"] == whole["terms"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ("[contact]\nradius = 0.9\n", r"pad\.toml: \[contact\] is given beside .*twin\.json.*; leave one out"),
+        ("[pad]\ngrid = 4\n", r"pad\.toml: \[pad\] asks for 4 \+ 4 fibres, .*, but .*twin\.json is of a pad of 2 \+ 2"),
+        ("[pad]\ngrid = 0\n", r"grid"),
+    ],
+)
+def test_settings_that_contradict_a_twin_are_refused(stated, said, tmp_path, monkeypatch, twin):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=said):
+        designed("--twin", twin, spec=QUICK_TWIN + stated)
+
+
+def test_defaults_that_are_written_out_contradict_no_twin(tmp_path, monkeypatch, twin):
+    monkeypatch.chdir(tmp_path)
+    stated = QUICK_TWIN + commented_toml({"contact": Contact})
+    assert designed("--twin", twin, spec=stated)[1]["provenance"]["settings"]["search"]["noise"] == 0.03
+
+
+def test_what_is_no_twin_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in ("none.json", "pad.json"):
+        Morphology.straight(2).save("pad.json")
+        with pytest.raises(InputError, match=path):
+            designed("--twin", path)
+
+
+def test_the_plan_goes_to_the_folder_of_the_pad_unless_told_otherwise(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Morphology.straight(2).save(tmp_path / "pad" / "morphology.json")
+    shown = CliRunner().invoke(design, ["show", "pad/morphology.json"], catch_exceptions=False)
+    assert shown.output == "plan -> pad/plan.svg\n"
+    assert (tmp_path / "pad" / "plan.svg").exists()
+    CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.png"], catch_exceptions=False)
+    assert (tmp_path / "a.png").exists()
+    with pytest.raises(InputError, match=r"--out is a\.pdf, allowed are \.svg and \.png"):
+        CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.pdf"], catch_exceptions=False)

@@ -1,0 +1,53 @@
+"""Spare knots: fibres of unlike numbers of knots in one morphology."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
+
+from design import Morphology
+from design.pad.courses.spare_knots import HAIR, with_spares, without_spares
+
+
+def moved(course, count):
+    """By how far (grid units) a course of a pad of 2 + 2 is off with so many more knots, and what is found of them."""
+    straight = Morphology.straight(2)
+    layout = straight.layout
+    more = np.stack([np.linspace(0, 3, len(course) + count), np.full(len(course) + count, 2.0)], axis=1)
+    pad = Morphology.of_layout(with_spares([course, more, *straight.knots[2:]], layout), layout)
+    assert pad.knots.shape[1] == len(course) + count
+    x = np.linspace(0, 3, 5001)
+    plain, filled = (PchipInterpolator(*line.T)(x) for line in (course, pad.knots[0]))
+    return np.abs(plain - filled).max(), without_spares(pad.knots, layout)[0]
+
+
+@given(st.lists(st.integers(1, 29), min_size=5, max_size=12), st.integers(1, 40))
+def test_a_course_that_turns_inside_stays_and_is_found_again(heights, count):
+    x = np.linspace(0, 3, len(heights) + 2)
+    course = np.stack([x, [1, *(height / 10 for height in heights), 1]], axis=1)
+    course[3, 1] = 2.95 if course[2, 1] < 2.9 and course[4, 1] < 2.9 else 0.05
+    course[[2, 4], 1] = 1.5  # so it turns at its fourth knot
+    off, found = moved(course, count)
+    assert off < 10 * HAIR
+    assert found == pytest.approx(course)
+
+
+@pytest.mark.parametrize("heights", [[], [1.0], [1.0, 1.0, 1.0]])
+def test_a_straight_course_stays(heights):
+    course = np.stack([np.linspace(0, 3, len(heights) + 2), [1.0, *heights, 1.0]], axis=1)
+    off, found = moved(course, 7)
+    assert off == 0
+    assert found == pytest.approx(course)
+
+
+@pytest.mark.parametrize("heights", [[2.0], [0.5, 1.8], [1.2, 2.0], [1.8, 1.5, 1.2], [1.2, 1.5, 1.8]])
+@pytest.mark.parametrize("count", [1, 2, 3, 9])
+def test_one_that_turns_next_to_its_ends_hardly_moves(heights, count):
+    course = np.stack([np.linspace(0, 3, len(heights) + 2), [1.0, *heights, 1.0]], axis=1)
+    assert moved(course, count)[0] < 0.02
+
+
+def test_pads_without_spare_knots_are_as_they_were():
+    pad = Morphology.random((2, 3), 6, 0, (9.0, 12.0))
+    assert np.array_equal(with_spares(without_spares(pad.knots, pad.layout), pad.layout), pad.knots)
