@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from design.common.command_line import json_option, load_spec, spec_option
+from design.common.page.local_page.listening import HOST
 
 from .options import drawn_anew
 from .rig import rig_option
@@ -17,6 +18,8 @@ from .rig import rig_option
 if TYPE_CHECKING:
     from sense.health.health_model import HealthModel
     from sense.live.pipeline import Event
+    from sense.live.sources import Source
+    from sense.live.streams.outlets import Outlet
     from sense.localizer.localizer import Localizer
     from sense.rig.devices.protocols import Converter
 
@@ -26,6 +29,20 @@ if TYPE_CHECKING:
 PORT = 8321
 BAR = 12
 """Characters of a fibre's bar on a terminal, to either side."""
+
+
+def _ways_out(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options that say to which other programs it is told as well, and from where they may listen."""
+    options = (
+        click.option("--tcp", type=click.IntRange(0, 65_535), help="Tell it in lines of JSON on this port; 0: any."),
+        click.option("--osc", metavar="HOST:PORT", help="Tell it in Open Sound Control to this address."),
+        click.option("--lsl", metavar="NAME", help="Tell it as streams of the Lab Streaming Layer, by this name."),
+        click.option("--host", default=HOST, show_default=True, help="Of page and --tcp; for others with a --token."),
+        click.option("--token", default="", envvar="PADFORGE_TOKEN", help="What must be known to listen."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
 
 
 @click.command()
@@ -42,10 +59,18 @@ BAR = 12
     help="Folder that calibrate wrote; may be given again for one that answers earlier, or better.",
 )
 @click.option("--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Of the page; 0: any.")
+@_ways_out
 @spec_option
 @json_option
 def live(
-    rig: str, replay: Path | None, speed: float, models: tuple[Path, ...], port: int, spec: Path | None, as_json: bool
+    rig: str,
+    replay: Path | None,
+    speed: float,
+    models: tuple[Path, ...],
+    port: int,
+    spec: Path | None,
+    as_json: bool,
+    **out: Any,
 ) -> None:
     """Show where a pad is pressed, as it is pressed: here, and on a page for the browsers of this machine.
 
@@ -57,38 +82,32 @@ def live(
     --rig ur5            the board, as [rig] says; the arm is not used
     --replay RECORDING   what was recorded
 
+    \b
+    padforge sense live --tcp 9000                                for programs here: docs/live-protocol.md
+    padforge sense live --osc 127.0.0.1:9001 --lsl pad            for music, for labs
+    padforge sense live --tcp 9000 --host 0.0.0.0 --token WORD    for other machines
+
+    Whoever knows the token sees page and lines from anywhere in the network, and nothing is encrypted.
+
     A fibre found bad is left out from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "lost" hold indices, from 0.
     """
     from sense.live.page_server import LivePage
     from sense.live.pipeline import Live
-    from sense.live.sources import connected, replayed
+    from sense.live.streams.messages import Messages
+    from sense.live.streams.outlets import tell_all
     from sense.localizer.localizer import Localizer
-    from sense.recordings.import_export import open_recording
-    from sense.settings import RigSettings
 
     localizers = [Localizer.load(model) for model in models]
     with ExitStack() as stack:
-        if replay is not None:
-            recording = open_recording(replay)
-            source, mirrored = replayed(recording, speed), recording.mirrored
-        else:
-            mirrored = bool(load_spec(spec).section(RigSettings).mirrored)
-            converter = _converter(rig, models[0], localizers[0], spec)
-            stack.callback(converter.close)
-            source = connected(converter, localizers[0].rate_hz)
+        rigged = (stack, rig, models[0], localizers[0], spec)
+        source, mirrored = _connected(*rigged) if replay is None else _replayed(replay, speed)
         pipeline = Live(localizers, _health(models[0]), source.fibres, source.rate_hz)
-        page = stack.enter_context(LivePage(port))
+        page = stack.enter_context(LivePage(port, host=out["host"], token=out["token"]))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
+        outlets, messages = _outlets(stack, source, **out), Messages(pipeline, mirrored)
         show = _json if as_json else stack.enter_context(_terminal())
-        scaling = localizers[0].normalization
-        half_mm = scaling.half_mm
-        pad = {
-            "title": f"{replay or f'{rig} rig'}, {models[0]}",
-            "middle_mm": scaling.middle_mm.tolist(),
-            "half_mm": [scaling.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
-            "mirrored": mirrored,
-        }
+        pad = _pad(f"{replay or f'{rig} rig'}, {models[0]}", localizers[0], mirrored)
 
         @stack.push
         def tell_the_end(kind: object, error: BaseException | None, trace: object) -> None:
@@ -100,6 +119,60 @@ def live(
                 view = pad | pipeline.view() | {"ended": ""}
                 page.show(view)
                 show(view, events)
+                if outlets:
+                    tell_all(outlets, messages.of(times_s, readings, events))
+
+
+def _connected(
+    stack: ExitStack, rig: str, model: Path, localizer: "Localizer", spec: Path | None
+) -> "tuple[Source, bool]":
+    """The readings of a converter, until `stack` is left, and whether the pad lies with its tracks up."""
+    from sense.live.sources import connected
+    from sense.settings import RigSettings
+
+    mirrored = bool(load_spec(spec).section(RigSettings).mirrored)
+    converter = _converter(rig, model, localizer, spec)
+    stack.callback(converter.close)
+    return connected(converter, localizer.rate_hz), mirrored
+
+
+def _replayed(replay: Path, speed: float) -> "tuple[Source, bool]":
+    """The readings of a recording, and whether the pad lay with its tracks up."""
+    from sense.live.sources import replayed
+    from sense.recordings.import_export import open_recording
+
+    recording = open_recording(replay)
+    return replayed(recording, speed), recording.mirrored
+
+
+def _pad(title: str, localizer: "Localizer", mirrored: bool) -> dict[str, Any]:
+    """What stays the same of the view."""
+    scaling = localizer.normalization
+    half_mm = scaling.half_mm
+    return {
+        "title": title,
+        "middle_mm": scaling.middle_mm.tolist(),
+        "half_mm": [scaling.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
+        "mirrored": mirrored,
+    }
+
+
+def _outlets(
+    stack: ExitStack, source: "Source", tcp: int | None, osc: str | None, lsl: str | None, host: str, token: str
+) -> "list[Outlet]":
+    """The ways out that were asked for, open until `stack` is left."""
+    from sense.live.streams.outlets import Lines, Lsl, Osc
+
+    outlets: list[Outlet] = []
+    if tcp is not None:
+        lines = stack.enter_context(Lines(host, tcp, token))
+        click.echo(f"lines: {lines.address[0]}:{lines.address[1]}", err=True)
+        outlets.append(lines)
+    if osc is not None:
+        outlets.append(stack.enter_context(Osc(osc)))
+    if lsl is not None:
+        outlets.append(Lsl(lsl, source.fibres, source.rate_hz))
+    return outlets
 
 
 def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None) -> "Converter":

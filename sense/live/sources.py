@@ -4,22 +4,23 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from design import Contact, Morphology
 from design.common.errors import InputError, real
 from design.common.files import read_json
 from design.common.settings import validated
-from design.settings import PadSettings
+from design.settings import Contact, PadSettings
 from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.recording import Recording
 from sense.rig.devices.protocols import Converter
-from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.rig.session.averaging import Averager
 from sense.settings import RigSettings
+
+if TYPE_CHECKING:
+    from sense.rig.emulators.live_pad import SimulatedConverter
 
 Block = tuple[Array, Array]
 """Times (n,) in s, and readings (n, C) in V."""
@@ -83,12 +84,15 @@ def replayed(recording: Recording, speed: float) -> Source:
     return Source(recording.fibres, recording.rate_hz, blocks())
 
 
-def simulated(model: Path) -> SimulatedConverter:
+def simulated(model: Path) -> "SimulatedConverter":
     """The pad that the model in this folder was learnt from, where that was a simulated one.
 
     Raises:
         InputError: its recording is not beside it, or of another kind.
     """
+    from design.pad.morphology import Morphology  # needs what only other jobs need
+    from sense.rig.emulators.live_pad import SimulatedConverter
+
     path = model / RECORDED / START
     if not path.is_file():
         raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")

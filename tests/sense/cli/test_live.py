@@ -1,4 +1,5 @@
 import json
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,13 +8,13 @@ from pathlib import Path
 import pytest
 
 import padforge
-import sense.live.sources
 from design import Morphology
 from sense import Localizer, Recording
 from sense.cli.live import view_lines
 from sense.live.page_server import LivePage
 from sense.recordings.simulation.published_protocol import simulate
 from sense.rig.devices.protocols import ConverterSamples, RigFault
+from sense.rig.emulators import live_pad
 from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.settings import RigSettings
 
@@ -50,6 +51,24 @@ def test_a_recording_is_shown(live, brief: Recording, tmp_path: Path) -> None:
     first = told[0]
     assert plain.splitlines()[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
     assert len(plain.splitlines()) == len(told)
+
+
+def test_other_programs_are_told_what_they_ask_for(live, brief: Recording, tmp_path: Path) -> None:
+    brief.save(tmp_path / "short", {})
+    replay = ("--replay", str(tmp_path / "short"), "--speed", "1e6")
+    token = "a word of sixteen"
+    code, _, err = live(*replay, "--tcp", "0", "--osc", "127.0.0.1:9", "--host", "127.0.0.1", "--token", token)
+    assert code == 0
+    assert re.search(r"^page: http://127\.0\.0\.1:\d+/\?token=a\+word\+of\+sixteen ", err, re.MULTILINE)
+    assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)
+    for wrong, message in (
+        (("--host", "0.0.0.0"), "host is '0.0.0.0', which other machines reach"),
+        (("--osc", "here"), "--osc is 'here', expected HOST:PORT"),
+        (("--tcp", "0", "--token", "short"), "token has 5 characters, allowed are 16 to 256"),
+    ):
+        code, out, err = live(*replay, *wrong)
+        assert (code, out) == (2, "")
+        assert message in err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -97,7 +116,7 @@ def test_the_end_comes_when_it_is_asked_for(live, monkeypatch: pytest.MonkeyPatc
         def close(self) -> None:
             closed.append(True)
 
-    monkeypatch.setattr(sense.live.sources, "SimulatedConverter", Interrupted)
+    monkeypatch.setattr(live_pad, "SimulatedConverter", Interrupted)
     code, _, err = live()
     assert code == 130
     assert "interrupted" in err.splitlines()[-1]
@@ -109,7 +128,7 @@ def test_a_fault_of_the_rig_ends_it(live, monkeypatch: pytest.MonkeyPatch) -> No
         def read(self) -> ConverterSamples:
             raise RigFault("stale", "the board does not send", "reset it")
 
-    monkeypatch.setattr(sense.live.sources, "SimulatedConverter", Stale)
+    monkeypatch.setattr(live_pad, "SimulatedConverter", Stale)
     code, out, err = live("--json")
     assert (code, out) == (1, "")
     assert err.splitlines()[-1] == "padforge: the board does not send; reset it"

@@ -1,0 +1,1 @@
+"""What is told of a pad to other programs, as it happens."""

@@ -1,0 +1,216 @@
+"""Ways out of this program: lines over TCP, OSC over UDP, and streams of the Lab Streaming Layer."""
+
+import hmac
+import queue
+import socketserver
+import threading
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from typing import Any, Protocol, Self
+
+from design.common.errors import InputError
+from design.common.page.local_page.listening import POLL_S, listening, refuse_open
+from sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
+
+from .messages import Message
+
+MOST_BEHIND = 4096
+"""Lines that wait for a client; one that is further behind is let go, so that nobody else waits for it."""
+MOST_CLIENTS = 32
+TOKEN_S = 10.0
+"""A client has so long to say the token."""
+PLACE = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm"}
+"""What of a touch OSC and LSL tell, and its units."""
+
+
+class Outlet(Protocol):
+    """Something that messages go out by."""
+
+    def tell(self, message: Message) -> None:
+        """Send one message; never waits for who listens."""
+        ...
+
+
+def tell_all(outlets: Iterable[Outlet], messages: Iterable[Message]) -> None:
+    """Send messages by all ways out, in their order."""
+    for message in messages:
+        for outlet in outlets:
+            outlet.tell(message)
+
+
+class Lines:
+    """A server that tells every client all messages from when it came, a line of JSON each, from `with` to its end.
+
+    The first is the fibres' state as it is then.
+
+    Attributes:
+        address: host and port.
+    """
+
+    def __init__(self, host: str, port: int, token: str = "") -> None:
+        """Take `port` of `host`, or any that is free if 0; a client's first line must be `token` if there is one.
+
+        Raises:
+            InputError: the port is taken, or not for this user, or others could listen without a token.
+        """
+        refuse_open(host, token)
+        self._server = listening(lambda: _LineServer((host, port), token), host, port, "--tcp")
+        self.address: tuple[str, int] = self._server.server_address[:2]  # type: ignore[assignment]
+        self._number = 0
+
+    def tell(self, message: Message) -> None:
+        """Send one message to all who listen."""
+        line = f"{message.line(self._number)}\n".encode()
+        self._number += 1
+        self._server.tell(line, kept=message.topic == HEALTH)
+
+    def __enter__(self) -> Self:
+        name = "server of lines"
+        threading.Thread(target=self._server.serve_forever, args=(POLL_S,), name=name, daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._server.shutdown()
+        self._server.tell(None)
+        self._server.server_close()
+
+
+class _LineServer(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+    block_on_close = True  # what was told before the end still goes out
+    allow_reuse_address = True
+
+    def __init__(self, address: tuple[str, int], token: str) -> None:
+        self.token = token.encode()
+        self._clients: set[_Client] = set()
+        self._kept: bytes | None = None
+        self._lock = threading.Lock()
+        super().__init__(address, _Client)
+
+    def tell(self, line: bytes | None, kept: bool = False) -> None:
+        """Give a line to all who listen, and if it is `kept` to those who come later; None is the end."""
+        with self._lock:
+            self._kept = line if kept else self._kept
+            for client in self._clients:
+                client.take(line)
+
+    def join(self, client: "_Client") -> bool:
+        with self._lock:
+            if len(self._clients) >= MOST_CLIENTS:
+                return False
+            self._clients.add(client)
+            if self._kept is not None:
+                client.take(self._kept)
+            return True
+
+    def leave(self, client: "_Client") -> None:
+        with self._lock:
+            self._clients.discard(client)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that has gone away is no error of this program; any other is told as usual."""
+        import sys
+
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
+class _Client(socketserver.StreamRequestHandler):
+    server: _LineServer  # pyright: ignore[reportIncompatibleVariableOverride]
+    timeout = TOKEN_S  # of one that says no token, or takes nothing
+
+    def setup(self) -> None:
+        super().setup()
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(MOST_BEHIND)
+        self._behind = False
+
+    def take(self, line: bytes | None) -> None:
+        try:
+            self._waiting.put_nowait(line)
+        except queue.Full:
+            self._behind = True
+
+    def handle(self) -> None:
+        token = self.server.token
+        if token and not hmac.compare_digest(self.rfile.readline(len(token) + 2).rstrip(b"\r\n"), token):
+            return
+        if not self.server.join(self):
+            return
+        try:
+            while not self._behind and (line := self._waiting.get()) is not None:
+                self.wfile.write(line)
+        finally:
+            self.server.leave(self)
+
+
+class Osc:
+    """Open Sound Control over UDP: /pad/touches, /pad/readings, /pad/pressed and /pad/health."""
+
+    def __init__(self, address: str) -> None:
+        """Send to `address`, HOST:PORT.
+
+        Raises:
+            InputError: no such address.
+            ModuleNotFoundError: python-osc is not installed.
+        """
+        from pythonosc.udp_client import SimpleUDPClient
+
+        host, _, port = address.rpartition(":")
+        if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
+            raise InputError(f"--osc is {address!r}, expected HOST:PORT")
+        try:
+            self._client = SimpleUDPClient(host, int(port))
+        except OSError as error:
+            raise InputError(f"--osc is {address!r}: no such host ({error})") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._client.close()
+
+    def tell(self, message: Message) -> None:
+        """Send one message."""
+        with suppress(BlockingIOError, ConnectionRefusedError):  # nobody listens, or too slowly, as UDP has it
+            self._client.send_message(message.topic, _osc_values(message))
+
+
+def _osc_values(message: Message) -> list[Any]:
+    pad = message.pad
+    if message.topic == READINGS:
+        return [float("nan") if each is None else each for each in pad["volts"]]
+    if message.topic == TOUCHES:
+        return [pad[name] for name in PLACE]
+    return [pad["pressed"]] if message.topic == PRESSED else list(pad["states"])
+
+
+class Lsl:
+    """Two streams of the Lab Streaming Layer: readings at their rate in V, and touches as they are found."""
+
+    def __init__(self, name: str, fibres: int, rate_hz: float) -> None:
+        """Offer "NAME readings" and "NAME touches" to all who look for streams in this network.
+
+        Raises:
+            ModuleNotFoundError: pylsl is not installed.
+        """
+        volts = {f"fibre {fibre}": "V" for fibre in range(1, fibres + 1)}
+        self._readings = _outlet(f"{name} readings", volts, rate_hz)
+        self._touches = _outlet(f"{name} touches", PLACE, 0.0)
+
+    def tell(self, message: Message) -> None:
+        """Send one message, if it is of readings or of a touch."""
+        if message.topic == READINGS:
+            self._readings.push_sample([float("nan") if each is None else each for each in message.pad["volts"]])
+        elif message.topic == TOUCHES:
+            self._touches.push_sample([float(message.pad[name]) for name in PLACE])
+
+
+def _outlet(name: str, units: Mapping[str, str], rate_hz: float) -> Any:
+    """A stream whose channels have names and units; of no steady rate if it is 0."""
+    from pylsl import IRREGULAR_RATE, StreamInfo, StreamOutlet, cf_double64
+
+    info = StreamInfo(name, "Tactile", len(units), rate_hz or IRREGULAR_RATE, cf_double64, f"padforge {name}")
+    listed = info.desc().append_child("channels")
+    for label, unit in units.items():
+        listed.append_child("channel").append_child_value("label", label).append_child_value("unit", unit)
+    return StreamOutlet(info)
