@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 @click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
 @click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
 @click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
+@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
 @common.out_option()
@@ -30,6 +31,7 @@ def calibrate(
     method: str | None,
     features: str | None,
     test_split: str | None,
+    time_budget: float | None,
     seed: int | None,
     spec: Path | None,
     out: Path | None,
@@ -39,6 +41,7 @@ def calibrate(
 
     \b
     padforge sense calibrate out/pad/recording --test-split chronological
+    padforge sense calibrate out/pad/recording --time-budget 600
 
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
     error_map.png and error_by_loss.png.
@@ -49,18 +52,31 @@ def calibrate(
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     folder = out or common.pad_folder(recording)
     with claimed(folder):
-        document = run_calibration(common.load_spec(spec), read_recording(recording), folder, overrides)
+        document = run_calibration(common.load_spec(spec), read_recording(recording), folder, overrides, time_budget)
     common.show_result(document, calibration_lines(document), as_json)
 
 
-def run_calibration(spec: "Spec", recording: "Recording", out: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:
+def run_calibration(
+    spec: "Spec",
+    recording: "Recording",
+    out: Path,
+    overrides: Mapping[str, Any],
+    time_budget: float | None = None,
+) -> dict[str, Any]:
     """Calibrate into `out` with the settings of `spec`, and say on stderr how far it is; returns `calibration.json`."""
     from sense.report.calibration_results import calibrate_into
     from sense.settings import LocalizerSettings
 
     options = spec.section(LocalizerSettings, **overrides)
     with reported("training") as report:
-        return calibrate_into(recording, out, options, progress=report, warn=lambda line: click.echo(line, err=True))
+        return calibrate_into(
+            recording,
+            out,
+            options,
+            time_budget=time_budget,
+            progress=report,
+            warn=lambda line: click.echo(line, err=True),
+        )
 
 
 @click.command()

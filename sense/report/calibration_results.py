@@ -19,6 +19,7 @@ def calibrate_into(
     out: Path,
     options: LocalizerSettings,
     *,
+    time_budget: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     warn: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
@@ -27,6 +28,7 @@ def calibrate_into(
     Nothing in `out` changes before the last result is there.
 
     Args:
+        time_budget: seconds to train for, see `calibrate`.
         progress: called with (steps of training done, in all), and (0, 0) when the health of the fibres is learnt.
         warn: told in a line what is not learnt, of depth, force or health, as the recording does not suffice.
 
@@ -34,7 +36,7 @@ def calibrate_into(
         InputError: as `calibrate`, or `out` cannot be written.
     """
     refuse_unwritable(out)
-    localizer, document = calibrate(recording, options, progress=progress)
+    localizer, document = calibrate(recording, options, time_budget=time_budget, progress=progress)
     for line in left_out(recording, localizer):
         warn(line)
     progress(0, 0)

@@ -21,7 +21,7 @@ from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate
 
-from .published_training import HIDDEN
+from .networks.published_training import HIDDEN
 
 PRESSES, TEST = 1500, 300
 EPOCHS = (3, 10, 30, 100)
@@ -138,7 +138,8 @@ def _adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    from .training import TrainingPresses, train_members
+    from .networks.training_presses import TrainingPresses
+    from .training import train_members
 
     alive = np.ones(inputs.shape[:2], dtype=bool)
     held = _held(len(inputs))
@@ -175,7 +176,7 @@ def _untrained(entries: int) -> Weights:
     """A masked network of the usual size as training begins."""
     import torch
 
-    from .training import initial
+    from .networks.masked_network import initial
 
     options, generator = settings.LocalizerSettings(), torch.Generator().manual_seed(0)
     members = [initial(entries, options, generator) for _ in range(options.members)]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from design.common.errors import InputError, instance
+from design.common.errors import InputError, instance, real
 from design.common.files import provenance
 from design.common.profiling import stage
 from design.common.settings import or_default, validated
@@ -23,10 +23,14 @@ from sense.localizer.normalization import Normalization, Scaled
 from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
+from .networks.training_presses import TrainingPresses
+
 LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
 CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that end it and find the radii; of the published method, 15 % of all."""
+MOST_SECONDS = 1e9
+"""Longest time budget: some thirty years."""
 LEAST_SPREAD_MM = 0.2
 """Depths of which nine tenths lie within so much are one."""
 SUBSETS = 32
@@ -39,6 +43,7 @@ def calibrate(
     *,
     split: str | None = None,
     seed: int | None = None,
+    time_budget: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Localizer, dict[str, Any]]:
     """Train a localizer on a part of the presses and test it on the rest.
@@ -49,19 +54,25 @@ def calibrate(
     Args:
         recording: readings and presses with known places.
         options: how to learn; the defaults if None. split, seed: win over those of `options`.
-        progress: called with (steps done, steps in all).
+        time_budget: seconds to train for, with as many members as that is good for; what is found depends on the pace
+            then. None for the length and the members of `options`.
+        progress: called with (steps done, steps in all); in a time budget, with seconds.
 
     Returns:
         The localizer, and the document of `calibration.json`.
 
     Raises:
-        InputError: an option out of range, too few presses to hold a share back, or a training that diverged.
+        InputError: an option out of range, a time budget for the published method, too few presses to hold a share
+            back, or a training that diverged.
     """
     instance("recording", recording, Recording)
     options = or_default("options", options, settings.LocalizerSettings)
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
     options = validated(settings.LocalizerSettings, {**options.model_dump(), **given}, "[localizer]")
+    time_budget = None if time_budget is None else real("time_budget", time_budget, 0, MOST_SECONDS)
     if options.method == "published":
+        if time_budget is not None:
+            raise InputError("time_budget is given: method published trains until it gains no more, expected masked")
         options = options.model_copy(update={"features": "published"})
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.known)
@@ -71,7 +82,7 @@ def calibrate(
     from design.common.computing import one_torch_thread
 
     with stage("train"), one_torch_thread():
-        localizer = learn(recording, training, options, rng, progress)
+        localizer = learn(recording, training, options, rng, progress, time_budget)
     localizer = replace(localizer, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     levels = range(min(options.lost, recording.fibres - 1) + 1) if options.method == "masked" else (0,)
     with stage("evaluate"):
@@ -86,11 +97,12 @@ def learn(
     options: settings.LocalizerSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    time_budget: float | None = None,
 ) -> Localizer:
     """Train a localizer on the presses `training` of a recording, by index.
 
-    Of them, a share is not trained on but ends the training and finds the radii: drawn at random, or the last ones, as
-    the split is. Presses are shown as they were commanded and, once more, as they would be found in the readings.
+    Of them, a share ends the training and finds the radii: drawn at random, or the last ones, as the split is. The
+    others are shown as they were commanded and, once more, as they would be found in the readings.
 
     Raises:
         InputError: the training diverged.
@@ -99,29 +111,26 @@ def learn(
         training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
     )
     masked = options.method == "masked"
-    edges = recording.begun, recording.lifted
-    raw = press_inputs(recording.readings, *edges, options.features)
+    raw = press_inputs(recording.readings, recording.begun, recording.lifted, options.features)
     measures = learnable(recording, training) if masked else {}
     shown_raw, rows, held_mm = raw[taught], taught, recording.presses_mm[checked]
     if masked:
         from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
-        again = as_detected(recording.readings, recording.times_s, *edges)
+        again = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         rows = np.concatenate([taught, taught])
-    shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
+    shown_mm, shown_more, held_more = recording.presses_mm[rows], _of(measures, rows), _of(measures, checked)
     scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more)
-    held_presses, held_more = scaling.inputs(raw[checked]), _of(measures, checked)
-    from .training import TrainingPresses, train_members  # torch, seconds to import, is needed here only
-
-    def samples(presses: Scaled, places_mm: Array, more: Mapping[str, Array]) -> TrainingPresses:
-        return TrainingPresses(presses.inputs, presses.alive, scaling.targets(places_mm, more), scaling.stretch)
-
-    shown, held = samples(scaling.inputs(shown_raw), shown_mm, shown_more), samples(held_presses, held_mm, held_more)
+    held_presses = scaling.inputs(raw[checked])
+    shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
+    held = _samples(scaling, held_presses, held_mm, held_more)
     if masked:
-        weights = train_members(shown, held, table, options, rng, progress)
+        from .training import train_members  # torch, seconds to import, is needed here only
+
+        weights = train_members(shown, held, table, options, rng, progress, time_budget)
     else:
-        from .published_training import train_published
+        from .networks.published_training import train_published
 
         weights = train_published(shown, held, rng)
     try:
@@ -140,6 +149,12 @@ def learn(
     )
     levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
     return replace(localizer, factors=radii(localizer, held_presses, held_mm, levels, held_more))
+
+
+def _samples(
+    scaling: Normalization, presses: Scaled, places_mm: Array, measures: Mapping[str, Array]
+) -> TrainingPresses:
+    return TrainingPresses(presses.inputs, presses.alive, scaling.targets(places_mm, measures), scaling.stretch)
 
 
 def _of(measures: Mapping[str, Array], presses: Indices) -> dict[str, Array]:

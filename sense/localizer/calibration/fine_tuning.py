@@ -17,7 +17,9 @@ from sense.health.trained_model import one_cycle
 from sense.localizer.network import Weights
 from sense.recordings.processing.limits import Floats
 
-from .training import INPUT_NOISE, MOVED, TrainingPresses, draw_alive, forward, inputs_at, masked, misses
+from .networks.masked_network import draw_alive, forward, inputs_at, masked, misses
+from .networks.training_presses import TrainingPresses
+from .training import INPUT_NOISE, MOVED
 
 STEPS, BATCH, RATE = 200, 128, 1e-4
 """Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""

@@ -146,7 +146,7 @@ def _adapted(
     localizer: Localizer, raw: Inputs, places_mm: Array, measures: Measures, rng: np.random.Generator
 ) -> Localizer:
     from .fine_tuning import adapt  # torch, seconds to import, is needed here only
-    from .training import TrainingPresses
+    from .networks.training_presses import TrainingPresses
 
     scaling, scaled = localizer.normalization, localizer.normalization.inputs(raw)
     found = localizer.locate(scaled).measures  # where it is not known how deep a press was, it goes on being found so

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sense import settings as sense_settings
 from sense.localizer import network
-from sense.localizer.calibration import training
+from sense.localizer.calibration.networks import masked_network
 from sense.localizer.network import pooled
 
 
@@ -17,10 +17,10 @@ from sense.localizer.network import pooled
 def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
     options = sense_settings.LocalizerSettings(layers=layers, hidden=24)
     generator = torch.Generator().manual_seed(seed)
-    weights = training.initial(3 * 5 + 3, options, generator)
+    weights = masked_network.initial(3 * 5 + 3, options, generator)
     inputs = torch.randn(7, 3, 5, generator=generator)
     alive = torch.rand(7, 3, generator=generator) < 0.6
-    expected = training.forward(weights, training.masked(inputs, alive)[None]).detach().numpy()
+    expected = masked_network.forward(weights, masked_network.masked(inputs, alive)[None]).detach().numpy()
     plain = {name: weight.detach().numpy() for name, weight in weights.items()}
     found = network.forward(plain, network.masked(inputs.numpy(), alive.numpy()))
     assert found.dtype == np.float32

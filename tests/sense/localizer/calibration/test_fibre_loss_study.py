@@ -19,7 +19,7 @@ from sense.settings import LocalizerSettings as Options
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published network of three neurons, and a coarse map of the answers, which is not what is tested."""
-    monkeypatch.setattr("sense.localizer.calibration.published_training.HIDDEN", 3)
+    monkeypatch.setattr("sense.localizer.calibration.networks.published_training.HIDDEN", 3)
     monkeypatch.setattr("sense.localizer.response_model.BUMPS", 7)
 
 

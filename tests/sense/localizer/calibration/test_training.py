@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from sense import settings as sense_settings
 from sense.localizer.calibration import training
-from sense.localizer.calibration.training import draw_alive, looked_up
+from sense.localizer.calibration.networks import masked_network
+from sense.localizer.calibration.networks.masked_network import draw_alive, looked_up
+from sense.localizer.calibration.networks.training_presses import TrainingPresses
 
 
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
@@ -34,14 +36,14 @@ def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float)
 def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of presses at the corners of the known places, half of a normal distribution remains on either axis."""
     corners = np.tile(np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32), (64, 1))
-    samples = training.TrainingPresses(np.zeros((256, 1, 1), np.float32), np.ones((256, 1), bool), corners)
+    samples = TrainingPresses(np.zeros((256, 1, 1), np.float32), np.ones((256, 1), bool), corners)
     seen: list[torch.Tensor] = []
 
     def spy(table: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
         seen.append(places)
         return looked_up(table, places)
 
-    monkeypatch.setattr(training, "looked_up", spy)
+    monkeypatch.setattr(masked_network, "looked_up", spy)
     options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0, batch=256)
     member = training._Member(samples, samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
     for _ in range(8):

@@ -9,7 +9,7 @@ import numpy as np
 from design.evaluation.levenberg_marquardt import fit
 from sense.localizer.network import Weights
 
-from .training import TrainingPresses
+from .training_presses import TrainingPresses
 
 HIDDEN = 50
 """Neurons of the experiment's network."""
