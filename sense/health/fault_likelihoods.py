@@ -10,7 +10,6 @@ measured on presses that the prediction was not fitted on: the heights of health
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
@@ -158,7 +157,7 @@ class FaultLikelihoods:
         spread = self._honest(spread)[..., :COMPONENTS]
         gains = [_log_t(answer, gain * mean, np.hypot(gain * spread, self.floor)).sum(axis=-1) for gain in GAINS]
         others = _log_t(answer[..., None, :, :], self.other_mean, self.other_spread).sum(axis=-1)
-        other = logsumexp(others, axis=-2) - np.log(LIBRARY)
+        other = np.logaddexp.reduce(others, axis=-2) - np.log(LIBRARY)
         odd = np.logaddexp(other, _log_t(answer, mean, WIDER * spread).sum(axis=-1)) - np.log(2)
         return [hypothesis - healthy for hypothesis in (*gains, odd)]
 

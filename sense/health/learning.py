@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from design.common.computing import one_torch_thread, run_tasks
 from design.common.errors import InputError, instance, real
 from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 from sense.recordings.recording import Recording, rate_of
@@ -43,13 +45,15 @@ def learn_health(
     readings, times_s = recording.readings, recording.times_s
     commanded = recording.begun, recording.lifted
     edges = {COMMANDED: commanded, DETECTED: as_detected(readings, times_s, *commanded)}
-    seed = int(provenance["seed"])
-    return {
-        name: fit_health_model(
-            readings, times_s, begun[learnt], lifted[learnt], rng=np.random.default_rng(seed), provenance=provenance
-        )
-        for name, (begun, lifted) in edges.items()
-    }
+
+    def fit(name: str) -> HealthModel:
+        begun, lifted = (edge[learnt] for edge in edges[name])
+        rng = np.random.default_rng(int(provenance["seed"]))
+        return fit_health_model(readings, times_s, begun, lifted, rng=rng, provenance=provenance)
+
+    with one_torch_thread():
+        found = dict(run_tasks((name, partial(fit, name)) for name in edges))
+    return {name: found[name] for name in edges}
 
 
 def fit_health_model(

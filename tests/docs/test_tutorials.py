@@ -160,7 +160,7 @@ def answer(counter: Path) -> None:
         return
     here, *words = (counter / "asked").read_text(encoding="utf-8").splitlines()
     (counter / "asked").unlink()
-    with chdir(here), patch.object(fibre_prediction, "STEPS", fibre_prediction.STEPS // SHORTER):
+    with chdir(here), patch.object(fibre_prediction, "MOST_STEPS", fibre_prediction.MOST_STEPS // SHORTER):
         ended = call(*words, limit_s=300)
     (counter / "err").write_text(ended.err, encoding="utf-8")
     (counter / "out").write_text(ended.out, encoding="utf-8")

@@ -41,7 +41,7 @@ def made(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(fibre_prediction, "STEPS", 80):
+    with mock.patch.object(fibre_prediction, "MOST_STEPS", 80):
         run_calibration(spec, recording, folder / "model", {})
     return folder
 

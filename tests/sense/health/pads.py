@@ -19,7 +19,7 @@ LEARNT, PRESSES, BAD_FROM = 600, 760, 660
 def learn(readings: Array, pad: Recording, presses: int = LEARNT) -> HealthModel:
     """Health by a quick training on the first presses, of which, on this pad, LEARNT suffice to call a fibre weak."""
     end = pad.begun[presses]
-    with mock.patch.object(fibre_prediction, "STEPS", 250), mock.patch.object(learning, "WEAK_PRESSES", LEARNT):
+    with mock.patch.object(fibre_prediction, "MOST_STEPS", 250), mock.patch.object(learning, "WEAK_PRESSES", LEARNT):
         return fit_health_model(
             readings[:end], pad.times_s[:end], pad.begun[:presses], pad.lifted[:presses], rng=np.random.default_rng(0)
         )

@@ -54,7 +54,7 @@ def learnt(features: str = "full", method: str = "masked") -> Localizer:
 def watched() -> HealthModel:
     """The health of that pad, learnt in a moment."""
     one = recorded()
-    with mock.patch("sense.health.fibre_prediction.STEPS", 30):
+    with mock.patch("sense.health.fibre_prediction.MOST_STEPS", 30):
         return fit_health_model(one.readings, one.times_s, one.begun, one.lifted, rng=np.random.default_rng(0))
 
 

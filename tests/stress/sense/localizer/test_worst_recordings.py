@@ -181,7 +181,7 @@ def test_health_is_learnt_from_the_worst_or_refused(
 @pytest.fixture(scope="module")
 def few_steps():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sense.health.fibre_prediction.STEPS", 20)
+        patch.setattr("sense.health.fibre_prediction.MOST_STEPS", 20)
         yield
 
 
