@@ -22,8 +22,8 @@ import design
 import fabricate
 import sense
 from design.benchmarking.cli import bench_command
-from design.cli import compare_command
-from design.cli import design as design_group
+from design.cli.main import compare_command
+from design.cli.main import design as design_group
 from design.common.command_line import (
     INTERRUPTED,
     load_spec,
@@ -64,6 +64,9 @@ SECTIONS = {
 
 PRESETS = {"published": "design.settings:PUBLISHED"}
 """Settings other than the defaults, by section, that `padforge init` can write."""
+
+EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
+"""What of `pyproject.toml` each stage needs to be installed; what chains stages needs all of it."""
 
 BENCHES = {
     "contact": "design.pad.benchmark:BENCH",
@@ -175,8 +178,7 @@ def _run(context: click.Context, spec: Path | None, seed: int | None, out: Path)
     settings = load_spec(spec)
     _check_ahead(settings, out)
     with claimed(out):
-        code = _run_stages(settings, seed, out)
-        if code != INTERRUPTED:
+        if (code := _run_stages(settings, seed, out)) != INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")
     context.exit(code)
@@ -291,7 +293,7 @@ def write_report(folder: Path) -> Path:
 
 def main() -> None:
     """Run the command line."""
-    sys.exit(run_to_end(cli, "padforge"))
+    sys.exit(run_to_end(cli, "padforge", EXTRAS))
 
 
 if __name__ == "__main__":

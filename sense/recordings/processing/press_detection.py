@@ -6,11 +6,11 @@ fibres that are dead, saturated, noisy or break meanwhile. It expects a pad that
 a quarter of a second, and a probe that sinks in within about half a second.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from design.common.errors import InputError, whole
 
@@ -67,8 +67,7 @@ class Finder:
         fibres = whole("fibres", fibres, 1, MAX_FIBRES)
         self._fibres, self._pad = unknown(fibres)
         self._last_s = -np.inf
-        seen = np.arange(1, fibres + 1)
-        self._doubt, self._sure = (np.append(0.0, chdtri(seen, chance)) for chance in (DOUBT, SURE))
+        self._doubt, self._sure = (chi_square_limits(fibres, chance) for chance in (DOUBT, SURE))
 
     def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
         """Take (n,) times in s, ascending, and (n, C) volts, NaN where missing; what became of the pad meanwhile.
@@ -124,3 +123,35 @@ def as_commanded(presses: Presses, times_s: Array) -> tuple[Indices, Indices]:
     # Presses may follow each other closely: none begins before the one before it has ended.
     sent_down = np.searchsorted(times_s, times_s[touched] - SENT_DOWN_S)
     return np.maximum(sent_down, np.concatenate([[0], lifted[:-1]]) + 1), lifted
+
+
+def chi_square_limits(most: int, chance: float) -> Array:
+    """(most + 1,) what the sum of squares of n standard normal numbers exceeds by `chance`, for n = 0 .. most.
+
+    By Newton's way from above on the logarithm of the upper tail, which is sums of n / 2 terms (M. Abramowitz and
+    I. A. Stegun, 1964, 26.4.4 and 26.4.5): readings are followed without SciPy, which a small machine may lack.
+    """
+    limits = [0.0]
+    for n in range(1, most + 1):
+        limit = limits[-1] + 20.0
+        for _ in range(200):
+            tail, density = _chi_square(limit, n)
+            step = math.log(tail / chance) * tail / density
+            limit += step
+            if abs(step) < 1e-13 * limit:
+                break
+        limits.append(limit)
+    return np.array(limits)
+
+
+def _chi_square(x: float, n: int) -> tuple[float, float]:
+    """Upper tail and density at x > 0 of the sum of squares of n standard normal numbers."""
+    half, odd = x / 2, n % 2
+    tail = math.erfc(math.sqrt(half)) if odd else 0.0
+    terms = (half**0.5 * math.exp(-half) / math.gamma(1.5), 1.5) if odd else (math.exp(-half), 1.0)
+    term, at = terms
+    for _ in range((n - odd) // 2):
+        tail += term
+        term *= half / at
+        at += 1
+    return tail, math.exp((n / 2 - 1) * math.log(half) - half - math.lgamma(n / 2)) / 2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from design.common import errors
-from design.common.errors import InputError
+from design.common.errors import InputError, what_to_install
 
 
 @pytest.mark.parametrize(
@@ -47,3 +47,22 @@ def test_a_path_is_neither_empty_nor_longer_than_systems_take():
     for value in ("", "a\0b", longest + "a", 3, None):
         with pytest.raises(InputError, match=r"file is .*, expected a path"):
             errors.path("file", value)
+
+
+@pytest.mark.parametrize(
+    ("module", "wanted", "said"),
+    [
+        ("torch.nn", "train", "torch, which is not installed: pip install 'padforge[train]'"),
+        ("torch", "", "torch, which is not installed: pip install 'padforge[design]'"),
+        ("distributed", "design", "distributed, which is not installed: pip install 'padforge[cluster]'"),
+        ("serial", "train", "pyserial, which is not installed: pip install 'padforge[rig]'"),
+        ("PIL", "design,cad,train", "pillow, which is not installed: pip install 'padforge[design,cad,train]'"),
+    ],
+)
+def test_what_is_missing_is_told_with_what_brings_it(module, wanted, said):
+    assert what_to_install(ModuleNotFoundError(name=module), wanted) == f"this needs {said}"
+
+
+def test_what_no_extra_brings_is_no_matter_of_installing():
+    for name in ("nothing_of_the_kind", "numpy", None):
+        assert what_to_install(ModuleNotFoundError(name=name)) is None

@@ -45,7 +45,7 @@ def design_here(folder, monkeypatch, *arguments):
     (folder / "pad.toml").write_text(SETTINGS)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["padforge", "design", "--out", "pad", *arguments])
-    return run_to_end(cli, "padforge")
+    return run_to_end(cli, "padforge", {})
 
 
 def finished(process):

@@ -34,6 +34,67 @@ def test_importing_takes_no_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+BARE = """
+import re, sys
+from importlib.abc import MetaPathFinder
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
+
+def name(text):
+    return re.split("[^A-Za-z0-9._-]", text)[0].lower().replace("_", "-")
+
+def with_needs(library, found):
+    if library not in found:
+        found.add(library)
+        try:
+            needs = requires(library) or ()
+        except PackageNotFoundError:
+            return found
+        for need in needs:
+            if "extra ==" not in need:
+                with_needs(name(need), found)
+    return found
+
+KEPT = with_needs("padforge", set())
+GONE = {module for module, by in packages_distributions().items() if not {name(each) for each in by} & KEPT}
+
+class Bare(MetaPathFinder):
+    def find_spec(self, fullname, path, target=None):
+        if fullname.partition(".")[0] in GONE:
+            raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
+
+assert {"torch", "scipy", "matplotlib", "build123d", "shapely"} <= GONE and "numpy" not in GONE
+sys.meta_path.insert(0, Bare())
+from padforge import main
+sys.argv[0] = "padforge"
+main()
+"""
+"""padforge as it is without any of its extras."""
+
+
+def bare(*words: str) -> tuple[int, str, str]:
+    done = subprocess.run([sys.executable, "-c", BARE, *words], capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_places_are_found_without_what_only_other_jobs_need(model, monkeypatch) -> None:
+    monkeypatch.chdir(model)
+    code, out, err = bare("sense", "locate", "--model", ".", "recording")
+    assert (code, err) == (0, "")
+    assert out.endswith("-> places.csv\n")
+    code, out, err = bare("sense", "evaluate", "--model", ".", "recording", "--lost", "1")
+    assert (code, err) == (0, "")
+    assert "mean" in out
+    code, out, err = bare("sense", "live", "--model", ".", "--replay", "recording", "--speed", "1000", "--port", "0")
+    assert code == 0, err
+    code, out, err = bare("sense", "calibrate", "recording", "--out", "again")
+    assert (code, out) == (2, "")
+    assert err.startswith("padforge: this needs ")
+    assert err.endswith("pip install 'padforge[train]'\n")
+    code, _, err = bare("run", "--out", "pad")
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.endswith("pip install 'padforge[design,cad,train]'\n")
+
+
 def test_numbers_and_places_that_cannot_be_are_one_line(few) -> None:
     huge = "9" * 20
     for arguments, message in (
@@ -46,7 +107,7 @@ def test_numbers_and_places_that_cannot_be_are_one_line(few) -> None:
         (("calibrate", "pad.toml", "--out", "m"), "pad.toml: no recording, expected a folder"),
         (("calibrate", "absent", "--out", "m"), "absent: no recording, expected a folder with start.json"),
         (("record", "--out", "pad.toml/rec"), "pad.toml is a file, expected a folder"),
-        (("import", "rec", "--out", "r"), "is a directory"),
+        (("import", "rec", "--out", "r"), "rec: ends in '', allowed are .mat"),
     ):
         code, out, err = few(*arguments)
         assert (code, out, err.count("\n")) == (2, "", 1)
