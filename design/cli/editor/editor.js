@@ -37,11 +37,12 @@ async function send() {
   if (busy) return
   busy = true
   while (waiting.length) {
-    const edit = waiting.shift(), answer = await post("/edit", edit)
+    const edit = waiting.shift(), fibre = chosen.fibre, answer = await post("/edit", edit)
     if (!answer) continue
-    if (edit.do !== "move") [chosen.fibre, chosen.knot] = edit.do === "add" || edit.do === "remove" ? answer.at : [chosen.fibre, chosen.knot]
+    const changed = edit.do === "add" || edit.do === "remove"
+    if (changed && chosen.fibre === fibre) [chosen.fibre, chosen.knot] = answer.at // else another was chosen meanwhile
     show(answer)
-    if (edit.do === "add" || edit.do === "remove") heldKnot()?.focus()
+    if (changed) heldKnot()?.focus()
   }
   busy = false
 }
