@@ -6,13 +6,13 @@ from .analysis import fibre_loss, learning_curve, recalibrate
 from .calibration import calibrate, evaluate
 from .identify import identify
 from .live import live
-from .locate import health, locate
+from .locate import deploy, health, locate
 from .recordings import export, import_
 from .rig import doctor, record
 
 COMMANDS = (
     *(import_, export, calibrate, evaluate, identify, locate, health, record, doctor, live),
-    *(recalibrate, fibre_loss, learning_curve),
+    *(recalibrate, fibre_loss, learning_curve, deploy),
 )
 
 

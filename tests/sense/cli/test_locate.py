@@ -1,7 +1,9 @@
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sense import Localizer, Recording
 from sense.localizer.locating import locate
@@ -65,3 +67,67 @@ def test_too_few_presses_for_health_are_said_to_be_and_leave_no_older_one(enough
     assert not list(Path("model").glob("health.*"))
     code, _, err = enough("health", "--model", "model", "short")
     assert (code, err.count("\n")) == (2, 1)
+
+
+def test_the_localizer_goes_elsewhere_as_a_graph(few) -> None:
+    code, out, _ = few("deploy", "--model", "model", "rec", "localizer.onnx")
+    assert code == 0
+    assert "tried on 60 presses with up to 3 fibres lost: places within " in out
+    assert out.endswith(" -> localizer.onnx\n")
+    assert few("deploy", "--model", "model", "again.onnx")[0] == 0
+    assert Path("again.onnx").read_bytes() == Path("localizer.onnx").read_bytes()
+
+
+def test_the_localizer_goes_elsewhere_as_a_header(few) -> None:
+    code, out, err = few("deploy", "--model", "model", "rec", "localizer.h", "--flash", "40k", "--ram", "8192")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert " KiB of 40, 8 of them for code; RAM " in lines[0]
+    assert lines[1:3] == ["mean error in mm on 9 presses never trained on", "lost  sets  header  causal    full"]
+    assert [line.split()[:2] for line in lines[3:7]] == [["0", "1"], ["1", "4"], ["2", "6"], ["3", "4"]]
+    assert lines[-1] == "localizer -> localizer.h"
+    float32 = Path("localizer.h").read_text()
+    assert few("deploy", "--model", "model", "rec", "localizer.h", "--flash", "40k", "--quantize", "int8")[0] == 0
+    assert "static const int8_t localizer_first_w_" in Path("localizer.h").read_text()
+    assert "int8_t localizer" not in float32
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["localizer.tflite"], "localizer.tflite: cannot be written, expected a name that ends in .onnx or .h"),
+        (["rec", "none/localizer.h"], "none/localizer.h: cannot be written, there is no folder none"),
+        (
+            ["localizer.h"],
+            "localizer.h: a .h learns from a recording, which is not given: expected RECORDING localizer.h",
+        ),
+        (["rec", "rec", "localizer.h"], "rec: one argument too many, expected [RECORDING] OUT"),
+        (["none", "localizer.h"], "none: "),
+        (["rec", "there.h"], "there.h: cannot be written, it is there and no file"),
+        (["other", "localizer.h"], "readings are of 6 fibres, the localizer was learnt from 4"),
+        (["other", "localizer.onnx"], "readings are of 6 fibres, the localizer was learnt from 4"),
+        (["rec", "localizer.h", "--flash", "4k"], "--flash is 4096 bytes: the least localizer of 4 fibres takes "),
+        (["rec", "localizer.h", "--ram", "512"], "--ram is 512 bytes: the least localizer of 4 fibres takes "),
+        (["rec", "localizer.h", "--ram", "much"], "Invalid value for '--ram': got 'much', expected bytes, as 65536, "),
+        (["rec", "localizer.h", "--model", "rec"], "rec/localizer.json: cannot be read"),
+    ],
+)
+def test_what_cannot_be_deployed_is_one_line(few, words: list[str], message: str) -> None:
+    whole = Recording.open("rec")
+    presses = (getattr(whole, name) for name in ("times_s", "presses_mm", "begun", "lifted"))
+    Recording(np.hstack([whole.readings, whole.readings[:, :2]]), *presses).save("other", {})
+    Path("there.h").mkdir()
+    code, out, err = few("deploy", "--model", "model", *words)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"padforge: {message}")
+    assert not [path for path in Path().iterdir() if path.suffix in (".h", ".onnx") and path.is_file()]
+
+
+@pytest.mark.parametrize("library", ["onnx", "onnxruntime"])
+def test_a_graph_without_its_libraries_is_one_line(few, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("sense.live.deployment.onnx")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    code, out, err = few("deploy", "--model", "model", "localizer.onnx")
+    assert (code, out) == (2, "")
+    assert err == f"padforge: this needs {library}, which is not installed: pip install 'padforge[deploy]'\n"

@@ -1,0 +1,1 @@
+"""The localizer on other machines: as an ONNX graph, and as a C header for microcontrollers."""

@@ -1,0 +1,7 @@
+"""Compiled kernels: pure functions on arrays of readings."""
+
+from pathlib import Path
+
+from design.common.computing import forget_outdated
+
+forget_outdated(Path(__file__).parent)

@@ -1,0 +1,100 @@
+"""A student of the quickly trained localizer, and its header compiled for this computer."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from sense import Localizer, Recording
+from sense.live.deployment.budget import Budget
+from sense.live.deployment.c_header import c_header
+from sense.live.deployment.student import Student, as_int8, split, teach
+from sense.recordings.processing.limits import Array, Mask
+from tests.sense.conftest import QUICK
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[3]
+BUDGET = Budget(40_000, 8_000)
+
+
+class Told(NamedTuple):
+    """What the C program tells: bytes of state and tables; a row an event: n, what, x, y, r50, r90, lost, ..."""
+
+    state: int
+    tables: int
+    events: Array
+
+    @property
+    def places(self) -> Array:
+        """Those events that have a place."""
+        return self.events[(self.events[:, 1].astype(int) & 2) > 0]
+
+
+def tutorial(name: str, language: str) -> str:
+    """The code in the tutorial that follows the comment of a name."""
+    text = (ROOT / "docs" / "tutorial-sense.md").read_text(encoding="utf-8")
+    found = re.search(rf"<!-- {name} -->\n```{language}\n(.*?)```", text, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+Program = Callable[..., Told]
+
+
+def compiled(source: Path, folder: Path, *flags: str) -> Path:
+    """A C99 program of a source beside `localizer.h` in a folder; the test is skipped where there is no compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no C compiler, cc")
+    program = folder / "program"
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O2", *flags]
+    subprocess.run([compiler, *strict, "-I", folder, source, "-o", program, "-lm"], check=True)
+    return program
+
+
+@pytest.fixture(scope="session")
+def taught(recording: Recording, localizer: Localizer) -> Student:
+    training, _ = split(recording, localizer, QUICK)
+    return teach(recording, localizer, training, BUDGET, QUICK)
+
+
+@pytest.fixture(scope="session")
+def quantized(taught: Student) -> Student:
+    """The same in int8."""
+    return replace(
+        taught, localizer=replace(taught.localizer, weights=as_int8(taught.localizer.weights)), quantized=True
+    )
+
+
+@pytest.fixture(scope="session")
+def deeply(deep_recording: Recording, deep_localizer: Localizer) -> Student:
+    """One that has learnt depth and force."""
+    options = QUICK.model_copy(update={"epochs": 20})
+    return teach(deep_recording, deep_localizer, split(deep_recording, deep_localizer, options)[0], BUDGET, options)
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Callable[..., Program]:
+    """The header of a student in a program that takes readings, whether the pad is pressed, and lost fibres."""
+
+    def build(student: Student, budget: Budget = BUDGET, *flags: str, text: str = "") -> Program:
+        (tmp_path / "localizer.h").write_text(text or c_header(student, budget, ["of a test"]))
+        path = compiled(HERE / "driver.c", tmp_path, *flags)
+
+        def run(readings: Array, held: Mask | None = None, lost: tuple[int, ...] = ()) -> Told:
+            pressed = np.full(len(readings), -1) if held is None else held
+            rows = np.column_stack([readings, pressed]).astype(np.float32).tobytes()
+            mask = "".join("0" if fibre in lost else "1" for fibre in range(student.localizer.fibres))
+            lines = subprocess.run([path, mask], input=rows, capture_output=True, check=True).stdout.split(b"\n")
+            state, tables = map(int, lines[0].split())
+            return Told(state, tables, np.array([line.split() for line in lines[1:-1]], float))
+
+        return run
+
+    return build

@@ -1,0 +1,95 @@
+"""The twin of the C header: windows as the features have them, averages as they are defined, touches where they are."""
+
+import numpy as np
+import pytest
+
+from sense import Recording
+from sense.live.deployment.kernels import press_stream
+from sense.live.deployment.streaming import POLES, Detector, commanded, held, owners, seen
+from sense.localizer import features
+from sense.recordings.processing import limits
+
+
+@pytest.fixture
+def nothing() -> Detector:
+    return Detector(np.full(4, np.inf), np.inf, 0)
+
+
+def test_windows_are_those_of_the_features(recording: Recording) -> None:
+    assert press_stream.WINDOWS == features.DOWN
+    assert press_stream.MOST_V == limits.MAX_VOLTS
+    assert features.REST == (-press_stream.REST, 0)
+    expected = features.window_inputs(recording.readings, recording.begun, recording.lifted, release=False)
+    np.testing.assert_allclose(commanded(recording).windows, expected, atol=2e-6)
+
+
+def test_history_is_what_averages_were_when_the_press_began(recording: Recording, nothing: Detector) -> None:
+    found = seen(recording.readings, nothing, held(recording))
+    levels = np.repeat(recording.readings[:1, :, None], len(POLES), axis=2)[0]
+    press = 0
+    for n, row in enumerate(recording.readings[: recording.begun[20]]):
+        if n == found.begun[press]:
+            rest = recording.readings[n - press_stream.REST : n].mean(axis=0)
+            np.testing.assert_allclose(found.inputs.history[press], levels - rest[:, None], atol=1e-5)
+            press += 1
+        levels += (row[:, None] - levels) / np.array(POLES)
+    assert press == 20
+
+
+def test_all_presses_are_seen_as_they_were_told(recording: Recording, nothing: Detector) -> None:
+    found = seen(recording.readings, nothing, held(recording))
+    assert np.array_equal(found.begun, recording.begun)
+    assert np.array_equal(found.ended, recording.lifted)
+    assert np.array_equal(found.told, recording.begun + press_stream.SEEN - 1)
+    assert found.inputs.alive.all()
+
+
+def test_short_presses_and_such_without_a_pause_are_seen(recording: Recording, nothing: Detector) -> None:
+    pressed = np.zeros(200, bool)
+    for first, end in ((0, 3), (5, 6), (7, 8), (40, 90), (91, 92)):
+        pressed[first:end] = True
+    found = seen(recording.readings[:200], nothing, pressed)
+    assert found.begun.tolist() == [1, 5, 7, 40, 91]
+    assert found.ended.tolist() == [3, 6, 8, 90, 92]
+    assert found.told.tolist() == [3, 6, 8, 59, 92]
+    assert np.isfinite(found.inputs.windows).all()
+    pressed[150:] = True
+    assert seen(recording.readings[:200], nothing, pressed).ended[-1] == 200
+
+
+def test_the_detector_finds_what_it_never_learnt_from(recording: Recording) -> None:
+    detector = Detector.fit(recording, np.arange(0, 200))
+    found = seen(recording.readings, detector)
+    press = owners(recording, found.begun)
+    assert np.isin(np.arange(200, 300), press).all()
+    assert (press >= 0).all()
+    off = found.begun - recording.begun[press]
+    assert np.abs(off).max() <= 2
+    assert np.abs(found.ended[:-1] - recording.lifted[press[:-1]]).max() <= 5  # the simulated pad takes its time
+
+
+def test_a_fibre_that_tells_nothing_is_no_noise(recording: Recording) -> None:
+    readings = np.array(recording.readings)
+    readings[:, 1], readings[:, 2] = 1.5, np.nan
+    dead = Recording(readings, recording.times_s, recording.presses_mm, recording.begun, recording.lifted)
+    detector = Detector.fit(dead, np.arange(300))
+    assert np.isinf(detector.noise_v[[1, 2]]).all()
+    assert len(seen(readings, detector).begun) >= 280
+
+
+def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
+    """A fibre breaks while the pad is free: what follows is found again after that."""
+    detector = Detector.fit(recording, np.arange(300))
+    readings = np.array(recording.readings)
+    readings[2012:, 0] = 0.0
+    found = seen(readings, detector)
+    long = np.flatnonzero(found.ended - found.begun > press_stream.LONGEST)
+    assert len(long) == 1
+    assert found.ended[long[0]] < recording.begun[100]
+    assert np.isin(np.arange(150, 300), owners(recording, found.begun)).mean() > 0.9
+
+
+def test_the_first_of_several_in_a_press_is_it(recording: Recording) -> None:
+    first = recording.begun[0]
+    begun = np.array([first - 5, first - 1, first + 3, recording.lifted[0] + 2, recording.begun[1]])
+    assert owners(recording, begun).tolist() == [-1, 0, -1, -1, 1]
