@@ -242,7 +242,7 @@ def _knot_count(layout: Layout, knots: int) -> int:
 def _fibres_of(document: Mapping[str, Any], count: int) -> tuple[int, int]:
     """(H, V) of a square pad of that many fibres."""
     if count % 2 or document.get("grid", count // 2) != count // 2:
-        raise InputError(f"grid is {document.get('grid')}, but there are {count} fibres")
+        raise InputError(f"grid is {shown(document.get('grid'))}, but there are {count} fibres")
     return count // 2, count // 2
 
 

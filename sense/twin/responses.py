@@ -121,7 +121,7 @@ def _told(places: Array, windows: Array, history: Array) -> float:
         expected = RegularGridInterpolator((grid, grid), model.table)(places[~seen])
         left[~seen] = settled(windows[~seen], history[~seen], model.memory, model.usual) - expected
         tables.append(model.table[:, :, 0])
-    precision, told = np.linalg.inv(np.cov(left[:, 0].T)), 0.0
+    precision, told = np.linalg.pinv(np.cov(left[:, 0].T), hermitian=True), 0.0  # short presses have readings twice
     for axis in (0, 1):
         one, other = (np.asarray(np.gradient(table, 2 / STEPS, axis=axis)) for table in tables)
         told += float(np.einsum("xyf,fg,xyg->xy", one, precision, other).mean())

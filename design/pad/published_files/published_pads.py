@@ -44,7 +44,7 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
     """Largest difference of the published samples to those of fibres; 0 where the file has no samples."""
     if not {"K", "loc_all", "sens_raw_all"} <= content.keys():
         return 0.0
-    settings = content["K"][0, 0]
+    settings = content["K"]
     contact = Contact(radius=float(settings["object_size"].item()), sides=int(settings["str_shp"].item()))
     places, expected = reals("loc_all", content["loc_all"][:presses], FARTHEST), content["sens_raw_all"][:presses]
     if places.ndim != 2 or places.shape[1] != 2:

@@ -35,7 +35,7 @@ def export_hdf5(recording: Recording, path: str | Path) -> None:
     import h5py
 
     path = Path(path)
-    with writing(path), atomic(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+    with writing(path), atomic(path) as temporary, h5py.File(temporary, "w", track_order=True, locking=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["source"] = json.dumps(dict(recording.source))
         arrays = {name: getattr(recording, attribute) for name, attribute in _ARRAYS.items()}

@@ -8,8 +8,6 @@ See `lerobot.datasets` of https://github.com/huggingface/lerobot (0.6), which re
 """
 
 import json
-import shutil
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.common.errors import InputError
-from design.common.files import UNFINISHED, write_json, writing
+from design.common.files import scratch, write_json, writing
 from sense.recordings.processing.limits import Indices
 from sense.recordings.recorder import refuse_existing
 from sense.recordings.recording import Recording
@@ -61,15 +59,14 @@ def export_lerobot(recording: Recording, path: Path, findings: ModelFindings | N
         raise InputError(f"{path}: no place of a press is known, and a dataset needs what was commanded")
     starts, ends = _episodes(recording)
     columns, names = _columns(recording, starts, ends, findings)
-    unfinished = path.resolve().with_name(f"{UNFINISHED}{uuid.uuid4().hex}")
+    path = path.resolve()
     with writing(path):
-        try:
-            _write(unfinished, columns, names, ends - starts, _rate(recording.rate_hz))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with scratch(path.parent) as folder:
+            _write(folder / path.name, columns, names, ends - starts, _rate(recording.rate_hz))
             if path.exists():
                 path.rmdir()
-            unfinished.rename(path.resolve())
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+            (folder / path.name).rename(path)
 
 
 def _rate(hz: float) -> float:

@@ -86,7 +86,6 @@ def _mapped(path: Path, mapping: str) -> Recording:
 
 def _numbers(values: object, what: str) -> Array:
     if not isinstance(values, np.ndarray):
-        raise InputError(f"{what} is a {type(values).__name__}, expected a full matrix of real numbers")
-    if values.dtype.kind not in "fiu":
-        raise InputError(f"{what} holds {values.dtype}, expected real numbers")
+        told = values if isinstance(values, str) else "a structure"
+        raise InputError(f"{what} is {told}, expected a full matrix of real numbers")
     return values.astype(np.float64)

@@ -1,8 +1,5 @@
 """Morphologies: construction, files, refusals."""
 
-import os
-import signal
-
 import numpy as np
 import pytest
 import scipy.io
@@ -178,11 +175,3 @@ def test_published_samples_that_are_not_as_published_are_one_line(settings, tmp_
 def test_parameters_of_another_kind_are_refused(para):
     with pytest.raises(InputError, match="parameters"):
         Morphology.from_parameters(para)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a child process that is a copy of this one")
-def test_a_file_that_breaks_the_compiled_reader_is_refused(tmp_path, monkeypatch):
-    scipy.io.savemat(tmp_path / "bad.mat", {"para": np.zeros(1)})
-    monkeypatch.setattr("scipy.io.loadmat", lambda file: os.kill(os.getpid(), signal.SIGSEGV))
-    with pytest.raises(InputError, match=r"bad\.mat: not a readable MATLAB file.*the reader breaks down over it"):
-        Morphology.load(tmp_path / "bad.mat")

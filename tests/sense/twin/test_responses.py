@@ -51,6 +51,13 @@ def test_presses_in_which_a_channel_gave_nothing_do_not_count(noisy: Twin, recor
     assert information(spoilt, only) == pytest.approx(information(recording, only), rel=0.35)
 
 
+def test_presses_so_short_that_windows_share_readings_tell_of_their_places_too() -> None:
+    recording = simulate(Morphology.random(2, 3, seed=0), RigSettings(presses=120, readings_per_press=8, seed=0))
+    found = information(recording, np.arange(recording.fibres))
+    assert np.isfinite(found).all()
+    assert (found > 0).any()
+
+
 def test_presses_as_deep_as_most_are_kept_the_deeper_of_two_kinds_and_all_of_unknown_depth() -> None:
     recording = simulate(Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)))
     kept = of_one_depth(recording)

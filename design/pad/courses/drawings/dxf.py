@@ -30,13 +30,14 @@ def read_dxf(path: Path) -> Drawing:
     require_file(path, MOST_BYTES)
     try:
         document = ezdxf.readfile(path)
-    except (OSError, ezdxf.DXFError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        unit, millimetre = document.units, units.InsertUnits.Millimeters
+        unit_mm = float(units.conversion_factor(units.InsertUnits(unit), millimetre)) if unit else 1.0
+    except MemoryError:
+        raise
+    except Exception as error:  # ezdxf raises whatever a torn file leads it to
         raise InputError(f"{path}: not a DXF file that can be read ({reason(error)})") from error
-    unit = document.units
     drawing = Drawing(note="" if unit else "the file says no unit: mm")
-    drawing.unit_mm = float(
-        units.conversion_factor(units.InsertUnits(unit), units.InsertUnits.Millimeters) if unit else 1
-    )
+    drawing.unit_mm = unit_mm
     for number, entity in enumerate(document.modelspace(), 1):
         drawing.looked_at()
         if entity.dxftype() not in _KINDS:

@@ -50,6 +50,7 @@ def read_svg(path: Path) -> Drawing:
         root = etree.fromstring(content, parser)
     except (etree.XMLSyntaxError, ValueError) as error:
         raise InputError(f"{path}: not an SVG file that can be read ({reason(error)})") from error
+    etree.strip_tags(root, etree.Entity)  # what an external DTD may declare, which is not looked at
     if _kind(root) != "svg":
         raise InputError(f"{path}: the root is <{_kind(root)}>, expected <svg>")
     drawing = Drawing()

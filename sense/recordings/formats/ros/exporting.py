@@ -2,14 +2,13 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from design.common.errors import InputError
-from design.common.files import UNFINISHED, atomic, writing
+from design.common.files import UNFINISHED, staged, writing
 from sense.recordings.formats.model_findings import ModelFindings
 from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
@@ -58,10 +57,8 @@ def export_bag(
     messages[topics.RECORDING] = [np.frombuffer(bytes(store.serialize_cdr(text, text.__msgtype__)), np.uint8)]
     stamps[topics.RECORDING] = stamps[topics.READINGS][:1]
     _refuse_too_many(messages)
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=path.parent, prefix=UNFINISHED) as folder, atomic(path) as temporary:
-            _write(store, Path(folder) / path.stem, stamps, messages).replace(temporary)
+    with writing(path), staged(path.parent) as folder:
+        _write(store, folder / f"{UNFINISHED}{path.stem}", stamps, messages).replace(folder / path.name)
 
 
 def _refuse_too_many(messages: Mapping[str, _Messages]) -> None:

@@ -1,6 +1,11 @@
-"""MATLAB files of version 7.3, which are HDF5, beside those of earlier ones."""
+"""MATLAB files of every version: what they hold, and what they only claim to."""
 
+import re
 import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +16,7 @@ import scipy.io
 from design import Morphology
 from design.common.errors import InputError
 from design.pad.published_files.matlab import load_mat
+from sense import import_mat
 
 
 def newer(path: Path, content: dict[str, Any]) -> Path:
@@ -39,7 +45,7 @@ def test_numbers_and_structures_are_those_of_earlier_versions(tmp_path: Path) ->
     old, new = load_mat(tmp_path / "old.mat", ("para",)), load_mat(newer(tmp_path / "new.mat", CONTENT), ("para",))
     assert set(new) == {"para", "K"}
     assert np.array_equal(new["para"], old["para"])
-    assert new["K"][0, 0]["object_size"].item() == old["K"][0, 0]["object_size"].item() == 0.6
+    assert new["K"]["object_size"].item() == old["K"]["object_size"].item() == 0.6
     pads = [Morphology.load(tmp_path / name) for name in ("old.mat", "new.mat")]
     assert np.array_equal(pads[0].knots, pads[1].knots)
 
@@ -72,11 +78,110 @@ def test_a_torn_file_of_7_3_is_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(refused.value)
 
 
+HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+MUCH = 2**29
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
+
+
+def variable(kind: int, shape: tuple[int, ...], *parts: bytes, name: bytes = b"voltage") -> bytes:
+    """A variable of a class that claims to have a shape."""
+    head = element(6, struct.pack("<II", kind, 0)), element(5, struct.pack(f"<{len(shape)}i", *shape)), element(1, name)
+    return element(14, b"".join((*head, *parts)))
+
+
+def packed(content: bytes) -> bytes:
+    content = zlib.compress(content)
+    return struct.pack("<II", 15, len(content)) + content
+
+
+def zeros(count: int) -> bytes:
+    """A variable of so many zeros, packed: a thousandth of them."""
+    whole = variable(9, (count, 1), struct.pack("<II", 2, count))
+    packer = zlib.compressobj()
+    content = packer.compress(whole[:4] + struct.pack("<I", len(whole) - 8 + count) + whole[8:])
+    content += b"".join(packer.compress(bytes(2**20)) for _ in range(count >> 20)) + packer.flush()
+    return struct.pack("<II", 15, len(content)) + content
+
+
+FIELDS = element(5, struct.pack("<i", 8)), element(1, b"field\0\0\0")
+BOMBS = {
+    "cells": (variable(1, (MUCH, 1)), "voltage is a cell array, expected a full matrix"),
+    "packed cells": (packed(variable(1, (MUCH, 1))), "voltage is a cell array, expected a full matrix"),
+    "structures": (variable(2, (MUCH, 1), *FIELDS), "voltage is a structure, expected a full matrix"),
+    "packed structures": (packed(variable(2, (MUCH, 1), *FIELDS)), "voltage is a structure, expected a full matrix"),
+    "text": (variable(4, (MUCH, 1), element(4, b"")), "voltage is text, expected a full matrix"),
+    "sparse": (variable(5, (MUCH, MUCH)), "voltage is a sparse matrix, expected a full matrix"),
+    "numbers": (variable(6, (MUCH, 1), element(9, bytes(8))), f"voltage claims {MUCH} values in 8 bytes of float64"),
+    "packed numbers": (
+        packed(variable(6, (MUCH, MUCH), element(9, bytes(8)))),
+        f"voltage claims {MUCH**2} values in 8 bytes of float64",
+    ),
+    "a long element": (struct.pack("<II", 14, 2**31), "it ends early"),
+    "zeros": (zeros(2**28), "it unpacks to more than 67108864 bytes"),
+    "bytes that are numbers": (zeros(2**25), "it holds more than 8388608 values"),
+}
+
+
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say how much memory is taken")
-def test_a_few_bytes_cannot_ask_for_much_memory(tmp_path: Path) -> None:
-    cells = 2**29
-    body = struct.pack("<IIII IIII", 6, 8, 1, 0, 5, 8, cells, 1) + struct.pack("<IIQ", 1, 1, ord("a"))
-    header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
-    (tmp_path / "cells.mat").write_bytes(header + struct.pack("<II", 14, len(body)) + body)
-    with pytest.raises(InputError, match=r"cells\.mat: .*it takes more than 2147483648 bytes to read"):
-        load_mat(tmp_path / "cells.mat", ())
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_few_bytes_cannot_ask_for_much_memory(tmp_path: Path, name: str) -> None:
+    """In a process that has but 256 MiB left; what else is in the file is read where that one is not needed."""
+    bomb, message = BOMBS[name]
+    time = variable(6, (2, 1), element(9, bytes(16)), name=b"tim")
+    (tmp_path / "bomb.mat").write_bytes(HEADER + time + bomb)
+    with most_memory(2**28):
+        with pytest.raises(InputError, match=rf"bomb\.mat: .*{message}") as refused:
+            import_mat(tmp_path / "bomb.mat")
+        if "expected a full matrix" in message:
+            assert load_mat(tmp_path / "bomb.mat", ("tim",))["tim"].shape == (2, 1)
+    assert "\n" not in str(refused.value)
+
+
+@contextmanager
+def most_memory(more: int) -> Iterator[None]:
+    """Let this process take so many bytes more than it has."""
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    has = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (has + more, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+def test_a_file_of_version_4_that_claims_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "old.mat", {"para": CONTENT["para"]}, format="4")
+    assert np.array_equal(load_mat(tmp_path / "old.mat", ("para",))["para"], CONTENT["para"])
+    (tmp_path / "bomb.mat").write_bytes(struct.pack("<5i", 0, MUCH, MUCH, 0, 5) + b"para\0" + bytes(8))
+    with pytest.raises(InputError, match=r"bomb\.mat: .*para claims more values than there are"):
+        load_mat(tmp_path / "bomb.mat", ())
+
+
+CORPUS = Path(scipy.io.matlab.__file__).parent / "tests" / "data"
+THEIRS = sorted(path.name for path in CORPUS.glob("*.mat"))
+BROKEN = "bad_miu.*|broken_utf8.*|corrupted.*|debigged.*|malformed.*|testhdf5.*"
+
+
+@pytest.mark.skipif(not THEIRS, reason="SciPy is installed without its tests")
+@pytest.mark.parametrize("name", [name for name in THEIRS if not re.fullmatch(BROKEN, name)])
+def test_what_matlab_itself_has_written_is_read_as_by_scipy(name: str) -> None:
+    """Of versions 4.2 to 7.4 on machines of either byte order: numbers and structures, and all else in words."""
+    with warnings.catch_warnings(action="ignore"):
+        expected = scipy.io.loadmat(CORPUS / name)
+    found = load_mat(CORPUS / name, ())
+    assert set(found) == {each for each in expected if not each.startswith("__")}
+    for each, value in found.items():
+        if isinstance(value, np.ndarray):
+            assert value.dtype == expected[each].dtype.newbyteorder("=")
+            np.testing.assert_array_equal(value, expected[each])
+        elif isinstance(value, dict):
+            for field, inner in value.items():
+                if isinstance(inner, np.ndarray):
+                    np.testing.assert_array_equal(inner, expected[each][0, 0][field])
+        else:
+            assert value == "a sparse matrix" or expected[each].dtype.kind in "OUVc"

@@ -233,6 +233,7 @@ def test_a_dxf_of_all_kinds_is_read(tmp_path: Path) -> None:
         lambda space: space.add_lwpolyline([(k, k % 7) for k in range(50_000)]),
         lambda space: space.add_lwpolyline([(0, 0, 1e300), (1, 1, 0)], format="xyb"),
         lambda space: [space.add_line((k, 0), (k, 1)) for k in range(21_000)],
+        lambda space: space.doc.header.__setitem__("$INSUNITS", 99),
     ],
 )
 def test_hostile_dxf_is_told_in_one_line(tmp_path: Path, draw) -> None:

@@ -1,0 +1,189 @@
+"""MATLAB files of version 4 and of 5 to 7.2: real numbers, and structures of them, out of the bytes that are there.
+
+A file may claim more than it holds. So a shape is compared with the bytes behind it before anything is asked for, and
+what is packed is unpacked no further than it may be; cells, objects and all else that is not needed are not unpacked
+into anything, but told of in words.
+
+Format: The MathWorks, MAT-File Format.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from math import prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .hdf5_datasets import FREE_BYTES, MOST_OBJECTS, PACKED
+
+MOST_BYTES = 2**29
+"""What the variables of a file may take, unpacked and as floating point numbers; the longest published recording is far
+below."""
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+"""Kinds of elements that are numbers."""
+_MATRIX, _PACKED = 14, 15
+_STRUCTURE, _OPAQUE = 2, 17
+_CLASSES = {1: "a cell array", _STRUCTURE: "a structure", 3: "an object", 4: "text", 5: "a sparse matrix"}
+"""What variables may be that are no full matrices of numbers, which are classes 6 to 15."""
+_COMPLEX = 0x800
+_STORED_4, _KINDS_4 = ("f8", "f4", "i4", "i2", "u2", "u1"), ("", "text", "a sparse matrix")
+
+Value = NDArray[Any] | dict[str, Any] | str
+
+
+def read_elements(stored: bytes) -> dict[str, Value]:
+    """The variables of a MATLAB file by name, in its order.
+
+    Returns:
+        Of a full real matrix the numbers, as they are stored; of a structure the same by the names of its fields; of
+        anything else what it is, in words.
+
+    Raises:
+        ValueError, struct.error, zlib.error: the file is torn, of another kind, or claims more than it holds or may.
+    """
+    content = _Content(stored)
+    found: dict[str, Value] = {}
+    variables = content.of_version_4() if 0 in stored[:4] else content.variables()
+    for count, (name, value) in enumerate(variables):
+        if count == MOST_OBJECTS:
+            raise ValueError(f"it holds more than {MOST_OBJECTS} variables")
+        if name:  # what has none, functions keep their own variables in
+            found[name] = value
+    return found
+
+
+class _Content:
+    """The bytes of a file, and how many of those that it may take are left."""
+
+    def __init__(self, stored: bytes) -> None:
+        self._stored = memoryview(stored)
+        self._most = min(MOST_BYTES, max(FREE_BYTES, PACKED * len(stored)))
+        self._unpacked = self._values = 0
+
+    def of_version_4(self) -> Iterator[tuple[str, Value]]:
+        """Name and value of every variable of a file without a header."""
+        stored, at = self._stored, 0
+        order = "<" if 0 <= struct.unpack_from("<i", stored)[0] < 5000 else ">"
+        while at < len(stored):
+            code, rows, columns, imaginary, letters = struct.unpack_from(f"{order}5i", stored, at)
+            name = _name(stored[at + 20 : at + 20 + letters])
+            at += 20 + letters
+            kind, number = code % 10, code // 10 % 10
+            if min(rows, columns, letters) < 0 or not 0 <= code < 5000 or kind > 2 or number > 5:
+                raise ValueError("it has no header of MATLAB")
+            values = np.dtype(order + _STORED_4[number])
+            size = rows * columns * values.itemsize
+            data = stored[at : at + size]
+            at += size * (2 if imaginary else 1)
+            if at > len(stored):
+                raise ValueError(f"{name} claims more values than there are")
+            told = _KINDS_4[kind] or ("complex" if imaginary else "")
+            yield name, told or self._numbers(data, values, (rows, columns), name)
+
+    def variables(self) -> Iterator[tuple[str, Value]]:
+        """Name and value of every variable of a file with a header."""
+        orders = {b"IM": "<", b"MI": ">"}
+        order = orders.get(bytes(self._stored[126:128]))
+        if order is None:
+            raise ValueError("it has no header of MATLAB")
+        elements = _Elements(self._stored[128:], order)
+        while elements.left >= 8:
+            kind, data = elements.next()
+            if kind == _PACKED:
+                kind, data = _Elements(self._unpack(data), order).next()
+            if kind != _MATRIX:
+                raise ValueError(f"it has an element of kind {kind}, expected a variable")
+            yield self._matrix(data, order)
+
+    def _unpack(self, packed: memoryview) -> memoryview:
+        unpacker, allowed = zlib.decompressobj(), self._most - self._unpacked
+        content = unpacker.decompress(packed, allowed + 1)
+        if len(content) > allowed:
+            raise ValueError(f"it unpacks to more than {self._most} bytes")
+        if not unpacker.eof:
+            raise ValueError("it ends early")
+        self._unpacked += len(content)
+        return memoryview(content)
+
+    def _matrix(self, content: memoryview, order: str, within: bool = False) -> tuple[str, Value]:
+        """Name and value of a variable, or of a field `within` one."""
+        if not content:  # a field that nothing was put into
+            return "", np.empty((0, 0))
+        parts = _Elements(content, order)
+        (flags,) = struct.unpack_from(f"{order}I", parts.next()[1])
+        kind = flags & 0xFF
+        if kind == _OPAQUE:
+            return _name(parts.next()[1]), "an object"
+        shape = tuple(int(length) for length in parts.numbers())
+        name = _name(parts.next()[1])
+        if min(shape, default=-1) < 0:
+            raise ValueError(f"{name} has shape {shape}")
+        if kind == _STRUCTURE and prod(shape) == 1 and not within:
+            return name, self._structure(parts, order)
+        if not 6 <= kind <= 15:
+            return name, _CLASSES.get(kind, "a function or an object")
+        if flags & _COMPLEX:
+            return name, "complex"
+        stored, data = parts.next()
+        if stored not in _STORED:
+            raise ValueError(f"{name} has an element of kind {stored}, expected numbers")
+        return name, self._numbers(data, np.dtype(order + _STORED[stored]), shape, name)
+
+    def _structure(self, parts: "_Elements", order: str) -> dict[str, Any]:
+        """What the fields of a structure hold, one of their own in words."""
+        length = int(parts.numbers()[0])
+        names = parts.next()[1]
+        if length < 1 or len(names) > length * MOST_OBJECTS:
+            raise ValueError(f"it has a structure of more than {MOST_OBJECTS} fields")
+        starts = range(0, len(names), length)
+        return {_name(names[at : at + length]): self._matrix(parts.next()[1], order, within=True)[1] for at in starts}
+
+    def _numbers(self, data: memoryview, kind: "np.dtype[Any]", shape: tuple[int, ...], name: str) -> NDArray[Any]:
+        """Values of a shape that is as large as what is there, by columns, in an array of its own."""
+        claimed = prod(shape)
+        if claimed * kind.itemsize != len(data):
+            raise ValueError(f"{name} claims {claimed} values in {len(data)} bytes of {kind.name}")
+        self._values += claimed
+        if 8 * self._values > self._most:
+            raise ValueError(f"it holds more than {self._most // 8} values")
+        return np.frombuffer(data, kind).reshape(shape, order="F").astype(kind.newbyteorder("="))
+
+
+class _Elements:
+    """Elements that lie one behind the other: each says its kind and how many bytes it has."""
+
+    def __init__(self, content: memoryview, order: str) -> None:
+        self._content, self._order, self._at = content, order, 0
+
+    @property
+    def left(self) -> int:
+        """Bytes that are not read yet."""
+        return len(self._content) - self._at
+
+    def next(self) -> tuple[int, memoryview]:
+        """Kind and bytes of the next element."""
+        kind, length = struct.unpack_from(f"{self._order}II", self._content, self._at)
+        begin = self._at + 8
+        if kind >> 16:  # a short one, whose bytes stand where else their number does
+            kind, length, begin = kind & 0xFFFF, kind >> 16, begin - 4
+            if length > 4:
+                raise ValueError("it has a short element that is long")
+            self._at = begin + 4
+        else:
+            self._at = begin + length + (-length % 8 if kind != _PACKED else 0)
+        if begin + length > len(self._content):
+            raise ValueError("it ends early")
+        return kind, self._content[begin : begin + length]
+
+    def numbers(self) -> NDArray[Any]:
+        """The numbers of the next element."""
+        kind, data = self.next()
+        if kind not in _STORED:
+            raise ValueError(f"it has an element of kind {kind}, expected numbers")
+        return np.frombuffer(data, self._order + _STORED[kind])
+
+
+def _name(content: memoryview) -> str:
+    return bytes(content).split(b"\0")[0].decode(errors="replace")
