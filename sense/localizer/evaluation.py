@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from math import isnan
+from math import ceil, isnan
 from typing import Any
 
 import numpy as np
@@ -146,9 +146,9 @@ def conformal(found: Sequence[Found], places_mm: Array, measures: Mapping[str, A
 
     They are then right for these presses.
 
-    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
-    distance over radius on presses never trained on, a rank higher than their share, as if the next were one; so of few
-    presses they are the more cautious.
+    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): of distance
+    over radius on presses that entered nothing before, the least that is not below a share of them and the next one.
+    So of few presses they are the more cautious.
 
     Args:
         found: the Q presses, with each of some sets of lost fibres. places_mm: (Q, 2).
@@ -156,19 +156,31 @@ def conformal(found: Sequence[Found], places_mm: Array, measures: Mapping[str, A
     """
     off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
     errors = [distances(each.places_mm, places_mm) for each in found]
-    share = 1 + 1 / len(places_mm)
-    r50 = np.quantile([error / each.r50_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.5 * share))
-    r90 = np.quantile([error / each.r90_mm for error, each in zip(errors, found, strict=True)], min(1.0, 0.9 * share))
+    r50 = _covering(0.5, np.array([error / each.r50_mm for error, each in zip(errors, found, strict=True)]))
+    r90 = _covering(0.9, np.array([error / each.r90_mm for error, each in zip(errors, found, strict=True)]))
     more = [_conformal_r90(each) for each in _paired(found, measures).values()]
     return np.array([np.sqrt(np.square(off).mean()), r50, r90, *more])
+
+
+def _covering(share: float, ratios: Array) -> float:
+    """The least of the ratios (sets, Q) that a share of them and one more does not exceed; the greatest if all are few.
+
+    Sets of one press are not independent of each other: they count for as many as the presses differ in how often they
+    keep to the share.
+    """
+    ranked = np.sort(ratios, axis=None)
+    kept = (ratios <= np.quantile(ratios, share)).mean(axis=0)
+    presses, spread = len(kept), float(kept.var())
+    alone = min(max(presses, share * (1 - share) * presses / spread), ranked.size) if spread else ranked.size
+    rank = ceil(round(share * (1 + 1 / alone) * ranked.size, 9))
+    return float(ranked[min(rank, ranked.size) - 1])
 
 
 def _conformal_r90(pairs: list[tuple[Measured, Array]]) -> float:
     """The factor of `conformal` of the r90 of a measure."""
     ratios = np.array([np.abs(each.values - true) / each.r90 for each, true in pairs])
     ratios = ratios[:, np.isfinite(ratios).all(axis=0)]
-    presses = ratios.shape[1]
-    return float(np.quantile(ratios, min(1.0, 0.9 * (1 + 1 / presses)))) if presses else 1.0
+    return _covering(0.9, ratios) if ratios.shape[1] else 1.0
 
 
 def _paired(found: Sequence[Found], measures: Mapping[str, Array] | None) -> dict[str, list[tuple[Measured, Array]]]:

@@ -178,8 +178,8 @@ class Localizer:
     def save(self, folder: str | Path) -> None:
         """Write `localizer.safetensors` and `localizer.json`; reading them back gives the same to the last bit.
 
-        Nothing is touched before both are complete. The document has the digest of its weights, so `load` tells a
-        pair that was interrupted between its halves from a whole one.
+        Both appear together, or the old ones stay. The document has the digest of its weights, so `load` tells two
+        that do not belong together.
 
         Raises:
             InputError: something is not finite or no JSON, or `folder` cannot be written.

@@ -30,7 +30,7 @@ ITERATIONS = (30, 100, 300)
 """Of L-BFGS, which does likewise."""
 PASSES = (30, 100, 300)
 """Of Adam, through batches of BATCH presses."""
-STEPS = (50, 200, 800)
+STEPS = (50, 200, 800, 3200)
 """Of the masked network, one member of its usual size."""
 FEATURES = ("published", "full")
 MARQUARDT = ("published",)

@@ -28,7 +28,8 @@ from .networks.training_presses import TrainingPresses
 LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
 CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
-"""Share of the presses of training that end it and find the radii; of the published method, 15 % of all."""
+"""Share of the presses of training that are not learnt from: half of them end it, the others find the radii. Of the
+published method, 15 % of all."""
 MOST_SECONDS = 1e9
 """Longest time budget: some thirty years."""
 LEAST_SPREAD_MM = 0.2
@@ -101,30 +102,28 @@ def learn(
 ) -> Localizer:
     """Train a localizer on the presses `training` of a recording, by index.
 
-    Of them, a share ends the training and finds the radii: drawn at random, or the last ones, as the split is. The
-    others are shown as they were commanded and, once more, as they would be found in the readings.
+    Of them, a share ends the training and another finds the radii: drawn at random, or the last ones, as the split is.
+    Were they the same, the weights would be those that suit them, and the radii too short. The others are shown as they
+    were commanded and, once more, as they would be found in the readings.
 
     Raises:
         InputError: the training diverged.
     """
-    taught, checked = (
-        training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
-    )
+    taught, ending, proving = _parts(training, options, rng)
     masked = options.method == "masked"
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, options.features)
     measures = learnable(recording, training) if masked else {}
-    shown_raw, rows, held_mm = raw[taught], taught, recording.presses_mm[checked]
+    shown_raw, rows = raw[taught], taught
     if masked:
         from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
         again = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         rows = np.concatenate([taught, taught])
-    shown_mm, shown_more, held_more = recording.presses_mm[rows], _of(measures, rows), _of(measures, checked)
+    shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
     scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more)
-    held_presses = scaling.inputs(raw[checked])
     shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
-    held = _samples(scaling, held_presses, held_mm, held_more)
+    held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], _of(measures, ending))
     if masked:
         from .training import train_members  # torch, seconds to import, is needed here only
 
@@ -148,7 +147,21 @@ def learn(
         learnt_from=recording.digest,
     )
     levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
-    return replace(localizer, factors=radii(localizer, held_presses, held_mm, levels, held_more))
+    proof = scaling.inputs(raw[proving]), recording.presses_mm[proving], levels, _of(measures, proving)
+    return replace(localizer, factors=radii(localizer, *proof))
+
+
+def _parts(
+    training: Indices, options: settings.LocalizerSettings, rng: np.random.Generator
+) -> tuple[Indices, Indices, Indices]:
+    """Presses to learn from, those that end the training and those that find the radii: of one alone, both do."""
+    taught, checked = (
+        training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
+    )
+    if len(checked) < 2:
+        return taught, checked, checked
+    ending, proving = (checked[part] for part in split_presses(len(checked), options.split, 0.5, rng, least=1))
+    return taught, ending, proving
 
 
 def _samples(

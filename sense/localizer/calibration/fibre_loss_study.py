@@ -52,8 +52,8 @@ def fibre_loss_study(
         localizer: the one network; None for the second way alone. retrain: whether the second way is wanted.
         options: split, share and seed; the defaults if None.
         lost: fibres that are lost at once, at most; no more than leave one.
-        keep_in: folder for the networks that are done, from which a run that was broken off goes on; removed when all
-            are done.
+        keep_in: folder for the networks that are done, from which a run that was broken off goes on;
+            `Checkpoints.clear` removes them once the document is kept.
         progress: called with (networks done, networks in all).
 
     Returns:
@@ -144,8 +144,6 @@ def _retrained(
             if kept:
                 kept.save(_number(lost), {key: value for key, value in vars(result).items() if key != "measures"})
             progress(len(found), len(subsets))
-    if kept:
-        kept.clear()
     return found
 
 

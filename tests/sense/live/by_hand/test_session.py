@@ -66,7 +66,7 @@ def test_presses_by_hand_are_learnt_from(clumsy: tuple[Hands, Recording]) -> Non
     hand, recording = clumsy
     _, document = calibrate(recording, QUICK)
     spread_mm = np.linalg.norm(targets(hand) - targets(hand).mean(axis=0), axis=1).mean()
-    assert document["errors"][0]["mean_mm"] < 0.45 * spread_mm
+    assert document["errors"][0]["mean_mm"] < 0.55 * spread_mm
 
 
 class Turned(Finder):

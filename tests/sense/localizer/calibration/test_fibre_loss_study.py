@@ -1,7 +1,9 @@
 """Lost fibres: one test for both ways, and resumed work is the same work."""
 
+import errno
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,7 +94,6 @@ def test_broken_off_work_goes_on_and_gives_the_same(
     monkeypatch.setattr(loss_study, "_train_without", counted)
     assert fibre_loss_study(recording, retrain=True, lost=1, keep_in=kept) == whole
     assert len(trained) == 5 - finished
-    assert not kept.exists()
 
 
 def test_work_of_other_settings_is_not_gone_on_with(recording: Recording, tmp_path: Path) -> None:
@@ -111,9 +112,11 @@ def test_no_way_is_one_line(recording: Recording) -> None:
         fibre_loss_study(recording)
 
 
-def test_the_command_writes_a_document_and_a_figure(
+@pytest.fixture
+def run(
     localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+) -> Callable[..., tuple[object, str, str]]:
+    """Runs a command of `padforge sense` in a folder with a `model` and a recording `rec`."""
     localizer.save(tmp_path / "model")
     recording.save(tmp_path / "rec", {})
     monkeypatch.chdir(tmp_path)
@@ -124,12 +127,42 @@ def test_the_command_writes_a_document_and_a_figure(
             padforge.main()
         return caught.value.code or 0, *capsys.readouterr()
 
+    return run
+
+
+def test_the_command_writes_a_document_and_a_figure(run: Callable[..., tuple[object, str, str]]) -> None:
     command = ("fibre-loss", "rec", "--model", "model", "--retrain", "--lost", "1")
     code, out, _ = run(*command, "--out", "out", "--json")
     assert code == 0
     assert json.loads(out) == json.loads(Path("out", "fibre_loss.json").read_text())
     assert Path("out", "fibre_loss.png").read_bytes()[:4] == b"\x89PNG"
+    assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
     code, out, err = run("fibre-loss", "rec", "--out", "other")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "neither --model nor --retrain" in err
     assert not Path("other").exists()
+
+
+def test_networks_are_kept_until_the_result_is_written(
+    run: Callable[..., tuple[object, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ("fibre-loss", "rec", "--retrain", "--lost", "1", "--out", "out")
+    real, trained = loss_study._train_without, []
+
+    def counted(lost: tuple[int, ...], *rest: object) -> object:
+        trained.append(lost)
+        return real(lost, *rest)  # type: ignore[arg-type]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(loss_study, "_train_without", counted)
+    with monkeypatch.context() as broken:
+        broken.setattr("sense.report.fibre_loss_figure.draw_fibre_loss", full)
+        code, _, err = run(*command)
+    assert (code, len(trained)) == (2, 5), err
+    assert len(list(Path("out", "unfinished").glob("start_*.npz"))) == 5
+    assert not Path("out", "fibre_loss.json").exists()
+    code, _, err = run(*command)
+    assert (code, len(trained)) == (0, 5), err
+    assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
