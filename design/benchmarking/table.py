@@ -55,7 +55,7 @@ def write_bench(bench: Bench, measured: BenchRounds, out: Path) -> dict[str, Any
 def write_csv(rows: Sequence[Row], path: Path) -> None:
     """Write rows of the same columns."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]) if rows else [])
+    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, text.getvalue())

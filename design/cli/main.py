@@ -35,10 +35,12 @@ twin_option = click.option(
 
 @click.group(invoke_without_command=True)
 @spec_option
-@click.option("--method", type=click.Choice(["descent", "error", "genetic"]), help="As [search] method.")
+@click.option("--method", type=click.Choice(["descent", "genetic"]), help="As [search] method.")
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
-@click.option("--from", "origin", metavar="random|straight|FILE", default="random", help="What to start from.")
+@click.option(
+    "--from", "origin", metavar="random|straight|FILE", help="What to start from (default: random; a twin: straight)."
+)
 @twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Where presses are told apart.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="End with the best after S seconds.")
@@ -143,6 +145,9 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
 def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     """Print every term of the objective as JSON.
 
+    published_joint_entropy is that of all fibres over 49 presses, which limit it to log2 49 = 5.61 bits: straight
+    fibres and all published pads are there.
+
     \b
     padforge design score out/pad/morphology.json
     padforge design score out/pad/morphology.json --twin out/pad/twin.json
@@ -159,10 +164,9 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
         settings = settings_for_twin(settings, twin, pad)
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
     size = settings.section(PadSettings, **pad.layout.settings)
-    asked = settings.section(Contact), search.lost, search.noise
-    terms = score_terms(pad, *asked, rules, size)
-    if search.method == "error":
-        terms |= error_terms(expected_errors(pad, *asked, size))
+    asked = settings.section(Contact), search.lost
+    terms = error_terms(expected_errors(pad, *asked, search.noise, size))
+    terms |= score_terms(pad, *asked, rules=rules, size=size)
     found = [asdict(violation) for violation in check_rules(pad, rules, size)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)
 

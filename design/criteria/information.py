@@ -9,9 +9,7 @@ from design.pad.kernels.published import information as kernels
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import Contact, between_fibres
-
-LEVELS = 4096
-"""Levels of the published 12-bit converter."""
+from design.settings.search import LEVELS
 
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:

@@ -7,17 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from design.common.computing import in_chunks
-from design.common.errors import InputError, instance, reals
+from design.common.errors import InputError, instance, reals, whole
 from design.common.settings import or_default
 from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
 from design.pad.kernels.published.information import published_terms as terms_kernel
 from design.pad.morphology import Morphology
 from design.settings import PUBLISHED_CONTACT, Contact, Counts, Layout, between_fibres
-
-from .information import LEVELS
-
-WEIGHTS = (1.0, 1e-7, 5e-6)
-"""Published alpha, beta and gamma."""
+from design.settings.search import LEVELS, MOST_LEVELS, SIDE, WEIGHTS
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,7 @@ class PublishedTerms:
 
 
 @lru_cache(maxsize=16)
-def published_presses(fibres: Counts | Layout, side: int = 7) -> NDArray[np.float64]:
+def published_presses(fibres: Counts | Layout, side: int = SIDE) -> NDArray[np.float64]:
     """The (side^2, 2) presses the published search samples: a serpentine over 1..M, jittered by U(0, 2/49)."""
     places = boustrophedon(between_fibres(Layout.of(fibres)), side, jitter=2 / 49)
     places.setflags(write=False)
@@ -52,6 +48,7 @@ def published_terms(
     samples: int = 2000,
     weights: tuple[float, float, float] = WEIGHTS,
     layout: Layout | None = None,
+    levels: int = LEVELS,
 ) -> list[PublishedTerms]:
     """Terms of formula (5), as the published code computes them, for every pad of a population.
 
@@ -61,10 +58,11 @@ def published_terms(
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
         layout: of a population's fibres; as many horizontals as verticals, a unit apart, if None.
+        levels: what signals are rounded up to whole ones of, 1 to 2^24.
     """
     alpha, beta, gamma = _weights(weights)
     travel, cross, ends, _ = fibre_axes(pads, layout)
-    samples = as_samples(samples, travel.shape[1])
+    samples, levels = as_samples(samples, travel.shape[1]), whole("levels", levels, 1, MOST_LEVELS)
     if presses is None:
         layout = pads.layout if isinstance(pads, Morphology) else layout
         places = published_presses(layout or ends.horizontals)
@@ -74,7 +72,7 @@ def published_terms(
     found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:
-        terms_kernel(travel, cross, ends.horizontals, places, shape, samples, LEVELS, begin, end, found)
+        terms_kernel(travel, cross, ends.horizontals, places, shape, samples, levels, begin, end, found)
 
     in_chunks(work, len(travel), grain=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]

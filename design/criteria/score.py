@@ -5,12 +5,11 @@ from dataclasses import asdict
 
 from design.common.errors import InputError, instance
 from design.common.settings import or_default
-from design.pad.contact import boustrophedon, lattice, signals
+from design.pad.contact import boustrophedon, lattice, signals, signals_quantized
 from design.pad.courses.keep_out import outside
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
 from design.settings import (
-    NOISE,
     PUBLISHED_CONTACT,
     Contact,
     PadSettings,
@@ -19,10 +18,12 @@ from design.settings import (
 )
 
 from .fibre_loss import loss_masks, loss_shares
-from .information import idle_share, information
-from .published_objective import published_terms
+from .information import idle_share, information, joint_entropy, quantize
+from .published_objective import published_presses, published_terms
 
 SIDE, MOST_LOSSES = 20, 64
+AMBIGUITY_NOISE = 0.05
+"""Of a signal, share of full scale, under which pads are compared: under less, no good pad confuses anything."""
 MOST_PAIRS = 2**29
 """Most pairs of points of one fibre, over all fibres, that are looked at for folds: 2 GiB of distances."""
 
@@ -76,7 +77,7 @@ def score(
     pad: Morphology,
     contact: Contact | None = None,
     lost: int | tuple[float, ...] = 3,
-    noise: float = NOISE,
+    noise: float = AMBIGUITY_NOISE,
     rules: RulesSettings | None = None,
     size: PadSettings | None = None,
 ) -> dict[str, float]:
@@ -86,7 +87,8 @@ def score(
     (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
     far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
-    (`published_objective`), of the published contact where `contact` is a measured one.
+    (`published_objective`), of the published contact where `contact` is a measured one, and `published_joint_entropy`,
+    that of all fibres together in bits, which its 49 presses limit to log2 49 = 5.61: even straight fibres reach that.
 
     Presses are where `size` says, whose layout is the pad's whatever it says of that; those of the information and of
     the published terms between the outermost fibres, as published.
@@ -124,4 +126,6 @@ def all_terms(
     terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
     shape = PUBLISHED_CONTACT if contact.reach else contact
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
-    return terms | {f"published_{name}": value for name, value in asdict(published_terms(pad, shape)[0]).items()}
+    terms |= {f"published_{name}": value for name, value in asdict(published_terms(pad, shape)[0]).items()}
+    levels = quantize(signals_quantized(pad, published_presses(pad.layout), shape))
+    return terms | {"published_joint_entropy": joint_entropy(levels)}

@@ -1,19 +1,24 @@
-"""Expected localisation error: how far off a regression is that learns places from noisy signals.
+"""Expected localisation error: how far off a regression is that learns places from signals, and what noise adds to it.
 
-For signals s of the fibres K that still work, with noise of standard deviation sigma on each, two terms are added:
+For presses a with signals s_a, in full scales, noise of standard deviation sigma on each and the set K of fibres that
+still work, two terms are added:
 
-    G_K = mean_b |p_b - f_K(s_b + noise)|,                  f_K learnt from the noisy signals of other presses a,
-    C_K = mean_a sqrt(trace F_a^-1),   F_a = J_a' J_a / sigma^2 + 12 / size^2,   J_a = ds / dp there.
+    E_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|s_a - s_b|^2_K / 2 w^2),
+    B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' J_a / sigma^2 + 12 / size^2,    J_a = ds / dp there.
 
-f_K is kernel ridge regression with a Gaussian kernel one full scale wide (C. E. Rasmussen, C. K. I. Williams, Gaussian
-Processes for Machine Learning, 2006, chapter 2), so G_K is what a localizer of few presses comes to, confusions of far
-places included. C_K is the Cramer-Rao bound (van Trees 1968, section 2.4) with what is known beforehand, that the place
-is one of the pad: what no localizer falls below, however many presses it has learnt from. Where noise is small the
-ambiguity counts only confusions, of which there are none left; these two still fall with it.
+E_K is how far off kernel ridge regression finds each press when it has learnt from all the others, which is known
+without learning anew (C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, 2006, chapter 2 and
+section 5.4.2; w is the width of the kernel, r the ridge, c_aa C's diagonal, p the places from their middle). So it
+counts confusions by how far off they lead, as the ambiguity does, but without a noise level; and besides, what a
+localizer has to learn between presses: signals that fold the pad too often are far apart for neighbours. It goes with
+the error of a trained network. B_K is the Cramer-Rao bound (van Trees 1968, section 2.4) with what is known beforehand,
+that the place is one of the pad: what no localizer falls below, however many presses it has learnt from. It grows with
+the noise, and where noise is small, E_K is all there is.
 """
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,14 +33,12 @@ from design.settings import Contact, PadSettings, Rectangle
 
 SIDE, WINDOW = 14, 5.0
 """Presses along a side of a lattice, and the longest side, grid units: presses further apart are seldom confused."""
-PAIRS, MOST_LOSSES = 8, 32
-"""Pairs of lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
-HARDER = 3.0
-"""About how many times as great the error is with one more fibre lost: by its inverse each counts as much."""
-WIDTH, RIDGE = 1.0, 1e-3
-"""Width of the regression's kernel, full scales of a signal, and its ridge."""
-LEAST = 1e-8
-"""Squared distance, so that its root has a gradient at 0."""
+LATTICES, MOST_LOSSES = 8, 32
+"""Lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
+WIDTH, RIDGE = 0.5, 1e-2
+"""Width of the kernel, full scales of a signal, and the ridge: such errors go best with those of trained networks."""
+LEAST = 1e-12
+"""Squared length, so that its root has a gradient at 0."""
 
 
 def expected_errors(
@@ -50,27 +53,20 @@ def expected_errors(
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(loss_shares(lost)), fibres))
     masks = [torch.tensor(loss_masks(fibres, k, MOST_LOSSES)) for k in levels]
-    errors = np.zeros((PAIRS, len(masks)))
-    for pair in errors:
-        places, step = two_lattices(size.sensed, rng)
+    errors = np.zeros((LATTICES, len(masks)))
+    for lattice in errors:
+        places, step = shifted_lattice(size.sensed, rng)
         found = torch.tensor(exact_signals(pad, places, contact).T)
-        white = torch.tensor(rng.standard_normal(found.shape))
-        given = found / full_scale(found), torch.tensor(places), torch.tensor(step)
+        touched = found.any(dim=1)  # on a large pad most fibres are touched by none of the presses
+        given = found[touched] / full_scale(found), torch.tensor(places), torch.tensor(step)
         for k, kept in enumerate(masks):
-            equal = torch.full((len(kept),), 1 / len(kept), dtype=torch.float64)
-            pair[k] = expected_error(*given, kept, equal, white, noise).item()
+            lattice[k] = expected_error(*given, kept[:, touched], noise).mean().item()
     return errors.mean(axis=0).tolist()
 
 
 def error_terms(errors: Sequence[float]) -> dict[str, float]:
     """`expected_errors` by name."""
     return {f"expected_error_lost_{lost}": value for lost, value in enumerate(errors)}
-
-
-def balanced(shares: tuple[float, ...]) -> tuple[float, ...]:
-    """Shares (sum 1) of 0, 1, ... lost fibres in which a gain of some percent counts alike, from the P(k) `shares`."""
-    weights = [share * HARDER**-k for k, share in enumerate(shares)]
-    return tuple(weight / sum(weights) for weight in weights)
 
 
 def cells(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -86,63 +82,92 @@ def cells(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array,
     return corner, size, np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def two_lattices(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Presses (2 SIDE^2, 2) on two lattices, each shifted by up to a cell, and their step (2,), grid units.
+def shifted_lattice(rectangle: Rectangle, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Presses (SIDE^2, 2) on a lattice that is shifted by up to a cell, and its step (2,), grid units.
 
-    They lie over a part of what is pressed, all of it unless it is large.
+    It lies over a part of what is pressed, all of it unless it is large.
     """
     corner, size, cell = cells(rectangle, rng)
-    return corner + size * np.concatenate([cell + rng.random(2) for _ in range(2)]) / SIDE, size / SIDE
+    return corner + size * (cell + rng.random(2)) / SIDE, size / SIDE
 
 
-def expected_error(
-    signals: Tensor, places: Tensor, step: Tensor, kept: Tensor, weight: Tensor, noise: Tensor, sigma: float
-) -> Tensor:
-    """Mean of G + C of the module's formula over losses, a scalar in grid units with gradient by the signals.
+def expected_error(signals: Tensor, places: Tensor, step: Tensor, kept: Tensor, sigma: float) -> Tensor:
+    """(L,) E + B of the module's formula for each of some losses, grid units, with gradient by the signals.
 
     Args:
-        signals: (F, 2Q) in full scales, for the presses of two lattices of Q = side^2 one after the other.
-        places: (2Q, 2), grid units. step: (2,) between neighbours of a lattice, grid units.
-        kept: (L, F), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
-        noise: (F, 2Q) standard normal. sigma: of the noise, in full scales, > 0.
+        signals: (F, Q) in full scales, for the presses of a lattice of Q = side^2; single precision is enough.
+        places: (Q, 2), grid units. step: (2,) between neighbours of the lattice, grid units.
+        kept: (L, F), 1 for a fibre that works, 0 for a lost one.
+        sigma: of the noise, in full scales, > 0.
     """
-    found, where = signals.T.double(), places.double()
-    count = len(found) // 2
-    rates = torch.cat([_rates(part, step.double()) for part in found.split(count)]) / sigma
-    size = step.double() * math.isqrt(count)
-    noisy = kept.double()[:, None, :] * (found + sigma * noise.T.double())
-    errors = _regression(noisy, where - where.mean(dim=0), count) + _bound(rates, kept.double(), size)
-    return errors.to(signals.dtype) @ weight
+    there, apart, masks = (given.to(signals.dtype) for given in (places, step, kept))
+    bound = _bound(_rates(signals.T, apart) / sigma, masks, apart * math.isqrt(len(there)))
+    learnt = _LeaveOneOut.apply(signals / WIDTH, there - there.mean(dim=0), masks)
+    return learnt + bound
+
+
+def over_losses(errors: Tensor, kept: Tensor, shares: tuple[float, ...]) -> Tensor:
+    """Geometric mean of errors over numbers of lost fibres: a gain of a tenth counts alike, however many are lost.
+
+    Args:
+        errors: (L,). kept: (L, F) the losses they are of.
+        shares: P(k) of k = 0, 1, ... lost; what is not in `kept` is left out.
+    """
+    lost = (kept == 0).sum(dim=1)
+    levels = [k for k in range(len(shares)) if (lost == k).any()]
+    logs = torch.stack([errors[lost == k].mean().log() for k in levels])
+    weights = torch.tensor([shares[k] for k in levels], dtype=logs.dtype, device=logs.device)
+    return (logs @ weights / weights.sum()).exp()
 
 
 def _rates(signals: Tensor, step: Tensor) -> Tensor:
     """(P, F, 2) by how much signals (Q, F) on a lattice change by x and y, by differences over each of its cells."""
-    side = math.isqrt(len(signals))
+    fibres, side = signals.shape[1], math.isqrt(len(signals))
     a, b, c, d = (
-        signals.view(side, side, -1)[rows, columns]
+        signals.reshape(side, side, fibres)[rows, columns]
         for rows in (slice(None, -1), slice(1, None))
         for columns in (slice(None, -1), slice(1, None))
     )
     by_x, by_y = (b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])
-    return torch.stack([by_x, by_y], dim=-1).reshape(-1, signals.shape[1], 2)
+    return torch.stack([by_x, by_y], dim=-1).reshape((side - 1) ** 2, fibres, 2)
 
 
 def _bound(rates: Tensor, kept: Tensor, size: Tensor) -> Tensor:
-    """(L,) C for rates (P, F, 2) in units of the noise."""
-    known = torch.einsum("lk,qki,qkj->lqij", kept, rates, rates) + torch.diag(12 / size**2)
-    trace = known[..., 0, 0] + known[..., 1, 1]
-    return (trace / (known[..., 0, 0] * known[..., 1, 1] - known[..., 0, 1] ** 2)).sqrt().mean(dim=1)
+    """(L,) B for rates (P, F, 2) in units of the noise."""
+    told = torch.einsum("lk,qki,qkj->lqij", kept, rates, rates)
+    xx, yy, (prior_x, prior_y) = told[..., 0, 0], told[..., 1, 1], 12 / size**2
+    # at a faint noise the first difference cancels where one direction alone is told, and the prior must not with it
+    volume = (xx * yy - told[..., 0, 1] ** 2).clamp(min=0) + prior_x * yy + prior_y * xx + prior_x * prior_y
+    return ((xx + yy + prior_x + prior_y) / volume).sqrt().mean(dim=1)
 
 
-def _regression(noisy: Tensor, places: Tensor, count: int) -> Tensor:
-    """(L,) G for noisy signals (L, 2Q, F): the first `count` presses are learnt, the others asked for."""
-    learnt, asked = noisy[:, :count], noisy[:, count:]
-    known = torch.exp(_squares(learnt, learnt) / (-2 * WIDTH**2)) + RIDGE * torch.eye(count, dtype=noisy.dtype)
-    weights = torch.cholesky_solve(places[:count].expand(len(noisy), -1, -1), torch.linalg.cholesky(known))
-    found = torch.exp(_squares(asked, learnt) / (-2 * WIDTH**2)) @ weights
-    return ((found - places[count:]).square().sum(dim=-1) + LEAST).sqrt().mean(dim=1)
+class _LeaveOneOut(torch.autograd.Function):
+    """E with its gradient in closed form, since both come from the same inverse."""
 
+    @staticmethod
+    def forward(ctx: Any, signals: Tensor, presses: Tensor, kept: Tensor) -> Tensor:
+        """(L,) E for signals (F, Q) in widths of the kernel."""
+        (fibres, count), losses = signals.shape, len(kept)
+        # differences, unlike products, do not cancel: single precision serves
+        apart = signals[:, :, None] - signals[:, None, :]
+        kernel = torch.exp(torch.mm(kept / -2, apart.square().view(fibres, count**2)).view(losses, count, count))
+        ridged = kernel.clone()
+        ridged.diagonal(dim1=1, dim2=2).add_(RIDGE)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(ridged))
+        alpha = inverse @ presses
+        length = (alpha.square().sum(dim=-1) + LEAST).sqrt()
+        ctx.save_for_backward(apart, kernel, inverse, alpha, length, kept)
+        return (length / inverse.diagonal(dim1=1, dim2=2)).mean(dim=1)
 
-def _squares(a: Tensor, b: Tensor) -> Tensor:
-    """(L, A, B) squared distances of rows (L, A, n) to rows (L, B, n)."""
-    return a.square().sum(dim=-1)[:, :, None] + b.square().sum(dim=-1)[:, None, :] - 2 * a @ b.mT
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient by the signals."""
+        apart, kernel, inverse, alpha, length, kept = ctx.saved_tensors
+        diagonal = inverse.diagonal(dim1=1, dim2=2)
+        share = upstream[0][:, None] / diagonal.shape[1]
+        by_alpha, by_diagonal = alpha * (share / (length * diagonal))[..., None], -share * length / diagonal**2
+        # dC = -C dk C, whence how E changes with every entry of k, but for the sign
+        by_kernel = torch.bmm(inverse * by_diagonal[:, None, :], inverse)
+        by_kernel += torch.bmm(inverse @ by_alpha, alpha.mT)
+        pull = torch.mm(kept.T, (by_kernel * kernel).flatten(1)).view(apart.shape) * apart
+        return pull.sum(dim=2) - pull.sum(dim=1), None, None

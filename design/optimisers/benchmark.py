@@ -33,14 +33,14 @@ class InThisThread(Executor):
 def trials() -> Iterator[BenchTrial]:
     """Every way at every budget, for N of KNOTS and each of SEEDS.
 
-    The genetic search minimises the published objective; the gradient search runs without design rules, as the genetic
-    one does, and with them. Both are for the published contact, between the fibres.
+    The genetic search minimises the published objective. The gradient search minimises the expected error, without
+    design rules, as the genetic one does, and with them. Both are for the published contact, between the fibres.
     """
     free = RulesSettings(enforce=False)
     ways = [("genetic", n, {"method": "genetic", "generations": n}, free) for n in GENERATIONS]
     for steps in STEPS:
-        descent = {"method": "descent", "starts": 1, "steps": steps}
-        ways += [("descent", steps, descent, free), ("with rules", steps, descent, RulesSettings())]
+        one = {"starts": 1, "steps": steps}
+        ways += [("descent", steps, one, free), ("with rules", steps, one, RulesSettings())]
     for knots in KNOTS:
         for way, size, settings, rules in ways:
             for seed in SEEDS:

@@ -13,7 +13,7 @@ from pymoo.core.termination import NoTermination
 from pymoo.operators.sampling.rnd import FloatRandomSampling
 
 from design.common.checkpoints import State
-from design.criteria.published_objective import published_terms
+from design.criteria.published_objective import published_presses, published_terms
 from design.pad.courses.curves import refine
 from design.pad.knots import MARGIN, Array, assemble
 from design.pad.morphology import Morphology
@@ -112,7 +112,8 @@ class _PublishedProblem(PymooProblem):
         least, most = (
             np.broadcast_to(each, self.shape).ravel() for each in (MARGIN, np.array(self.layout.extent) - MARGIN)
         )
-        self.contact = problem.contacts[0]
+        self.contact, self.search = problem.contacts[0], problem.search
+        self.presses = published_presses(self.layout, problem.search.presses)
         self.limits = least, most
         super().__init__(n_var=len(least), n_obj=1, xl=least, xu=most)
 
@@ -121,9 +122,15 @@ class _PublishedProblem(PymooProblem):
         return assemble(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
-        out["F"] = np.array(
-            [[terms.objective] for terms in published_terms(self.fibres(x), self.contact, layout=self.layout)]
+        terms = published_terms(
+            self.fibres(x),
+            self.contact,
+            self.presses,
+            weights=self.search.weights,
+            layout=self.layout,
+            levels=self.search.levels,
         )
+        out["F"] = np.array([[each.objective] for each in terms])
 
 
 class _FirstGeneration(FloatRandomSampling):

@@ -1,4 +1,4 @@
-"""Gradient search on the ambiguity, or on the expected error, under noise and fibre loss, within the rules.
+"""Gradient search on the expected error under noise and fibre loss, within the rules.
 
 One start is a `GradientSearch`: it advances by any number of steps, tells its state as plain arrays and goes on from
 them to the same bits, so that it can run in slices on any thread or machine and survive being killed.
@@ -16,17 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from design.common.checkpoints import State
-from design.criteria.ambiguity import ambiguity, full_scale, sharpness
+from design.criteria.ambiguity import full_scale, sharpness
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
-from design.evaluation.expected_error import SIDE, balanced, cells, expected_error, two_lattices
+from design.evaluation.expected_error import SIDE, expected_error, over_losses, shifted_lattice
 from design.pad.contact import boustrophedon, signals
-from design.pad.courses.keep_out import outside
 from design.pad.morphology import Morphology
-from design.settings import Rectangle
 
-from .parametrization import Fibres, border_of, first_course, nearly_straight
+from .parametrization import Fibres, border_of, first_course
 from .problem import SearchProblem
 
 SCALE_SIDE = 24  # presses per row and column by which full scale is known
@@ -62,12 +60,7 @@ class GradientSearch:
         self._history: list[tuple[int, float]] = []
         pad, search, rules = problem.pad, problem.search, problem.rules
         if state is None:
-            nearly = search.method == "error" and problem.origin is None
-            course = (
-                nearly_straight(pad, rules, search.knots, self.rng)
-                if nearly
-                else first_course(pad, rules, search.knots, problem.origin, start, self.rng)
-            )
+            course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
             self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
             # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
             presses = boustrophedon(pad.sensed, SCALE_SIDE)
@@ -130,7 +123,7 @@ class GradientSearch:
         self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
 
     def _step(self) -> None:
-        """One step on the ambiguity and the rules."""
+        """One step on the expected error and the rules."""
         search, rules = self.problem.search, self.problem.rules
         progress = self.step / max(1, search.steps - 1)
         rate = RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
@@ -183,7 +176,7 @@ class GradientSearch:
         """What is minimised, and sharpness where it is asked for, averaged over the contacts."""
         search, pad = self.problem.search, self.problem.pad
         slope = pchip_slopes(travel, cross)
-        measure = self._expected_error() if search.method == "error" else self._ambiguity()
+        measure = self._expected_error()
         total = torch.zeros((), device=search.device)
         for contact in self.problem.contacts:
             total = total + measure(
@@ -195,49 +188,28 @@ class GradientSearch:
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
 
-    def _ambiguity(self) -> Measure:
-        """The ambiguity on presses and losses drawn once for all contacts of a step."""
-        search, pad = self.problem.search, self.problem.pad
-        places = stratified(pad.sensed, self.rng)
-        free = places[outside(places, pad)]
-        places = free if len(free) else places  # a keep-out may take up the whole part that is looked at
-        kept, weight = draw_losses(pad.layout.fibres, loss_shares(search.lost), self.rng)
-        there, losses, shares = (
-            torch.tensor(x, dtype=torch.float32, device=search.device) for x in (places, kept, weight)
-        )
-
-        def measure(signals_at: SignalsAt, noise: float) -> Tensor:
-            return ambiguity(signals_at(places).float().to(search.device), there, losses, shares, noise * self.scale)
-
-        return measure
-
     def _expected_error(self) -> Measure:
-        """The expected error on presses, losses and noise drawn once for all contacts of a step.
+        """The expected error on presses and losses drawn once for all contacts of a step.
 
-        Noise is a share of full scale, which passes from that of the first pad to that of the pad itself: with its own
-        from the beginning fibres hardly leave their straight course, and with the first to the end mere length counts.
+        Signals and noise are shares of full scale, which passes from that of the first pad to that of the pad itself:
+        with its own from the beginning fibres hardly leave their course, and with the first to the end length counts.
         """
         search, pad = self.problem.search, self.problem.pad
         own = self.step / search.steps
-        places, step = two_lattices(pad.sensed, self.rng)
-        kept, weight = draw_losses(pad.layout.fibres, balanced(loss_shares(search.lost)), self.rng)
-        white = self.rng.standard_normal((pad.layout.fibres, len(places)))
-        there, apart, losses, shares, heard = (
-            torch.tensor(x, device=search.device) for x in (places, step, kept, weight, white)
+        places, step = shifted_lattice(pad.sensed, self.rng)
+        shares = loss_shares(search.lost)
+        kept, _ = draw_losses(pad.layout.fibres, shares, self.rng)
+        there, apart, losses = (
+            torch.tensor(x, dtype=torch.float32, device=search.device) for x in (places, step, kept)
         )
 
         def measure(signals_at: SignalsAt, noise: float) -> Tensor:
-            found = signals_at(places).to(search.device)
-            scale = self.scale ** (1 - own) * found.amax(dim=1).mean() ** own
-            return expected_error(found / scale, there, apart, losses, shares, heard, noise)
+            found = signals_at(places).float().to(search.device)
+            largest = found.amax(dim=1).mean()
+            scale = self.scale ** (1 - own) * largest**own if largest > 0 else self.scale
+            return over_losses(expected_error(found / scale, there, apart, losses, noise), losses, shares)
 
         return measure
 
     def _broken(self) -> bool:
         return bool(self.problem.broken(self.morphology()))
-
-
-def stratified(rectangle: Rectangle, rng: np.random.Generator) -> NDArray[np.float64]:
-    """One press in each of SIDE x SIDE cells over a part of what is pressed, (SIDE^2, 2): all of it unless large."""
-    corner, size, cell = cells(rectangle, rng)
-    return corner + size * (cell + rng.random(cell.shape)) / SIDE

@@ -95,16 +95,6 @@ def first_course(
     return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
 
 
-def nearly_straight(pad: PadSettings, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
-    """Knots (F, N+2, 2) of straight fibres, moved crosswise by a tenth of a grid unit or so."""
-    layout, course = pad.layout, straight_course(pad, rules, knots)
-    crosswise = 0.1 * rng.standard_normal(course[:, 1:-1, 0].shape)
-    inner = course[:, 1:-1].copy()
-    for axis, rows in enumerate(layout.families):
-        inner[rows, :, 1 - axis] += crosswise[rows]
-    return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
-
-
 def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
     """A random zigzag each family runs side by side: nothing crosses within a family, and every turn is round.
 

@@ -24,8 +24,8 @@ from design.common.errors import path as as_path
 from design.common.settings import or_default
 from design.criteria.fibre_loss import loss_shares
 from design.criteria.rules import Violation
-from design.criteria.score import all_terms, ambiguities, ambiguity_terms
-from design.evaluation.expected_error import balanced, error_terms, expected_errors
+from design.criteria.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms
+from design.evaluation.expected_error import error_terms, expected_errors
 from design.pad.courses.passing import straight_course
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -76,12 +76,11 @@ class SearchResult:
     """What a search found.
 
     Attributes:
-        morphology: the best pad: fewest broken rules first, then least mean ambiguity over the losses. Straight fibres
+        morphology: the best pad: fewest broken rules first, then least expected error over the losses. Straight fibres
             count as found, but by the published method.
-        terms: every term of `score` for it.
+        terms: every term of `score` for it, and its expected errors.
         violations: the rules it breaks; empty where rules are not enforced.
-        straight: the ambiguities of straight fibres on the same pad, to set beside its own, and where it was found by
-            them the expected errors; both by name, as in `terms`.
+        straight: expected errors and ambiguities of straight fibres on the same pad, by name, to set beside its own.
         history: one entry per noted step: {"run", "step", "objective"}.
         enforced: whether it was to keep to the rules.
         seconds: wall time.
@@ -140,11 +139,10 @@ def search(
         if problem.search.method != "genetic":  # the published method is left as it was published
             known.append(straight)
         best = min([*(_Judged(pad, problem) for pad in found), *known], key=lambda judged: judged.rank)
-        located = best.terms()
-        spread = [value for name, value in located.items() if name.startswith("ambiguity")]
-        terms = located | all_terms(best.pad, spread, problem.contacts[0], problem.rules, problem.pad)
+        terms = best.errors() | all_terms(best.pad, best.ambiguities(), problem.contacts[0], problem.rules, problem.pad)
+        beside = straight.errors() | ambiguity_terms(straight.ambiguities())
     told = problem.rules.enforce, _history(problem, states), time.perf_counter() - begin, stop.reason
-    return SearchResult(best.pad, terms, best.broken, straight.terms(), *told)
+    return SearchResult(best.pad, terms, best.broken, beside, *told)
 
 
 def _advance(
@@ -181,34 +179,29 @@ def _candidates(problem: SearchProblem, states: dict[int, State], stop: Stop) ->
 
 
 class _Judged:
-    """A pad, the rules it breaks, and what the search minimises of it (contacts, losses)."""
+    """A pad, the rules it breaks, and its expected errors (contacts, losses)."""
 
     def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
         self._problem, self.pad = problem, pad
         self.broken: list[Violation] = problem.broken(pad)
-        measure = expected_errors if problem.search.method == "error" else ambiguities
         asked = problem.search.lost, problem.search.noise, problem.pad
-        self.spread = [measure(pad, contact, *asked) for contact in problem.contacts]
+        self._errors = [expected_errors(pad, contact, *asked) for contact in problem.contacts]
 
     @property
     def rank(self) -> tuple[int, float]:
-        """Least for the best pad: fewest broken rules, then least mean of what is minimised."""
-        if self._problem.search.method != "error":
-            return len(self.broken), float(np.mean(self.spread))
-        shares = balanced(loss_shares(self._problem.search.lost))[: len(self.spread[0])]
-        return len(self.broken), float(np.mean(np.array(self.spread) @ shares))
+        """Least for the best pad: fewest broken rules first, then the least of what is minimised."""
+        errors = np.mean(self._errors, axis=0)
+        shares = loss_shares(self._problem.search.lost)[: len(errors)]
+        return len(self.broken), float(np.exp(np.log(errors) @ shares / sum(shares)))
 
-    def _ambiguities(self) -> list[float]:
+    def ambiguities(self) -> list[float]:
         """With 0, 1, ... lost, under the first contact."""
-        if self._problem.search.method != "error":
-            return self.spread[0]
-        search, contact = self._problem.search, self._problem.contacts[0]
-        return ambiguities(self.pad, contact, search.lost, search.noise, self._problem.pad)
+        problem = self._problem
+        return ambiguities(self.pad, problem.contacts[0], problem.search.lost, AMBIGUITY_NOISE, problem.pad)
 
-    def terms(self) -> dict[str, float]:
-        """Ambiguities, and expected errors where they are minimised, by name."""
-        expected = error_terms(self.spread[0]) if self._problem.search.method == "error" else {}
-        return ambiguity_terms(self._ambiguities()) | expected
+    def errors(self) -> dict[str, float]:
+        """With 0, 1, ... lost, under the first contact, by name."""
+        return error_terms(self._errors[0])
 
 
 def _straight(problem: SearchProblem, stop: Stop) -> Morphology:

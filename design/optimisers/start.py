@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .genetic_search import GeneticSearch
     from .gradient_search import GradientSearch
 
-SLICE = {"descent": 25, "error": 15, "genetic": 2}  # steps or generations between two looks: about a third of a second
+SLICE = {"descent": 20, "genetic": 2}  # steps or generations between two looks: about a third of a second
 SLICE_S = 1.0  # where steps are slow a slice ends after this, so that a time budget holds
 
 

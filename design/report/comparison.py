@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MOST_VARIANTS = 64
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
+"""Names that are no files on Windows."""
 DESIGNED = (PadSettings, Contact, SearchSettings, RulesSettings)
 """What a design depends on, and so what is varied."""
 Making = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
@@ -46,8 +48,9 @@ class Variant:
 
     @property
     def folder(self) -> str:
-        """Name of the folder that it goes to."""
-        return re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
+        """Name of the folder that it goes to, which every system takes."""
+        name = re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
+        return f"pad-{name}" if _DEVICE.match(name) else name
 
 
 def variants(sources: Sequence[Path], vary: Sequence[str], load: Callable[[Path | None], Spec]) -> list[Variant]:
@@ -74,7 +77,7 @@ def variants(sources: Sequence[Path], vary: Sequence[str], load: Callable[[Path 
                 tables.setdefault(section, {})[key] = value
             said = [f"{key} {str(value).strip('()').replace(', ', ' x ')}" for _, key, value in chosen]
             found.append(Variant(", ".join([name, *said] if name else said) or "defaults", spec.replaced(tables)))
-    folders = [variant.folder for variant in found]
+    folders = [variant.folder.casefold() for variant in found]  # as macOS and Windows tell them apart
     if len(set(folders)) < len(folders):
         raise InputError(f"{max(folders, key=folders.count)}: one of this name is there already, expected each once")
     if not 2 <= len(found) <= MOST_VARIANTS:

@@ -1,5 +1,6 @@
 """A search as it is asked for: settings in; morphology.json, design.json and the plan out."""
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,9 +9,9 @@ from design.common.checkpoints import Checkpoints
 from design.common.command_line import progress
 from design.common.errors import InputError
 from design.common.figures import save_figure
-from design.common.files import provenance, sha256, staged, write_json
+from design.common.files import as_written, provenance, read_json, sha256, staged, write_json
 from design.common.profiling import stage
-from design.criteria.rules import check_rules
+from design.criteria.rules import Violation, check_rules
 from design.optimisers.search import SearchResult, SearchRun, search
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -30,22 +31,25 @@ def run_search(
     spec: "Spec",
     out: Path,
     overrides: dict[str, Any],
-    origin: str = "random",
+    origin: str | None = None,
     run: SearchRun | None = None,
     twin: Path | None = None,
+    written: Callable[[SearchResult], None] = lambda result: None,
 ) -> tuple[dict[str, Any], SearchResult]:
     """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result.
 
     Args:
         overrides: of the settings of the search, by name; those that are not None count.
         origin: "random", "straight" or the file of a morphology to start from, which also says how many knots a fibre
-            has unless `overrides` does.
+            has unless `overrides` does; None for straight fibres with a twin, since under a wide reach the best pads
+            are gentle, and else for random ones.
         run: how long it may take and on what it runs; its states are kept in `out`, and a bar tells its progress.
         twin: a `twin.json`, for whose reach, noise and sensed rectangle to search.
+        written: called when the results are on the disk, before the states of a search that came to its end go.
     """
     spec, inputs = (spec, []) if twin is None else (settings_for_twin(spec, twin), [twin])
     pad, rules = spec.section(PadSettings), spec.section(RulesSettings)
-    begin = None
+    begin, origin = None, origin or ("straight" if twin else "random")
     if origin == "straight":
         begin = Morphology.straight(pad.layout)
     elif origin != "random":
@@ -76,9 +80,35 @@ def run_search(
         save_figure(figure, together / "design.svg")
         save_figure(figure, together / "design.png")
         write_json(together / "design.json", document)
+    written(result)
     if not result.stopped:
         Checkpoints(out / "search", {}).clear()
     return document, result
+
+
+def found_before(out: Path) -> SearchResult | None:
+    """What a search into `out` has found, or None where the morphology there is another one.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    path = out / "design.json"
+    if not (path.exists() and (out / "morphology.json").exists()):
+        return None
+    document = read_json(path, "padforge-design/1")
+    with as_written(path):
+        if document["morphology_sha256"] != sha256(out / "morphology.json"):
+            return None
+        return SearchResult(
+            Morphology.load(out / "morphology.json"),
+            document["terms"],
+            [Violation(**each) for each in document["violations"]],
+            document["straight"],
+            bool(document["provenance"]["settings"]["rules"]["enforce"]),
+            document["history"],
+            float(document["seconds"]),
+            document["stopped"],
+        )
 
 
 def write_plan(spec: "Spec", pad: Morphology, path: Path) -> None:

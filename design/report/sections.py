@@ -6,16 +6,19 @@ from typing import Any
 
 from design.common.files import as_written, read_json, unchanged
 from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
+from design.criteria.score import AMBIGUITY_NOISE
 from design.settings import PadSettings, RulesSettings, sensed_rectangle
 
 _TERMS = {
     "information": "mutual information of places and signals, bits",
     "idle_share": "share of presses in which a fibre is idle",
     "sharpness": "mean second difference of the signals along a serpentine",
-    "published_entropy": "joint entropy of the signals, as published",
+    "published_entropy": "joint entropy of each family's signals, added up, bits, as published",
     "published_sharpness": "sharpness, as published",
     "published_disorder": "disorder, as published",
     "published_objective": "objective, as published",
+    "published_joint_entropy": "joint entropy of all fibres' signals, bits; 49 presses limit it to log2 49 = 5.61,"
+    " which straight fibres and all published pads reach",
 }
 
 
@@ -32,6 +35,8 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     layout = PadSettings(**pad).layout
     unit_mm, (low, high) = layout.unit_mm, sensed_rectangle(layout)
     spread = {int(name[-1]): float(value) for name, value in terms.items() if name.startswith("ambiguity")}
+    headline = "expected_error" if "expected_error_lost_0" in terms else "ambiguity"  # a former search told none
+    both = terms, document.get("straight", {})
     holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
     size = " x ".join(f"{round((b - a) * unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
     plan = (
@@ -43,17 +48,19 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
             beside(
                 [figures([(folder / "design.svg", plan)])],
                 [
-                    heading("Ambiguity by lost fibres"),
+                    heading("Errors by lost fibres"),
                     paragraph(
-                        "How far, on average, the place that a noisy reading suggests lies from the one that was"
-                        " pressed, over all losses of so many fibres. The noise has a standard deviation of"
-                        f" {100 * float(settings['search']['noise']):.2g}% of a signal's full scale."
+                        "What a localizer is expected to err, on average over all losses of so many fibres, and how far"
+                        " the place that a very noisy reading suggests lies from the one that was pressed, the"
+                        " ambiguity; in mm, and as much for straight fibres. Errors are expected under noise with a"
+                        f" standard deviation of {100 * float(settings['search']['noise']):.2g}% of a signal's full"
+                        f" scale, ambiguities are under {100 * AMBIGUITY_NOISE:.2g}%."
                     ),
                     table(
-                        ["fibres lost", "grid units", "mm", "mm, straight fibres"],
+                        ["fibres lost", "expected error", "straight", "ambiguity", "straight"],
                         [
-                            [lost, f"{value:#.3g}", f"{value * unit_mm:#.3g}", _straight(document, lost, unit_mm)]
-                            for lost, value in spread.items()
+                            [lost, *(_mm(each, f"{name}_lost_{lost}", unit_mm) for name in MEASURES for each in both)]
+                            for lost in spread
                         ],
                     ),
                 ],
@@ -67,13 +74,14 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         [
             (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
             (holds, "design rules"),
-            (f"{spread[0] * unit_mm:#.3g} mm", "ambiguity of the design"),
+            (f"{_mm(terms, f'{headline}_lost_0', unit_mm)} mm", f"{headline.replace('_', ' ')} of the design"),
         ],
     )
     return [fibres]
 
 
 PAD = "morphology.json"
+MEASURES = ("expected_error", "ambiguity")
 Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
 """Its name, the document that it has left, and what a report has to say of that."""
 
@@ -142,9 +150,9 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     )
 
 
-def _straight(document: Mapping[str, Any], lost: int, unit_mm: float) -> str:
-    """The ambiguity of straight fibres in mm; nothing where a search before this version left none."""
-    value = document.get("straight", {}).get(f"ambiguity_lost_{lost}")
+def _mm(terms: Mapping[str, Any], name: str, unit_mm: float) -> str:
+    """A term in mm; nothing where a search before this version left none."""
+    value = terms.get(name)
     return "-" if value is None else f"{float(value) * unit_mm:#.3g}"
 
 
@@ -173,8 +181,9 @@ def _places(broken: Sequence[Mapping[str, Any]]) -> list[list[object]]:
 
 def _terms(terms: Mapping[str, float]) -> Iterator[list[object]]:
     for name, value in terms.items():
-        if name.startswith("ambiguity_lost_"):
-            yield [name, value, f"ambiguity with {name[-1]} fibres lost, grid units"]
+        if "_lost_" in name:
+            measure = name.split("_lost_")[0].replace("_", " ")
+            yield [name, value, f"{measure} with {name[-1]} fibres lost, grid units"]
         elif name.startswith("penalty_"):
             yield [name, value, f"how far {name.removeprefix('penalty_')} is broken, as the search has it"]
         else:

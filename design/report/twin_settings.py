@@ -12,7 +12,7 @@ from design.settings import Contact, PadSettings, SearchSettings
 if TYPE_CHECKING:
     from design.common.settings import Spec
 
-SEARCH = {"method": "error", "knots": 8, "starts": 2}
+SEARCH = {"knots": 8, "starts": 2}
 """How a twin is designed for: more knots than these, or more steps, do not find better pads of four fibres a family."""
 
 
@@ -22,9 +22,6 @@ KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
 
 def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
     """The settings of `spec`, with the reach, the noise and the sensed rectangle of the `twin.json` at `path`.
-
-    What a press does and how noisy it is being known, the search is for the least expected error, unless `spec` states
-    another method.
 
     Its fibres and pitch are the pad's as well, where `spec` states none, or those of `pad`, if one is given. Reach and
     rectangle stay as they are in mm on a pad of another pitch; of the rectangle what lies beyond a pad is left out.
@@ -36,7 +33,6 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
     if spec.given(Contact) and spec.section(Contact) != Contact():
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
     given = spec.given(SearchSettings)
-    method = given.get("method", SEARCH["method"])
     own = twin.morphology.layout
     stated = {**own.settings, **{key: spec.given(PadSettings)[key] for key in KEYS if key in spec.given(PadSettings)}}
     if pad is not None:
@@ -48,7 +44,7 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         {
             "pad": stated | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
             "contact": twin.contact(size.unit_mm).model_dump(),
-            "search": {**(SEARCH if method == SEARCH["method"] else {}), **given, "noise": _noise(twin)},
+            "search": {**SEARCH, **given, "noise": _noise(twin)},
         }
     )
 

@@ -8,9 +8,9 @@ from .contact import MEASURED_REACH, PUBLISHED_CONTACT, Contact
 from .layout import MOST_FIBRES, Counts, Layout, Pitch
 from .pad import PadSettings, Polygon, Rectangle, Sensed, between_fibres, sensed_rectangle
 from .rules import RulesSettings
-from .search import NOISE, Lost, SearchSettings
+from .search import Lost, SearchSettings
 
-PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.11)
+PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005)
 PUBLISHED: Mapping[str, Settings] = {
     "pad": PUBLISHED_PAD,
     "contact": PUBLISHED_CONTACT,
@@ -21,7 +21,6 @@ PUBLISHED: Mapping[str, Settings] = {
 __all__ = [
     "MEASURED_REACH",
     "MOST_FIBRES",
-    "NOISE",
     "PUBLISHED",
     "PUBLISHED_CONTACT",
     "PUBLISHED_PAD",

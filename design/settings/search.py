@@ -16,31 +16,43 @@ Lost = Annotated[
 ]
 
 
-NOISE = 0.05
-"""What an ambiguity can tell: the built pad's responses scatter by 0.01 to 0.02 of full scale, but at that
-no confusions are left among presses a fifth of a grid unit apart."""
+WEIGHTS = (1.0, 1e-7, 5e-6)
+"""Published alpha, beta and gamma: of entropy, sharpness and disorder (formula (5))."""
+SIDE = 7
+"""The published search presses 7 x 7 places."""
+LEVELS = 4096
+"""Levels of the published 12-bit converter."""
+MOST_LEVELS = 2**24
 
 
 class SearchSettings(Settings):
     """`[search]`: how the fibres are found.
 
     Attributes:
+        noise: the default is what the responses of a built pad scatter by.
         lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
+        weights, presses, levels: of the published objective, alpha, beta and gamma; the side of its square of presses;
+            and the levels that signals are rounded up to.
         contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
     """
 
-    method: Literal["descent", "error", "genetic"] = Field(
-        default="descent", description="gradients of the ambiguity, or of the expected error; or as published"
+    method: Literal["descent", "genetic"] = Field(
+        default="descent", description="gradients of the expected error, or the genetic search as published"
     )
     knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
     steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
+    weights: Annotated[tuple[Share, Share, Share], BeforeValidator(as_tuple)] = Field(
+        default=WEIGHTS, description="weights of entropy, sharpness and disorder in the genetic search"
+    )
+    presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
+    levels: int = Field(default=LEVELS, ge=1, le=MOST_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
     lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
     noise: float = Field(
-        default=NOISE, ge=1e-9, le=10, description="standard deviation of a signal's noise, of full scale"
+        default=0.02, ge=1e-9, le=10, description="standard deviation of a signal's noise, of full scale"
     )
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
     contacts: Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)] = Field(
@@ -53,9 +65,9 @@ class SearchSettings(Settings):
         """What is designed for where nothing else is asked: the measured contact, by the published method its own."""
         return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
 
-    @field_validator("lost")
+    @field_validator("lost", "weights")
     @classmethod
-    def _some_weight(cls, lost: int | tuple[float, ...]) -> int | tuple[float, ...]:
-        if isinstance(lost, tuple) and sum(lost) == 0:
+    def _some_weight(cls, weights: int | tuple[float, ...]) -> int | tuple[float, ...]:
+        if isinstance(weights, tuple) and sum(weights) == 0:
             raise ValueError("one of the weights must be above 0")
-        return lost
+        return weights

@@ -132,7 +132,8 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     search = SearchSettings().model_dump()
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
-    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.05, 0.0)
+    assert (search["weights"], search["presses"], search["levels"]) == ((1.0, 1e-7, 5e-6), 7, 4096)
+    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.02, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -143,6 +144,9 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
         (Contact, "sides", (3,), (2,)),
         (SearchSettings, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
         (SearchSettings, "noise", (1e-9, 10.0), (0.0, 10.1)),
+        (SearchSettings, "weights", ((1.0, 0.0, 0.0), (0.0, 1e6, 5e-324)), ((0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,))),
+        (SearchSettings, "presses", (2, 64), (1, 65)),
+        (SearchSettings, "levels", (1, 2**24), (0, 2**24 + 1)),
         (SearchSettings, "seed", (0, 2**32 - 1), (-1, 2**32)),
         (RulesSettings, "min_crossing_angle_deg", (0.0, 90.0), (-0.1, 90.1)),
         (RulesSettings, "min_gap_mm", (0.0, 1000.0), (-0.1, 1000.1)),

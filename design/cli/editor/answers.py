@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from design.criteria.rules import check_rules
-from design.criteria.score import free_presses
+from design.criteria.score import AMBIGUITY_NOISE, free_presses
 from design.evaluation.ambiguity_map import ambiguity_map
 from design.pad.courses.curves import beziers
 from design.pad.courses.spare_knots import with_spares
@@ -80,7 +80,7 @@ class Answers:
         return free_presses(self.size)
 
     def _spread(self, pad: Morphology) -> Array:
-        return ambiguity_map(pad, self._presses, self.contact, self.search.lost, self.search.noise)
+        return ambiguity_map(pad, self._presses, self.contact, self.search.lost, AMBIGUITY_NOISE)
 
 
 def _told(pad: Morphology, course: Array) -> list[list[float]]:

@@ -97,6 +97,7 @@ def test_files_hold_what_was_measured(tmp_path):
         *(("a", "plain"), ("a", "ours"), ("b", "plain"), ("b", "ours"))
     ]
     assert [row["speed"] for row in made["rows"][::2]] == [1, 1]
+    assert b"\r" not in (tmp_path / "x.csv").read_bytes()
     with (tmp_path / "x.csv").open() as file:
         assert [row["error"] for row in csv.DictReader(file)] == ["0.5", "0.1"] * 2
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")

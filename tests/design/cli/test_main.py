@@ -11,7 +11,7 @@ from design import Contact, InputError, Morphology, SearchRun, Spec, Twin, score
 from design.cli.main import design
 from design.common.files import sha256
 from design.common.settings import commented_toml
-from design.criteria.score import ambiguities
+from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 from design.evaluation.expected_error import error_terms, expected_errors
 from design.pad.twin import Frame, TwinChannel
 from design.report.twin_settings import settings_for_twin
@@ -25,13 +25,18 @@ def test_straight_fibres_are_told_beside_what_was_found(tmp_path, monkeypatch):
     (tmp_path / "pad.toml").write_text(QUICK)
     told = CliRunner().invoke(design, [], catch_exceptions=False).output.splitlines()
     document = json.loads((tmp_path / "out/pad/design.json").read_text())
-    straight = ambiguities(Morphology.straight(2), Contact(), 1, SearchSettings().noise, PadSettings(grid=2))
+    pad, asked = Morphology.straight(2), {"lost": 1, "size": PadSettings(grid=2)}
+    straight = [
+        *expected_errors(pad, Contact(), noise=SearchSettings().noise, **asked),
+        *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
+    ]
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
-    assert set(document["straight"]) == {name for name in document["terms"] if name.startswith("ambiguity")}
-    assert told[1].startswith(
-        "  ambiguity {ambiguity_lost_0:#.3g} / {ambiguity_lost_1:#.3g} ".format(**document["terms"])
-    )
-    assert told[2].split() == f"{straight[0]:#.3g} / {straight[1]:#.3g} with straight fibres".split()
+    assert set(document["straight"]) == {name for name in document["terms"] if "_lost_" in name}
+    for line, name in ((1, "expected error"), (3, "ambiguity")):
+        found = [value for term, value in document["terms"].items() if term.startswith(name.replace(" ", "_"))]
+        assert told[line].startswith(f"  {name} {found[0]:#.3g} / {found[1]:#.3g} ")
+        plain = straight[line - 1 : line + 1]
+        assert told[line + 1].split() == f"{plain[0]:#.3g} / {plain[1]:#.3g} with straight fibres".split()
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +72,8 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(tmp_path, monkeypatch, 
     assert (used["pad"]["grid"], used["pad"]["pitch_mm"], used["pad"]["sensed_mm"]) == (2, 10, [18, 30])
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
-    asked = {"lost": 1, "noise": 0.03, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
-    expected = error_terms(expected_errors(pad, known.contact(), **asked))
+    asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
+    expected = error_terms(expected_errors(pad, known.contact(), noise=0.03, **asked))
     assert document["terms"] == pytest.approx(score(pad, known.contact(), **asked) | expected, rel=1e-9)
     scored = CliRunner().invoke(design, ["score", "out/pad/morphology.json", "--twin", str(twin)])
     assert json.loads(scored.output)["terms"] == pytest.approx(document["terms"], rel=1e-9)
@@ -91,8 +96,9 @@ def test_a_search_for_a_twin_is_resumed(tmp_path, monkeypatch, twin):
 
     spec = settings_for_twin(Spec.load(Path("pad.toml")), twin)
     pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
+    straight, run = Morphology.straight(pad.layout), SearchRun(killed, Path("out/pad/search"))
     with pytest.raises(KilledError):
-        search(pad, contact, settings, run=SearchRun(killed, Path("out/pad/search")))
+        search(pad, contact, settings, origin=straight, run=run)
     with pytest.raises(InputError, match="begun with contact reach"):
         designed("--resume", spec=long + "[pad]\ngrid = 2\npitch_mm = 10.0\nsensed_mm = [18.0, 30.0]\n")
     _, resumed = designed("--twin", twin, "--resume", spec=long)

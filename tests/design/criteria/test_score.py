@@ -1,10 +1,13 @@
 """Scores of pads, whatever their size."""
 
+import math
+
 import pytest
 import torch
 
 from design import InputError, Morphology
 from design.criteria.ambiguity import ambiguity, full_scale
+from design.criteria.published_objective import published_terms
 from design.criteria.score import ambiguities, free_presses, score
 from design.pad.contact import signals
 from design.settings import PUBLISHED_CONTACT, PadSettings
@@ -28,6 +31,21 @@ def test_a_pad_is_scored_where_it_is_pressed():
     assert score(pad, lost=1) == beyond
     with pytest.raises(InputError, match="the pad itself is 45 mm wide"):
         score(pad, size=PadSettings(sensed_mm=(46, 20)))
+
+
+def test_the_joint_entropy_of_all_fibres_saturates_where_those_of_the_families_do_not():
+    """49 presses give no more than log2 49 bits, and straight fibres have them."""
+    pad = Morphology.straight(4)
+    assert score(pad, lost=0)["published_joint_entropy"] == pytest.approx(math.log2(49))
+    assert published_terms(pad)[0].entropy < 9
+    one = score(Morphology.straight((1, 0)), lost=0)  # one family is all there is
+    assert one["published_joint_entropy"] == one["published_entropy"]
+
+
+@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
+def test_the_joint_entropy_of_the_published_pads_is_saturated(published, name):
+    terms = score(Morphology.load(published / f"{name}.mat"), lost=0)
+    assert terms["published_joint_entropy"] == pytest.approx(math.log2(49))
 
 
 def test_fibres_that_no_press_touches_change_no_ambiguity():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from design.criteria.published_objective import published_objective
+from design.criteria.published_objective import published_objective, published_presses, published_terms
 from design.optimisers.genetic_search import GeneticSearch
 from design.optimisers.problem import SearchProblem
 from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
@@ -40,6 +40,18 @@ def test_the_best_objective_never_rises_and_is_that_of_the_best_pad():
     assert objectives == sorted(objectives, reverse=True)
     assert objectives[-1] < objectives[0]
     assert published_objective(breeding.morphology(), CONTACT) == objectives[-1]
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [{"weights": (2.0, 1e-6, 0.0)}, {"presses": 12}, {"levels": 16}, {"weights": (0.5, 0.0, 1e-5), "presses": 3}],
+)
+def test_what_is_bred_for_are_the_weights_the_presses_and_the_levels_of_the_settings(asked):
+    breeding, objectives = bred(2, SMALL.model_copy(update=asked))
+    presses = published_presses(PAD.layout, asked.get("presses", 7))
+    rest = {name: asked[name] for name in asked if name != "presses"}
+    assert published_terms(breeding.morphology(), CONTACT, presses, **rest)[0].objective == objectives[-1]
+    assert published_objective(breeding.morphology(), CONTACT) != objectives[-1]
 
 
 @pytest.mark.parametrize("broken_at", [0, 1, 2, 5, 6])

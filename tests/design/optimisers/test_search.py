@@ -9,8 +9,8 @@ import pytest
 
 from design import Contact, InputError, Morphology
 from design.common.checkpoints import Checkpoints
-from design.criteria.score import ambiguities, ambiguity_terms, score
-from design.evaluation.expected_error import expected_errors
+from design.criteria.score import AMBIGUITY_NOISE, ambiguities, ambiguity_terms, score
+from design.evaluation.expected_error import error_terms, expected_errors
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import SearchRun, search
 from design.optimisers.start import advance_start
@@ -210,12 +210,13 @@ def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
     )
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [worse])
     contact = Contact(reach=((0, 1), (0.5, 0.7), (1, 0.2), (1.6, 0)), length="manhattan")
-    plain = ambiguities(straight, contact, quick.lost, quick.noise, PadSettings())
-    assert np.mean(plain) < np.mean(ambiguities(worse, contact, quick.lost, quick.noise, PadSettings()))
+    plain = expected_errors(straight, contact, quick.lost, quick.noise, PadSettings())
+    assert np.all(np.array(plain) < expected_errors(worse, contact, quick.lost, quick.noise, PadSettings()))
     found = search(contact=contact, settings=quick, rules=free)
     assert found.morphology.knots.shape == worse.knots.shape
     np.testing.assert_array_equal(found.morphology.knots[:4, :, 1], straight.knots[:4, :1, 1] + np.zeros(5))
-    assert found.straight == pytest.approx(ambiguity_terms(plain), rel=1e-6)
+    confused = ambiguities(straight, contact, quick.lost, AMBIGUITY_NOISE, PadSettings())
+    assert found.straight == pytest.approx(error_terms(plain) | ambiguity_terms(confused), rel=1e-6)
     assert found.straight.items() <= found.terms.items()
     genetic = search(contact=contact, settings=quick.model_copy(update={"method": "genetic"}), rules=free)
     assert genetic.morphology == worse
@@ -224,16 +225,19 @@ def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
 
 def test_the_terms_of_what_is_found_are_its_scores():
     pad, contact = PadSettings(grid=2, sensed_mm=(20, 30)), Contact(radius=0.9)
-    settings = SearchSettings(knots=3, starts=1, steps=5, lost=1, noise=0.05)
+    settings = SearchSettings(knots=3, starts=1, steps=5, lost=1, noise=0.03)
     found = search(pad, contact, settings, QUICK)
-    assert found.terms == score(found.morphology, contact, 1, 0.05, QUICK, pad)
-    plain = ambiguity_terms(ambiguities(Morphology.straight(2), contact, 1, 0.05, pad))
-    assert found.straight == pytest.approx(plain, rel=1e-6)
+    expected, plain = (
+        error_terms(expected_errors(each, contact, 1, 0.03, pad)) for each in (found.morphology, Morphology.straight(2))
+    )
+    assert found.terms == score(found.morphology, contact, 1, 0.05, QUICK, pad) | expected
+    confused = ambiguity_terms(ambiguities(Morphology.straight(2), contact, 1, 0.05, pad))
+    assert found.straight == pytest.approx(plain | confused, rel=1e-6)
 
 
 def test_a_search_for_the_least_expected_error_finds_less_than_straight_fibres_have():
     """The wide reach is that of a built pad; what is found is judged by what is searched for."""
-    settings = SearchSettings(method="error", knots=5, starts=1, steps=50, lost=(0, 0, 1), noise=0.02)
+    settings = SearchSettings(knots=5, starts=1, steps=50, lost=(0, 0, 1), noise=0.02)
     found = search(PadSettings(grid=3), None, settings, RulesSettings(enforce=False))
     errors = expected_errors(found.morphology, Contact(), (0, 0, 1), 0.02, PadSettings(grid=3))
     assert [found.terms[f"expected_error_lost_{lost}"] for lost in range(3)] == errors

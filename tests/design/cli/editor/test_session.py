@@ -10,7 +10,7 @@ from design import Contact, InputError, Morphology, PadSettings, RulesSettings, 
 from design.cli.editor.answers import Answers
 from design.cli.editor.session import Session
 from design.cli.main import design
-from design.criteria.score import ambiguities
+from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 
 
 def session(tmp_path, pad=None, **size):
@@ -40,7 +40,7 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     view = shown[-1]
     size = PadSettings().of(pad.layout)
     assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
-    assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, SearchSettings().noise, size), abs=3e-4)
+    assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size), abs=3e-4)
     assert np.mean(view["map"], axis=1) == pytest.approx(view["ambiguity"], abs=1e-4)
     assert np.array(view["fibres"][4]["knots"]) == pytest.approx(pad.to_mm(pad.knots[4]), abs=1e-4)
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
