@@ -45,14 +45,22 @@ def fabricate() -> None:
     """
 
 
-@fabricate.command()
-@click.argument("morphology", type=click.Path(path_type=Path))
-@click.option(
+formats_option = click.option(
     "--formats",
     default="stl,step,svg,png",
     show_default=True,
-    help="Which to write, of stl, 3mf, step, svg, dxf, png, gcode, urscript.",
+    help="Which files of the mould to write, of stl, 3mf, step, svg, dxf, png, gcode, urscript.",
 )
+
+
+def split_formats(formats: str) -> tuple[str, ...]:
+    """The names that `--formats` lists."""
+    return tuple(name.strip() for name in formats.split(",") if name.strip())
+
+
+@fabricate.command()
+@click.argument("morphology", type=click.Path(path_type=Path))
+@formats_option
 @spec_option
 @out_option(what="Folder for the files")
 @json_option
@@ -76,10 +84,11 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     settings = FabricationSettings.from_spec(load_spec(spec))
     pad = Morphology.load(morphology)
     folder = out or pad_folder(morphology)
-    wanted = [name.strip() for name in formats.split(",") if name.strip()]
     with claimed(folder):
         inputs = [path for path in (morphology, spec) if path]
-        document = build_files(pad, folder, wanted, settings, inputs, warn=partial(click.echo, err=True))
+        document = build_files(
+            pad, folder, split_formats(formats), settings, inputs, warn=partial(click.echo, err=True)
+        )
     show_result(document, mould_lines(document, folder), as_json)
 
 

@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 
 from design.common import profiling
 from design.common.errors import InputError, instance, path, shown
-from design.common.files import (
-    provenance,
-    read_json,
-    require_file,
-    sha256,
-    staged,
-    unchanged,
-    write_json,
-    writing,
-)
+from design.common.files import provenance, read_json, require_file, sha256, staged, unchanged, write_json, writing
 from design.pad.morphology import Morphology
 from fabricate.checks.findings import Finding, verdict
 from fabricate.checks.mesh_checks import SOUND, sound
@@ -106,7 +97,8 @@ def build(
             pad, a mould that is no closed solid, or files that cannot be written; `out` is as it was then.
     """
     out = path("out", out)
-    inputs = _require_known(formats, inputs)
+    require_formats(formats)
+    inputs = _require_files(inputs)
     profiling.looked_at("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
@@ -137,10 +129,14 @@ def build(
     return document
 
 
-def _require_known(formats: Sequence[str], inputs: Sequence[Path]) -> list[Path]:
+def require_formats(formats: Sequence[str]) -> None:
+    """Raise InputError for a format that is none of `FORMATS`."""
     for name in instance("formats", formats, Sequence):
         if not isinstance(name, str) or name not in FORMATS:
             raise InputError(f"formats: got {shown(name)}, allowed are {', '.join(FORMATS)}")
+
+
+def _require_files(inputs: Sequence[Path]) -> list[Path]:
     inputs = [path("inputs", given) for given in instance("inputs", inputs, Sequence)]
     for given in inputs:
         require_file(given)

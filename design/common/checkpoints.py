@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, shown
-from .files import atomic, read_bytes, read_json, write_json
+from .files import atomic, clear_litter, read_bytes, read_json, write_json
 
 FORMAT = "padforge-search/1"
 
@@ -73,17 +73,17 @@ class Checkpoints:
             InputError: a search.json there that is none of a search.
         """
         about = self.folder / "search.json"
-        if not about.exists():
-            return
-        try:
-            read_json(about, FORMAT)
-        except InputError as error:
-            raise InputError(f"{error}; remove it, or choose another folder") from error
-        for path in self.folder.iterdir():
-            if _STATE.fullmatch(path.name) and path.is_file() and not path.is_symlink():
-                path.unlink()
-        about.unlink()
-        with suppress(OSError):  # where there is more in it than states
+        if about.exists():
+            try:
+                read_json(about, FORMAT)
+            except InputError as error:
+                raise InputError(f"{error}; remove it, or choose another folder") from error
+            for path in self.folder.iterdir():
+                if _STATE.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+                    path.unlink()
+            about.unlink()
+        clear_litter(self.folder)
+        with suppress(OSError):  # where it is not there, or there is more in it than states
             self.folder.rmdir()
 
     def _read(self, path: Path, start: int) -> State:

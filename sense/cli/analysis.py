@@ -26,7 +26,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     if it did not, places are found as before. The old model is written over only where --out says so.
     """
     from design.common.files import refuse_unwritable, staged, write_json
-    from sense.health.model_folder import copy_health
+    from sense.health.model_folder import copy_health, health_files
     from sense.localizer.calibration import recalibration
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
@@ -38,7 +38,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     old, opened = Localizer.load(model), open_recording(recording)
     with reported("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
-    with staged(target) as folder:
+    with staged(target, without=health_files()) as folder:
         localizer.save(folder)
         write_json(folder / "recalibration.json", document)
         copy_health(model, folder)
@@ -72,6 +72,7 @@ def fibre_loss(
     Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper). Retrained networks that are done are
     kept when it is broken off, and the same command goes on from them.
     """
+    from design.common.checkpoints import Checkpoints
     from design.common.files import refuse_unwritable, staged, write_json
     from sense.localizer.calibration.fibre_loss_study import fibre_loss_lines, fibre_loss_study
     from sense.localizer.localizer import Localizer
@@ -82,6 +83,7 @@ def fibre_loss(
     if not (model or retrain):
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
     target = out or common.pad_folder(recording)
+    unfinished = target / "unfinished"
     refuse_unwritable(target)
     localizer = Localizer.load(model) if model else None
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
@@ -92,12 +94,14 @@ def fibre_loss(
             retrain=retrain,
             options=options,
             lost=lost,
-            keep_in=target / "unfinished",
+            keep_in=unfinished,
             progress=report,
         )
     with staged(target) as folder:
         write_json(folder / "fibre_loss.json", document)
         draw_fibre_loss(document, folder / "fibre_loss.png")
+    if retrain:
+        Checkpoints(unfinished, {}).clear()
     common.show_result(document, fibre_loss_lines(document), as_json)
 
 

@@ -83,6 +83,7 @@ def record(
     """
     from design.settings import Contact, PadSettings
     from sense.rig import operation
+    from sense.rig.devices.processes import require_rig_system
     from sense.rig.planning.setup import Setup
     from sense.settings import RigSettings
 
@@ -101,6 +102,7 @@ def record(
         shown = like if like and not morphology else pad
         recording = operation.record_simulated(settings, shown, target, overrides, inputs, like)
     else:
+        require_rig_system()
         options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
@@ -215,10 +217,12 @@ def doctor(
     from dataclasses import asdict
 
     from design.settings import Contact, PadSettings
+    from sense.rig.devices.processes import require_rig_system
     from sense.rig.operation import look_over
     from sense.rig.planning.setup import Setup
     from sense.settings import RigSettings
 
+    require_rig_system()
     settings = common.load_spec(spec)
     pad, options = _pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
     known = morphology is not None or rig == "simulated" or through_drivers

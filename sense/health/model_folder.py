@@ -1,8 +1,10 @@
 """Health in the folder of a model, as `calibrate` leaves it there: what is known of a recording's fibres by it."""
 
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 
+from design.common.files import settle
 from sense.recordings.formats.assembly import FOUND
 from sense.recordings.recording import Recording
 
@@ -13,6 +15,7 @@ from .trained_model import files_of
 
 def has_health(model: Path, name: str = COMMANDED) -> bool:
     """Whether health was learnt into a folder."""
+    settle(model)
     return files_of(model, name)[0].exists()
 
 
@@ -26,16 +29,14 @@ def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[Fibre
     return known, examine(known, recording.readings, recording.times_s, recording.begun, recording.lifted)
 
 
-def forget_health(folder: Path) -> None:
-    """Remove what an earlier calibration into a folder told health by: it must not speak for a later one."""
-    for name in (COMMANDED, DETECTED):
-        for file in files_of(folder, name):
-            file.unlink(missing_ok=True)
+def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:
+    """Names of the files in a folder by which it tells health, for those of its models that are named."""
+    return {file.name for name in names for file in files_of("", name)}
 
 
 def copy_health(model: Path, folder: Path) -> None:
     """What a model tells health by goes to another folder: it was learnt without places."""
-    for name in (COMMANDED, DETECTED):
-        for file in files_of(model, name):
-            if file.exists():
-                shutil.copyfile(file, folder / file.name)
+    settle(model)
+    for name in health_files():
+        if (model / name).exists():
+            shutil.copyfile(model / name, folder / name)

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from design.common.errors import InputError
-from design.common.files import atomic, read_bytes, writing
+from design.common.files import read_bytes, staged
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,14 +30,14 @@ AVERAGE = 0.998
 class ModelFiles(NamedTuple):
     """NAME.json and NAME.safetensors, of which the first has the digest of the second.
 
-    So a pair that was interrupted between its halves is told from a whole one.
+    They are written together; a pair whose halves somebody has mixed is told from a whole one.
     """
 
     document: Path
     weights: Path
 
     def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write `document`, its "weights_sha256" filled in, and `arrays`; neither is touched before both are complete.
+        """Write `document`, its "weights_sha256" filled in, and `arrays`, together or not at all.
 
         Raises:
             InputError: the document of `what` is not finite or no JSON, or the folder cannot be written.
@@ -48,9 +48,9 @@ class ModelFiles(NamedTuple):
             text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         except (TypeError, ValueError) as error:
             raise InputError(f"{self.document}: {what} cannot be written as JSON ({error})") from error
-        with writing(self.document.parent), atomic(self.weights) as weights, atomic(self.document) as described:
-            weights.write_bytes(content)
-            described.write_text(text, encoding="utf-8")
+        with staged(self.document.parent) as stage:
+            (stage / self.weights.name).write_bytes(content)
+            (stage / self.document.name).write_text(text, encoding="utf-8")
 
     @contextmanager
     def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, shown, whole
-from design.common.files import UNFINISHED, lock, read_json, refuse_unwritable, sync, write_json, writing
+from design.common.files import UNFINISHED, lock, read_json, refuse_unwritable, sync, to_disk, write_json, writing
 from sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, write_at
@@ -87,7 +87,7 @@ class Recorder:
             InputError: no run directory, or damage elsewhere than at its end.
         """
         fibres = fibres_of(path)
-        if _unborn(path):  # broken off before the first reading
+        if unborn(path):  # broken off before the first reading
             with writing(path):
                 for name in (JOURNAL, READINGS):
                     (path / name).touch()
@@ -96,7 +96,7 @@ class Recorder:
         with writing(path):
             self._journal = (path / JOURNAL).open("r+b", buffering=0)
             try:
-                lock(self._journal, _busy(path))
+                lock(self._journal, busy(path))
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
@@ -197,15 +197,15 @@ class Recorder:
     def sync(self) -> None:
         """Put all so far on the disk: the readings and states first, then what the journal says of them."""
         self._blocks.flush()
-        os.fsync(self._stream.fileno())
+        to_disk(self._stream.fileno())
         if self._states is not None:
             self._states[0].flush()
-            os.fsync(self._states[1].fileno())
+            to_disk(self._states[1].fileno())
         lines = "".join(self._lines).encode()
         write_at(self._journal, self._noted, lines)
         self._noted += len(lines)
         self._lines.clear()
-        os.fsync(self._journal.fileno())
+        to_disk(self._journal.fileno())
 
     def __enter__(self) -> "Recorder":
         return self
@@ -218,7 +218,8 @@ class Recorder:
                 self.sync()
 
 
-def _busy(path: Path) -> str:
+def busy(path: Path) -> str:
+    """What to say where a recording is locked by the recorder that is at work."""
     return f"{path}: another program is recording into it"
 
 
@@ -231,9 +232,9 @@ def _claimed(path: Path) -> BinaryIO:
     """The journal of a recording that is to be born in `path`, kept from others; of several that come, one gets it."""
     journal = _opened(path / JOURNAL)
     try:
-        lock(journal, _busy(path))
+        lock(journal, busy(path))
         if not os.path.samestat(os.fstat(journal.fileno()), (path / JOURNAL).stat()):
-            raise InputError(_busy(path))  # who had it first gave up and took it away
+            raise InputError(busy(path))  # who had it first gave up and took it away
         refuse_begun(path)
     except BaseException:
         journal.close()
@@ -241,11 +242,11 @@ def _claimed(path: Path) -> BinaryIO:
     return journal
 
 
-def _unborn(path: Path) -> bool:
+def unborn(path: Path) -> bool:
     """Whether a folder holds nothing but what is made before `start.json`, and that itself; no reading, no press."""
     return all(
-        file.name in (START, _UNBORN)
-        or (file.name in _BIRTH and stat.S_ISREG(file.lstat().st_mode) and file.stat().st_size == 0)
+        stat.S_ISREG(file.lstat().st_mode)
+        and (file.name in (START, _UNBORN) or (file.name in _BIRTH and file.stat().st_size == 0))
         for file in path.iterdir()
     )
 
@@ -267,7 +268,7 @@ def fibres_of(path: Path) -> int:
 def refuse_begun(path: Path) -> None:
     """As `refuse_existing`, but for a recording that was broken off while it was being born: one can begin there."""
     refuse_unwritable(path)
-    if path.exists() and ((path / START).exists() or not _unborn(path)):
+    if path.exists() and ((path / START).exists() or not unborn(path)):
         refuse_existing(path)
 
 
@@ -276,19 +277,6 @@ def refuse_existing(path: Path) -> None:
     refuse_unwritable(path)
     if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
-
-
-def refuse_replacing(path: Path) -> None:
-    """Raise InputError if `path` holds anything but a simulated recording, which the same seed gives again."""
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
-    source = read_json(path / START, FORMAT).get("source")
-    kind = source.get("kind") if isinstance(source, dict) else None
-    if kind != "simulated":
-        raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; choose another --out")
-    strange = sorted(file.name for file in path.iterdir() if file.name not in FILES)
-    if strange:
-        raise InputError(f"{path}: holds {strange[0]}, which is no part of a recording; choose another --out")
 
 
 STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")

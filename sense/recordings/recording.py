@@ -2,9 +2,8 @@
 
 import hashlib
 import json
-import shutil
-import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import isnan
 from pathlib import Path
@@ -14,13 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.common.errors import InputError, shown
-from design.common.files import read_json, writing
+from design.common.files import held, read_json, scratch, sync, writing
 from sense.recordings.processing import limits
 from sense.recordings.processing.limits import Array, Indices, Mask
 
 from .block_file import read_blocks
 from .press_journal import Press, read_journal
-from .recorder import FORMAT, JOURNAL, READINGS, START, Recorder, fibres_of, refuse_existing
+from .recorder import (
+    FILES,
+    FORMAT,
+    JOURNAL,
+    READINGS,
+    START,
+    Recorder,
+    busy,
+    fibres_of,
+    refuse_existing,
+    unborn,
+)
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64) | dict.fromkeys(
     ("begun", "lifted"), np.int64
@@ -159,40 +169,76 @@ class Recording:
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
-    def save(self, path: str | Path, provenance: Mapping[str, Any]) -> None:
+    def save(self, path: str | Path, provenance: Mapping[str, Any], replacing: bool = False) -> None:
         """Write a run directory that appears whole or not at all.
 
+        Args:
+            replacing: whether a simulated recording that is there gives way, see `refuse_replacing`.
+
         Raises:
-            InputError: `path` exists and is not an empty directory (a recording is never written over, not even one
+            InputError: `path` exists and is not an empty directory (no other recording is written over, not even one
                 that appeared meanwhile), or cannot be written.
         """
+        refuse = refuse_replacing if replacing else refuse_existing
+        refuse(Path(path))
         path = Path(path).resolve()
-        refuse_existing(path)
-        unfinished = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
-        try:
-            with writing(path), Recorder(unfinished, self.fibres, self.source, provenance) as recorder:
-                recorder.append(self.times_s, self.readings)
-                measured = np.column_stack([getattr(self, name) for name in _MEASURED]).tolist()
-                edges = zip(self.presses_mm, self.begun, self.lifted, measured, strict=True)
-                for place, begun, lifted, (depth, reached, force) in edges:
-                    recorder.begin(place, int(begun), **({} if isnan(depth) else {"depth_mm": depth}))
-                    told = {} if isnan(reached) else {"at_mm": [None, None, reached]}
-                    recorder.finish(int(lifted), **told, **({} if isnan(force) else {"force_n": force}))
-            _put(unfinished, path)
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with scratch(path.parent) as folder:
+                self._write(folder / path.name, provenance)
+                if replacing:
+                    refuse(path)
+                    with suppress(FileNotFoundError):
+                        path.rename(folder / f"{path.name}-old")
+                _put(folder / path.name, path)
+
+    def _write(self, path: Path, provenance: Mapping[str, Any]) -> None:
+        with Recorder(path, self.fibres, self.source, provenance) as recorder:
+            recorder.append(self.times_s, self.readings)
+            measured = np.column_stack([getattr(self, name) for name in _MEASURED]).tolist()
+            edges = zip(self.presses_mm, self.begun, self.lifted, measured, strict=True)
+            for place, begun, lifted, (depth, reached, force) in edges:
+                recorder.begin(place, int(begun), **({} if isnan(depth) else {"depth_mm": depth}))
+                told = {} if isnan(reached) else {"at_mm": [None, None, reached]}
+                recorder.finish(int(lifted), **told, **({} if isnan(force) else {"force_n": force}))
 
 
 def _put(unfinished: Path, path: Path) -> None:
     """Rename a run directory to `path`, unless another came there first."""
-    with writing(path):
-        try:
-            if path.exists():
-                path.rmdir()
-            unfinished.rename(path)
-        except OSError:
-            refuse_existing(path)
-            raise
+    try:
+        if path.exists():
+            path.rmdir()
+        unfinished.rename(path)
+    except OSError:
+        refuse_existing(path)
+        raise
+    sync(path.parent)
+
+
+def refuse_replacing(path: Path) -> None:
+    """Raise InputError if `path` holds anything but a simulated recording, which the same seed gives again.
+
+    It is never a link, and nobody may be recording into it.
+    """
+    other = "choose another --out"
+    if path.is_symlink():
+        raise InputError(f"{path}: is a link, and none is followed where a recording is replaced; {other}")
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {other}")
+    if not unborn(path):
+        for file in sorted(path.iterdir()):
+            if file.name not in FILES or file.is_symlink() or not file.is_file():
+                raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {other}")
+    if (path / START).exists() or not unborn(path):
+        source = read_json(path / START, FORMAT).get("source")
+        kind = source.get("kind") if isinstance(source, dict) else None
+        if kind != "simulated":
+            raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; {other}")
+    if (path / JOURNAL).exists():
+        with held(path / JOURNAL, busy(path)):
+            pass
 
 
 def _validate(recording: Recording) -> None:

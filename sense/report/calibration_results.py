@@ -8,10 +8,16 @@ from design.common.errors import InputError
 from design.common.files import refuse_unwritable, staged, write_json
 from design.common.profiling import stage
 from sense.health.learning import learn_health
-from sense.health.model_folder import forget_health
+from sense.health.model_folder import health_files
 from sense.localizer.calibration.calibration import calibrate, left_out
 from sense.recordings.recording import Recording
 from sense.settings import LocalizerSettings
+
+FILES = (
+    *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
+    *sorted(health_files()),
+)
+"""Names of all that a calibration writes; of health, what can be learnt."""
 
 
 def calibrate_into(
@@ -46,7 +52,7 @@ def calibrate_into(
         except InputError as error:
             health = {}
             warn(f"no watch is kept on the fibres' health: {error}")
-    with staged(out) as folder:
+    with staged(out, without=health_files() - health_files(health)) as folder:  # it must not speak for another model
         localizer.save(folder)
         for name, model in health.items():
             model.save(folder, name)
@@ -56,8 +62,6 @@ def calibrate_into(
 
             draw_error_map(document, folder / "error_map.png")
             draw_error_by_loss(document, folder / "error_by_loss.png")
-    if not health:
-        forget_health(out)
     return document
 
 

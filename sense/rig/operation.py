@@ -3,14 +3,14 @@
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from design.common.errors import InputError
-from design.common.files import provenance
+from design.common.files import provenance, scratch
 from design.common.profiling import stage
 from design.common.settings import Spec
 from design.pad.morphology import Morphology
@@ -34,6 +34,9 @@ from .safety import Limits, require_ready, require_tool
 from .session.interrupts import Interrupts
 from .session.press_loop import Report, Session, require_safe_plan
 
+_DRY = "padforge-dry-"
+"""What folders for recordings that nobody keeps begin with, among temporary ones."""
+
 
 def record_simulated(
     spec: Spec,
@@ -42,23 +45,26 @@ def record_simulated(
     overrides: Mapping[str, Any],
     inputs: Sequence[Path] = (),
     like: Twin | None = None,
+    replacing: bool = False,
 ) -> Recording:
     """Record presses on the simulated rig, at once, with the settings of `spec`, into the run directory `out`.
 
     Args:
         pad, like: see `simulate`.
+        replacing: whether a simulated recording that is there gives way.
 
     Raises:
         InputError: settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
-    refuse_existing(out)
+    if not replacing:
+        refuse_existing(out)
     options = spec.section(RigSettings, **overrides)
     plan = pad.morphology if isinstance(pad, Twin) else pad
     size = spec.section(PadSettings, **plan.layout.settings)
     with stage("simulate"):
         recording = simulate(pad, options, spec.section(Contact), size, like)
     inputs = [*inputs, *([options.plan_file] if options.plan_file else [])]
-    recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs))
+    recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs), replacing)
     return recording
 
 
@@ -154,8 +160,7 @@ def record(
         require_ready(arm.state(), Limits.of(rig))  # before there is a folder that would be in the way
         if rig.max_force_n is None:
             say('[rig] max_force_n is "unwatched": no force stops the arm')
-        with tempfile.TemporaryDirectory() as scratch:
-            folder = Path(scratch) / "dry" if dry else setup.out
+        with scratch(Path(tempfile.gettempdir()), _DRY) if dry else nullcontext(setup.out) as folder:
             with recorder_of(setup, rig, plan, folder, resume, devices) as recorder:
                 report(len(recorder.done), len(plan))
                 interrupts.check()

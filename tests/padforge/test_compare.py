@@ -53,6 +53,17 @@ def test_no_two_pads_share_a_folder_and_none_leaves_that_of_the_comparison(tmp_p
     assert comparison.Variant("..", Spec({})).folder == "pad"
 
 
+def test_folders_are_such_as_every_system_takes_and_tells_apart(tmp_path):
+    names = ["con", "AUX.v2", "lpt1", "console", "comb"]
+    folders = [comparison.Variant(name, Spec({})).folder for name in names]
+    assert folders == ["pad-con", "pad-AUX.v2", "pad-lpt1", "console", "comb"]
+    for name in ("one.json", "ONE.json"):  # two files here, and one folder on macOS and Windows
+        Morphology.straight(1).save(tmp_path / name)
+    result = called("design", "compare", "one.json", "ONE.json", cwd=tmp_path)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "one: one of this name" in result.err
+
+
 def test_ctrl_c_ends_the_comparison_and_not_one_search_alone(tmp_path, monkeypatch):
     begun = []
 

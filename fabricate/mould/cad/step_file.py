@@ -5,9 +5,10 @@ less than half of the file, and whoever reads it finds the same shape.
 """
 
 import re
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from design.common.files import scratch
 
 if TYPE_CHECKING:
     from build123d import Compound
@@ -47,8 +48,8 @@ def write_step(path: Path, shape: "Compound") -> None:
     """
     from build123d import export_step
 
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        whole = Path(folder) / "whole.step"
+    with scratch(path.parent) as folder:
+        whole = folder / "whole.step"
         try:
             written = export_step(shape, whole, write_pcurves=False, timestamp=_EPOCH)
         except RuntimeError:

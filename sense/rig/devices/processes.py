@@ -1,11 +1,20 @@
 """Starts a module of this package as a process of its own."""
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
 
+from design.common.errors import InputError
+
 ROOT = Path(__file__).parents[3]
+
+
+def require_rig_system() -> None:
+    """Raise InputError where rigs and their emulators, which need what POSIX has, cannot run."""
+    if (here := platform.system()) not in ("Linux", "Darwin"):
+        raise InputError(f"a rig needs Linux or macOS, this is {here}; allowed here is --rig simulated")
 
 
 def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:

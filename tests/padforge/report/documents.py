@@ -23,8 +23,19 @@ def design_document() -> dict:
     settings = {name: section.model_dump(mode="json") for name, section in used.items()}
     return {
         "format": "padforge-design/1",
-        "terms": {"ambiguity_lost_0": 0.1, "ambiguity_lost_1": 0.2, "information": 9.5},
-        "straight": {"ambiguity_lost_0": 0.25, "ambiguity_lost_1": 0.5},
+        "terms": {
+            "expected_error_lost_0": 0.06,
+            "expected_error_lost_1": 0.08,
+            "ambiguity_lost_0": 0.1,
+            "ambiguity_lost_1": 0.2,
+            "information": 9.5,
+        },
+        "straight": {
+            "expected_error_lost_0": 0.12,
+            "expected_error_lost_1": 0.24,
+            "ambiguity_lost_0": 0.25,
+            "ambiguity_lost_1": 0.5,
+        },
         "violations": [],
         "provenance": provenance("padforge design", 3) | {"settings": settings},
     }

@@ -83,18 +83,22 @@ def test_rules_and_checks_have_their_verdicts(pad: Path) -> None:
 
 
 def test_straight_fibres_stand_beside_the_design(pad: Path) -> None:
-    """In mm; a search of before they were told leaves their column empty."""
-    rows = [[cell.strip() for cell in row] for row in ambiguity_rows(write_report(pad).read_text())]
-    assert rows == [["0", "0.100", "1.12", "2.81"], ["1", "0.200", "2.25", "5.62"]]
+    """In mm; a search of before they were told leaves their columns empty, and what it did tell is the headline."""
+    text = write_report(pad).read_text()
+    assert "expected error of the design" in text
+    rows = [[cell.strip() for cell in row] for row in error_rows(text)]
+    assert rows == [["0", "0.675", "1.35", "1.12", "2.81"], ["1", "0.900", "2.70", "2.25", "5.62"]]
     older = design_document()
-    del older["straight"]
+    del older["straight"], older["terms"]["expected_error_lost_0"], older["terms"]["expected_error_lost_1"]
     written(pad / "design.json", older)
-    assert [row[-1] for row in ambiguity_rows(write_report(pad).read_text())] == ["-", "-"]
+    text = write_report(pad).read_text()
+    assert "ambiguity of the design" in text
+    assert [row[1:] for row in error_rows(text)] == [["-", "-", "1.12", "-"], ["-", "-", "2.25", "-"]]
 
 
-def ambiguity_rows(text: str) -> list[list[str]]:
-    table = text.partition("mm, straight fibres</th>")[2].partition("</table>")[0]
-    return [re.findall(r"<td.*?>(.*?)</td>", row) for row in table.split("<tr>")[1:]]
+def error_rows(text: str) -> list[list[str]]:
+    table = text.partition("Errors by lost fibres")[2].partition("</table>")[0]
+    return [re.findall(r"<td.*?>(.*?)</td>", row) for row in table.split("<tr>")[2:]]
 
 
 def test_the_laying_guide_is_that_of_the_bench(made: Path, page: Path) -> None:

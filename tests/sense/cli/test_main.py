@@ -2,6 +2,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from design import Morphology
+
 
 def test_mistakes_are_one_line_and_leave_nothing(padforge_sense) -> None:
     Path("noise.mat").write_bytes(b"no matlab" * 100)
@@ -112,3 +116,14 @@ def test_numbers_and_places_that_cannot_be_are_one_line(few) -> None:
         code, out, err = few(*arguments)
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert message in err
+
+
+@pytest.mark.parametrize("asked", [("record", "--rig", "ur5"), ("record", "--through-drivers"), ("doctor",)])
+def test_a_rig_where_none_can_run_is_one_line(
+    padforge_sense, monkeypatch: pytest.MonkeyPatch, asked: tuple[str, ...]
+) -> None:
+    Morphology.straight(4).save("morphology.json")
+    monkeypatch.setattr("platform.system", lambda: "Windows")
+    code, out, err = padforge_sense(*asked, "--morphology", "morphology.json")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "a rig needs Linux or macOS, this is Windows; allowed here is --rig simulated" in err

@@ -2,6 +2,9 @@
 
 import json
 import os
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import JOURNAL, READINGS, START, STATES, Recorder
 from sense.recordings.recording import Recording
 from tests.helpers.effort import few
+from tests.helpers.kills import killed
 
 FIBRES = 3
 
@@ -239,3 +243,49 @@ def test_a_birth_that_fails_leaves_nothing(tmp_path, monkeypatch):
             Recorder(tmp_path / "run", FIBRES, {}, {})
     assert list((tmp_path / "run").iterdir()) == []
     made(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="what is open is told on Linux")
+def test_what_a_recording_needs_to_be_opened_outlasts_a_power_cut(tmp_path, monkeypatch):
+    """Files before the folder that names them, and that before the one above; also where it is renamed into place."""
+    synced = []
+    fsync, rename = os.fsync, os.rename
+
+    def traced(file):
+        synced.append(Path(f"/proc/self/fd/{file}").readlink())
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", traced)
+    monkeypatch.setattr(os, "rename", lambda old, new: (synced.append("renamed"), rename(old, new)))
+    recorder = Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {})
+    assert [path.name for path in synced] == [".unfinished-start.json", "run", tmp_path.name]
+    synced.clear()
+    record(recorder, range(1), 0.0)
+    assert {path.name for path in synced} == {READINGS, STATES, JOURNAL}
+    recorder.__exit__(None, None, None)
+    synced.clear()
+    Recording.open(tmp_path / "run").save(tmp_path / "copy", {})
+    renamed = synced.index("renamed")
+    assert {path.name for path in synced[:renamed]} >= {".unfinished-start.json", READINGS, JOURNAL, "copy"}
+    assert tmp_path in synced[renamed:]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
+def test_a_recording_that_gives_way_is_there_whole_or_not_at_all(tmp_path):
+    """Killed between any two file operations; and what is left goes with the next."""
+    new = replace(Recording.open(made(tmp_path, presses=2)), source={"kind": "simulated"})
+    found = []
+    for number in count():
+        folder = tmp_path / str(number)
+        with Recorder(folder / "run", FIBRES, {"kind": "simulated"}, {}) as recorder:
+            record(recorder, range(3), 0.0)
+        (folder / ".run-mine").mkdir()
+        ended = not killed(lambda folder=folder: new.save(folder / "run", {}, replacing=True), number, folder)
+        found.append(len(Recording.open(folder / "run").presses_mm) if (folder / "run").exists() else 0)
+        if not ended:
+            new.save(folder / "run", {}, replacing=True)
+        assert {path.name for path in folder.iterdir()} == {"run", ".run-mine"}
+        if ended:
+            break
+    assert set(found) == {3, 0, 2}
+    assert found == sorted(found, key=[3, 0, 2].index)

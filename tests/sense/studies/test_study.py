@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from design import InputError
-from sense.studies.study import Findings, Study, Task, run
+from sense.studies.study import Findings, Study, Task, _alone, run
 
 
 def test_other_settings_are_no_help_to_a_study_broken_off(tmp_path: Path) -> None:
@@ -42,6 +42,19 @@ def test_a_folder_in_which_the_same_study_is_at_work_is_refused(tmp_path: Path) 
 
     run(made(meet), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
+
+
+def test_a_system_that_keeps_what_is_open_is_no_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows removes no lock while it is held."""
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "in use")
+
+    study = Study("x", "X", {}, [], lambda states: Findings([{"a": 1}], []), lambda _: Figure())
+    with monkeypatch.context() as windows, _alone(tmp_path, "x"):
+        windows.setattr(Path, "unlink", unlink)
+    run(study, tmp_path)
+    assert (tmp_path / "x.json").exists()
 
 
 def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> None:

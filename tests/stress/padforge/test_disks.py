@@ -85,7 +85,7 @@ def start(folder: Path, *arguments: str, limit: int = -1, tied: bool = False) ->
 def require_whole(folder: Path) -> None:
     """Every file in a folder can be read to its end by what reads its kind; temporary ones are none."""
     for path in folder.rglob("*"):
-        if not path.is_file() or path.name.startswith("."):
+        if not path.is_file() or any(part.startswith(".") for part in path.relative_to(folder).parts):
             continue
         match path.suffix:
             case ".json":

@@ -17,12 +17,13 @@ from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings
 from fabricate import settings as fabricate
 from fabricate.checks import plan_checks as printability
-from padforge import _check_ahead, _sections
+from padforge.running import Run, check_ahead
+from padforge.tables import sections
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.door import require_one_line
 
-MODELS = _sections()
+MODELS = sections()
 DEFAULTS = commented_toml(MODELS).encode()
 KEYS = [(name, key) for name, model in MODELS.items() for key in model.model_fields]
 
@@ -238,7 +239,7 @@ def test_what_can_be_at_its_extreme_is_known():
 def test_a_whole_run_with_extreme_settings_is_checked_in_time(folder: Path, tables: dict[str, dict[str, Any]]):
     with ends_in_time():
         try:
-            _check_ahead(Spec(tables), folder / "none")
+            check_ahead(Run(Spec(tables), folder / "none"))
         except InputError as error:
             require_one_line(error)
 

@@ -1,14 +1,15 @@
 """An emulated UR controller on this machine, in a process of its own, with faults to be switched on at any moment."""
 
 import json
-import os
 import tempfile
+from contextlib import ExitStack
 from functools import partialmethod
 from pathlib import Path
 from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
+from design.common.files import unfinished_file
 from sense.rig.devices.processes import start
 from sense.rig.devices.protocols import Array, Pose, RigFault
 
@@ -18,6 +19,9 @@ from .truth import Truth, create
 HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
 """Where the emulated arm stands at first: 200 mm up, the tool pointing down."""
+
+_TRUTH = "padforge-ur-"
+"""What the names of its temporary files begin with."""
 
 
 class UrEmulator:
@@ -51,11 +55,13 @@ class UrEmulator:
         self._settings |= {"stiffness_n_mm": stiffness_n_mm, "host": host, "tcp_mm": tcp_mm}
 
     def __enter__(self) -> Self:
-        handle, name = tempfile.mkstemp(prefix="padforge-ur-")
-        os.close(handle)
-        create(Path(name))
-        self._process = start("sense.rig.emulators.ur.server", json.dumps(self._settings | {"truth": name}))
-        self.truth = Truth(Path(name))
+        self._end = ExitStack()
+        with ExitStack() as begun:
+            path = begun.enter_context(unfinished_file(Path(tempfile.gettempdir()), prefix=_TRUTH))
+            create(path)
+            self._process = start("sense.rig.emulators.ur.server", json.dumps(self._settings | {"truth": str(path)}))
+            self.truth = Truth(path)
+            self._end = begun.pop_all()
         if problem := self._hear():
             self.__exit__()
             raise RigFault("refused", f"no emulated arm at {problem}", "is there another one?")
@@ -64,7 +70,7 @@ class UrEmulator:
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.communicate()
-        self.truth.path.unlink(missing_ok=True)
+        self._end.close()
 
     def pose_at(self, times_s: ArrayLike) -> Array:
         """(n, 6) true poses in mm and rad at monotonic times; see `Truth.pose_at`."""

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -138,3 +139,37 @@ os._exit(0)
             time.sleep(0.4)
             RtdeReader(address, 1.0).close()
             reader.close()
+
+
+LEFT = """
+import os, sys
+from sense.rig.emulators.ur.emulator import UrEmulator
+with UrEmulator(host=sys.argv[1]):
+    os._exit(9)
+"""
+
+
+def test_what_a_killed_program_has_left_among_temporary_files_goes_with_the_next(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing else goes, nor the file of one that is at work."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    near = {
+        "padforge-ur-mine",
+        "padforge-ur-0123456789abcde",
+        "padforge-ur-127.0.0.1.lock",
+        "padforge-arm-127.0.0.1.lock",
+    }
+    for name in near:
+        (tmp_path / name).touch()
+    assert subprocess.run([sys.executable, "-c", LEFT, address], check=False).returncode == 9
+    assert len(list(tmp_path.iterdir())) == len(near) + 1
+    time.sleep(0.5)  # its arm finds that its program has ended
+    with UrEmulator(host=address):
+        at_work = {path.name for path in tmp_path.iterdir()} - near
+        assert len(at_work) == 1
+        with pytest.raises(RigFault, match="is there another one"), UrEmulator(host=address):
+            pass
+        assert {path.name for path in tmp_path.iterdir()} == near | at_work
+    assert {path.name for path in tmp_path.iterdir()} == near

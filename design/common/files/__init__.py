@@ -1,0 +1,35 @@
+"""Files as every stage writes and reads them: atomic, together or not at all, self-describing JSON."""
+
+from .blame import as_written, refuse_unwritable, writing
+from .folders import claimed, settle, staged
+from .litter import UNFINISHED, clear_litter, scratch, unfinished_file
+from .locks import held, lock
+from .reading import MOST_BYTES, provenance, read_bytes, read_json, require_file, sha256, unchanged
+from .single_files import atomic, sync, to_disk, write_json, write_text
+
+__all__ = [
+    "MOST_BYTES",
+    "UNFINISHED",
+    "as_written",
+    "atomic",
+    "claimed",
+    "clear_litter",
+    "held",
+    "lock",
+    "provenance",
+    "read_bytes",
+    "read_json",
+    "refuse_unwritable",
+    "require_file",
+    "scratch",
+    "settle",
+    "sha256",
+    "staged",
+    "sync",
+    "to_disk",
+    "unchanged",
+    "unfinished_file",
+    "write_json",
+    "write_text",
+    "writing",
+]

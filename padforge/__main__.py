@@ -1,0 +1,5 @@
+"""`python -m padforge`: the command line."""
+
+from . import main
+
+main()

@@ -1,0 +1,47 @@
+"""One page of all that the stages have left in the folder of a pad."""
+
+from pathlib import Path
+
+from design.common.errors import Fault, InputError
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` from the files in `folder`; stages that have left none are left out.
+
+    Raises:
+        InputError: no stage has left anything, or a file is damaged.
+        Fault: there are files of another pad among them, which the page tells first.
+    """
+    from design.common.files import as_written, write_text
+    from design.common.page.elements import PageSection, page
+    from design.report.contact_section import contact_sections
+    from design.report.sections import design_sections, provenance_row, provenance_section, stage_pages
+    from fabricate.report.sections import fabrication_sections
+    from sense.report import sections as sensed
+    from sense.report.identification_results import identification_sections
+
+    stages = (
+        ("design", folder / "design.json", design_sections),
+        ("fabrication", folder / "fabrication.json", fabrication_sections),
+        ("recording", folder / "recording" / "start.json", sensed.recording_sections),
+        ("identification", folder / "identification.json", identification_sections),
+        ("calibration", folder / "calibration.json", sensed.calibration_sections),
+        ("fibre-loss", folder / "fibre_loss.json", sensed.fibre_loss_sections),
+        ("contacts", folder / "contacts.json", contact_sections),
+    )
+    sections, origins, strange = stage_pages(folder, stages)
+    studies: list[str] = []
+    for path, document in sensed.find_studies(folder):
+        with as_written(path):
+            studies += sensed.study_pieces(path, document)
+            origins.append(provenance_row(folder, f"study {path.stem}", document))
+    if not origins:
+        raise InputError(f"{folder}: no design.json, fabrication.json, calibration.json or study to report on")
+    if studies:
+        sections.append(PageSection("Studies", studies))
+    lead = "Fibres, mould and calibration of one soft strain-sensor pad."
+    title = f"Pad report: {folder.resolve().name}"
+    write_text(folder / "report.html", page(title, lead, [*sections, provenance_section(origins)]))
+    if strange:
+        raise Fault(f"{folder / 'report.html'}: {'; '.join(strange)}")
+    return folder / "report.html"

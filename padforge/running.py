@@ -1,0 +1,221 @@
+"""`padforge run`: the stages of a pad one after another, in a time that is shared among them, and gone on with."""
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from design.common.command_line import INTERRUPTED
+from design.common.errors import InputError
+
+from .progress import RunProgress
+from .tables import sections
+
+if TYPE_CHECKING:
+    from design.common.settings import Spec
+    from design.optimisers.search import SearchResult
+    from design.pad.morphology import Morphology
+    from sense.recordings.recording import Recording
+
+SEARCH_SHARE = 0.5
+"""Of a time budget, what the search may take of it at most."""
+FINISH_S = 12.0
+"""What is left of it for health, figures and report, s."""
+_SETTINGS = {
+    "design": ("pad", "contact", "search", "rules"),
+    "mould": ("pad", "rules", "mould", "printer", "silicone", "fibre", "dispenser"),
+    "recording": ("pad", "contact", "rig"),
+    "contacts": ("pad", "contact", "search"),
+    "calibration": ("localizer",),
+}
+"""The sections that each stage depends on."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as it is asked for.
+
+    Attributes:
+        spec: its settings. out: the folder of the pad.
+        seed: of every random choice; that of each section if None.
+        formats: files of the mould, see `fabricate.export.FORMATS`.
+        resume: whether to go on from what an earlier run has done.
+        time_budget: seconds for all of it; None for no end.
+        begin_s: when it began, on the clock of `time.monotonic`.
+    """
+
+    spec: "Spec"
+    out: Path
+    seed: int | None = None
+    formats: tuple[str, ...] = ("stl", "step", "svg", "png")
+    resume: bool = False
+    time_budget: float | None = None
+    begin_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def seeds(self) -> dict[str, Any]:
+        """Settings that override those of a section."""
+        return {"seed": self.seed}
+
+    def made_of(self, stage: str, inputs: Mapping[str, str] | None = None) -> dict[str, Any]:
+        """What a stage depends on, as JSON has it: settings, seed, and the digests of its inputs."""
+        from design.settings import Contact
+
+        used = {name: self.spec.section(sections()[name]).model_dump(mode="json") for name in _SETTINGS[stage]}
+        stated = {"contact": self.spec.given(Contact)} if "contact" in used else {}
+        return {"settings": used, "stated": stated, "seed": self.seed, "inputs": dict(inputs or {})}
+
+    def left_s(self, share: float = 1.0, keep_s: float = 0.0) -> float | None:
+        """Seconds that are left of a share of the time budget, less what is kept for later; None without one."""
+        if self.time_budget is None:
+            return None
+        return max(0.0, share * self.time_budget - (time.monotonic() - self.begin_s) - keep_s)
+
+
+def check_ahead(run: Run) -> None:
+    """Refuse what would fail only after minutes of work: any section, sections that do not fit, a real recording."""
+    import numpy as np
+
+    from design.settings import PadSettings
+    from fabricate import FabricationSettings
+    from fabricate.export import require_formats
+    from sense.localizer.calibration.calibration import split_presses
+    from sense.recordings.recording import refuse_replacing
+    from sense.settings import LocalizerSettings, RigSettings
+
+    for model in sections().values():
+        run.spec.section(model)
+    require_formats(run.formats)
+    FabricationSettings.from_spec(run.spec).require_consistent(run.spec.section(PadSettings).layout)
+    learning = run.spec.section(LocalizerSettings)
+    if run.time_budget is not None and learning.method == "published":
+        raise InputError(
+            "[localizer] method: got published with --time-budget, allowed is masked: the published training ends "
+            "where it gains no more"
+        )
+    presses = run.spec.section(RigSettings).presses
+    split_presses(presses, learning.split, learning.test_share, np.random.default_rng(0))
+    refuse_replacing(run.out / "recording")
+
+
+def run_stages(run: Run) -> int:
+    """All stages into `run.out`, each with its summary on stdout; the exit code: 0, 1 if a rule or check fails, or 130.
+
+    What an earlier run has finished of the same is kept if `run.resume`.
+    """
+    from design.common.files import sha256
+    from design.report.contact_section import contact_line
+    from design.report.files import search_lines
+    from fabricate.cli import mould_lines
+    from sense.report.calibration_results import calibration_lines
+
+    progress = RunProgress(run.out, run.resume)
+    progress.begin()
+    kept: list[str] = []
+    found = _designed(run, progress, kept)
+    click.echo("\n".join(search_lines(found, run.out)))
+    if found.stopped == "interrupted":
+        return INTERRUPTED
+    pad = {"morphology.json": sha256(run.out / "morphology.json")}
+    mould = _moulded(run, progress, kept, found.morphology, pad)
+    click.echo("\n".join(mould_lines(mould, run.out)))
+    recording = _recorded(run, progress, kept, found.morphology, pad)
+    click.echo(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {run.out / 'recording'}")
+    contacts = _compared(run, progress, kept, found.morphology, pad)
+    calibration = _calibrated(run, progress, kept, recording)
+    click.echo("\n".join(f"  {line}" for line in calibration_lines(calibration)))
+    click.echo(contact_line(contacts))
+    if kept:
+        click.echo(f"{run.out}: kept as an earlier run has made it: {', '.join(kept)}", err=True)
+    return int(bool(found.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))
+
+
+def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult":
+    from design.common.checkpoints import Checkpoints
+    from design.optimisers.search import SearchRun
+    from design.report.files import found_before, run_search
+
+    made_of = run.made_of("design")
+    if progress.has("design", made_of) and (found := found_before(run.out)):
+        kept.append("fibres")
+        if not found.stopped:
+            Checkpoints(run.out / "search", {}).clear()  # a kill came just before
+        return found
+    how = SearchRun(resume=run.resume, time_budget=run.left_s(SEARCH_SHARE))
+
+    def written(found: "SearchResult") -> None:
+        if found.stopped != "interrupted":
+            progress.note("design", made_of)
+
+    return run_search(run.spec, run.out, run.seeds, run=how, written=written)[1]
+
+
+def _moulded(
+    run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
+) -> dict[str, Any]:
+    from fabricate import FabricationSettings, build
+
+    made_of = run.made_of("mould", inputs) | {"formats": sorted(run.formats)}
+    if progress.has("mould", made_of):
+        kept.append("mould")
+        return _document(run.out / "fabrication.json")
+    settings, warn = FabricationSettings.from_spec(run.spec), partial(click.echo, err=True)
+    mould = build(pad, run.out, run.formats, settings, [run.out / name for name in inputs], warn=warn)
+    progress.note("mould", made_of, ["fabrication.json", *mould["sha256"]])
+    return mould
+
+
+def _recorded(
+    run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
+) -> "Recording":
+    from design.common.files import sha256
+    from sense.recordings.recording import Recording
+    from sense.rig.operation import record_simulated
+    from sense.settings import RigSettings
+
+    plan = run.spec.section(RigSettings).plan_file
+    made_of = run.made_of("recording", {**inputs, **({plan.name: sha256(plan)} if plan else {})})
+    if progress.has("recording", made_of):
+        kept.append("recording")
+        return Recording.open(run.out / "recording")
+    paths = [run.out / name for name in inputs]
+    recording = record_simulated(run.spec, pad, run.out / "recording", run.seeds, paths, replacing=True)
+    progress.note("recording", made_of, ["recording"])
+    return recording
+
+
+def _compared(
+    run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
+) -> dict[str, Any]:
+    from design.report.contact_section import NAME, compare_contacts
+
+    made_of = run.made_of("contacts", inputs)
+    if progress.has("contacts", made_of):
+        kept.append("contacts")
+        return _document(run.out / NAME)
+    document = compare_contacts(run.spec, pad, run.out, run.seed)
+    progress.note("contacts", made_of, [NAME])
+    return document
+
+
+def _calibrated(run: Run, progress: RunProgress, kept: list[str], recording: "Recording") -> dict[str, Any]:
+    from sense.cli.calibration import run_calibration
+    from sense.report.calibration_results import FILES
+
+    made_of = run.made_of("calibration", {"recording": recording.digest})
+    if progress.has("calibration", made_of):
+        kept.append("calibration")
+        return _document(run.out / "calibration.json")
+    document = run_calibration(run.spec, recording, run.out, run.seeds, run.left_s(keep_s=FINISH_S))
+    progress.note("calibration", made_of, FILES)
+    return document
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """A document whose digest is the one that was noted as it was written."""
+    return json.loads(path.read_text(encoding="utf-8"))
