@@ -33,7 +33,7 @@ from design.settings import Contact, PadSettings, Rectangle
 
 SIDE, WINDOW = 14, 5.0
 """Presses along a side of a lattice, and the longest side, grid units: presses further apart are seldom confused."""
-LATTICES, MOST_LOSSES = 8, 32
+LATTICES, MOST_LOSSES = 4, 32
 """Lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
 WIDTH, RIDGE = 0.5, 1e-2
 """Width of the kernel, full scales of a signal, and the ridge: such errors go best with those of trained networks."""
