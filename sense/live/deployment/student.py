@@ -10,9 +10,9 @@ import numpy as np
 from design.common.computing import one_torch_thread
 from design.common.errors import InputError
 from sense.health.trained_model import refuse_other_pad
-from sense.localizer.calibration.calibration import CHECKED, learn, radii, split_presses
+from sense.localizer.calibration.calibration import CHECKED, learn, radii, split_presses, split_unseen
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
-from sense.localizer.evaluation import distances, errors_by_loss, held_back
+from sense.localizer.evaluation import distances, errors_by_loss
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Found, Localizer
 from sense.localizer.network import Weights, refuse_unsound
@@ -204,15 +204,7 @@ def split(recording: Recording, teacher: Localizer, options: LocalizerSettings) 
         InputError: the teacher was recalibrated by the recording, or there are too few presses.
     """
     refuse_other_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
-    known = np.flatnonzero(recording.known)
-    if recording.digest in teacher.recalibrated_by:
-        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    if recording.digest == teacher.learnt_from:
-        test = held_back(teacher, recording)
-        return np.setdiff1d(known, test), test
-    rng = np.random.default_rng(options.seed)
-    training, test = split_presses(len(known), options.split, options.test_share, rng)
-    return known[training], known[test]
+    return split_unseen(recording, teacher, options)
 
 
 def causal_beside(

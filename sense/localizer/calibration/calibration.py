@@ -15,7 +15,7 @@ from design.common.profiling import stage
 from design.common.settings import or_default, validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import settings
-from sense.localizer.evaluation import conformal, evaluate
+from sense.localizer.evaluation import conformal, evaluate, held_back
 from sense.localizer.features import press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.network import refuse_unsound
@@ -213,6 +213,25 @@ def radii(
     by_level = (lost_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
     found = ([plain.locate(presses, subset) for subset in subsets] for subsets in by_level)
     return np.clip([conformal(each, places_mm, measures) for each in found], 1e-6, 1e6)
+
+
+def split_unseen(
+    recording: Recording, localizer: Localizer | None, options: settings.LocalizerSettings
+) -> tuple[Indices, Indices]:
+    """Presses of known place to learn from, and those to test on, which `localizer`, if there is one, has not learnt.
+
+    Raises:
+        InputError: the localizer was recalibrated by the recording, or there are too few presses.
+    """
+    known, digest = np.flatnonzero(recording.known), recording.digest
+    if localizer is not None and digest in localizer.recalibrated_by:
+        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
+    if localizer is not None and digest == localizer.learnt_from:
+        test = held_back(localizer, recording)
+        return np.setdiff1d(known, test), test
+    rng = np.random.default_rng(options.seed)
+    training, test = split_presses(len(known), options.split, options.test_share, rng)
+    return known[training], known[test]
 
 
 def split_presses(

@@ -20,12 +20,12 @@ from design.common.files import provenance
 from design.common.settings import or_default
 from design.criteria.fibre_loss import lost_subsets
 from sense import settings
-from sense.localizer.evaluation import by_place, errors_by_loss, held_back
+from sense.localizer.evaluation import by_place, errors_by_loss
 from sense.localizer.localizer import Found, Localizer
 from sense.recordings.processing.limits import MAX_FIBRES, Array, Indices
 from sense.recordings.recording import Recording
 
-from .calibration import learn, split_presses
+from .calibration import learn, split_unseen
 
 FORMAT = "padforge-fibre-loss/1"
 ONE, MANY = "one network", "retrained"
@@ -72,7 +72,7 @@ def fibre_loss_study(
         instance("localizer", localizer, Localizer)
     keep_in = None if keep_in is None else path("keep_in", keep_in)
     options, lost = or_default("options", options, settings.LocalizerSettings), whole("lost", lost, 0, MAX_FIBRES)
-    training, test = _presses(recording, localizer, options)
+    training, test = split_unseen(recording, localizer, options)
     levels = range(min(lost, recording.fibres - 1) + 1)
     places_mm = recording.presses_mm[test]
     ways: dict[str, Any] = {}
@@ -102,21 +102,6 @@ def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm:
     ]
     maps = [{"lost": lost, "by_place": by_place(locate(tuple(lost)).places_mm, places_mm)} for lost in worst]
     return {"errors": rows, "by_subset": by_subset, "maps": maps}
-
-
-def _presses(
-    recording: Recording, localizer: Localizer | None, options: settings.LocalizerSettings
-) -> tuple[Indices, Indices]:
-    """Presses of known place to train on and to test on."""
-    known, digest = np.flatnonzero(recording.known), recording.digest
-    if localizer is not None and digest in localizer.recalibrated_by:
-        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    if localizer is not None and digest == localizer.learnt_from:
-        test = held_back(localizer, recording)
-        return np.setdiff1d(known, test), test
-    rng = np.random.default_rng(options.seed)
-    training, test = split_presses(len(known), options.split, options.test_share, rng)
-    return known[training], known[test]
 
 
 def _retrained(
