@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.common.errors import InputError
-from design.common.files import read_bytes
-from sense.recordings.processing.limits import MAX_BYTES, Array, Mask
+from design.common.files import open_in_place, read_bytes
+from sense.recordings.processing.limits import MAX_BYTES, MAX_FIBRES, Array, Mask
 
 _MAGIC = b"PFB1"
 _UNIT = 256
@@ -65,11 +65,11 @@ class BlockWriter:
             The writer, the open file it appends to, and the (R, 1 + C) rows that are there.
 
         Raises:
-            InputError: as `read_blocks`.
+            InputError: as `read_blocks`, or it is a link.
         """
         rows, _ = read_blocks(path, fibres)
         dtype = block_dtype(fibres)
-        file = path.open("r+b", buffering=0)
+        file = open_in_place(path)
         blocks = int(np.argmin(np.append(_sound(_blocks(file.read(), dtype)), False)))
         file.seek(blocks * dtype.itemsize)
         file.truncate()
@@ -119,7 +119,7 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
         (R, 1 + C) rows, and whether a torn tail was cut off behind them.
 
     Raises:
-        InputError: the file is missing, or a block is damaged although intact ones follow.
+        InputError: the file is missing, of another number of fibres, or a block is damaged although intact ones follow.
     """
     dtype = block_dtype(fibres)
     content = read_bytes(path, MAX_BYTES)
@@ -132,6 +132,8 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
             f"{path}: block {end} (byte {end * dtype.itemsize}) is damaged although intact blocks follow, "
             "allowed is a torn end of the file only"
         )
+    if _begins_with_block(tail):  # no writer that died has left it
+        raise InputError(f"{path}: block {end} is whole, but not of {fibres} fibres, as the recording says it is")
     blocks = blocks[:end]
     kept = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
     return blocks["rows"][kept], bool(tail)
@@ -151,6 +153,15 @@ def _sound(blocks: NDArray[np.void]) -> Mask:
         & (blocks["sequence"] == np.arange(len(blocks)))
         & (blocks["first"] == np.cumsum(counts) - counts)
         & (counts <= blocks.dtype["rows"].shape[0])
+    )
+
+
+def _begins_with_block(content: bytes) -> bool:
+    """Whether an intact block comes first, of any number of fibres."""
+    return content.startswith(_MAGIC) and any(
+        _checksums(np.frombuffer(content, dtype, count=1))[0] == np.frombuffer(content, dtype, count=1)["crc"][0]
+        for dtype in {block_dtype(fibres).itemsize: block_dtype(fibres) for fibres in range(1, MAX_FIBRES + 1)}.values()
+        if len(content) >= dtype.itemsize
     )
 
 

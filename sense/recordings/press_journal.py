@@ -7,7 +7,7 @@ from reprlib import repr as shortened
 from typing import Any, NamedTuple
 
 from design.common.errors import InputError
-from design.common.files import read_bytes
+from design.common.files import open_in_place, read_bytes
 from sense.recordings.processing.limits import MAX_INDEX, MAX_MM, MAX_N
 
 
@@ -68,7 +68,7 @@ def cut_torn_line(path: Path) -> None:
     content = path.read_bytes()
     whole = content.rfind(b"\n") + 1
     if whole < len(content):
-        with path.open("r+b") as file:
+        with open_in_place(path) as file:
             file.truncate(whole)
 
 

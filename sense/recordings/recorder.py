@@ -19,10 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from design.common.errors import InputError, shown, whole
-from design.common.files import UNFINISHED, lock, read_json, refuse_unwritable, sync, to_disk, write_json, writing
+from design.common.files import (
+    UNFINISHED,
+    lock,
+    open_in_place,
+    read_json,
+    refuse_unwritable,
+    sync,
+    to_disk,
+    write_json,
+    writing,
+)
 from sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
-from .block_file import BlockWriter, write_at
+from .block_file import BlockWriter, read_blocks, write_at
 from .press_journal import cut_torn_line, read_journal
 
 FORMAT = "padforge-recording/1"
@@ -84,19 +94,20 @@ class Recorder:
         """Go on with a run directory that was left unfinished; torn tails are cut off.
 
         Raises:
-            InputError: no run directory, or damage elsewhere than at its end.
+            InputError: no run directory, damage elsewhere than at its end, links, or presses without any reading.
         """
         fibres = fibres_of(path)
         if unborn(path):  # broken off before the first reading
             with writing(path):
                 for name in (JOURNAL, READINGS):
                     (path / name).touch()
-        done = read_journal(path / JOURNAL)
         self = cls.__new__(cls)
         with writing(path):
-            self._journal = (path / JOURNAL).open("r+b", buffering=0)
+            self._journal = open_in_place(path / JOURNAL)
             try:
                 lock(self._journal, busy(path))
+                done = read_journal(path / JOURNAL)
+                _refuse_other_readings(path, fibres, len(done))
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
@@ -111,9 +122,8 @@ class Recorder:
         self.done = {press for press, entry in done.items() if entry[3] <= len(rows)}
         self.readings = len(rows)
         for press in sorted(set(done) - self.done):  # or they would count again as soon as enough rows follow
-            self._note(
-                {"event": "aborted", "press": press, "reading": len(rows), "reason": "its readings were torn off"}
-            )
+            gone = {"event": "aborted", "press": press, "reading": len(rows), "reason": "its readings were torn off"}
+            self._note(gone)
         self.sync()
         self._press = max(self.done, default=-1) + 1
         return self
@@ -221,6 +231,13 @@ class Recorder:
 def busy(path: Path) -> str:
     """What to say where a recording is locked by the recorder that is at work."""
     return f"{path}: another program is recording into it"
+
+
+def _refuse_other_readings(path: Path, fibres: int, presses: int) -> None:
+    """Raise InputError where no break has left the readings as they are: nothing of them is to be cut off then."""
+    times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
+    if (presses and not len(times_s)) or not (np.diff(times_s) > 0).all():
+        raise InputError(f"{path / READINGS}: not the readings of {presses} presses of {fibres} fibres, told beside it")
 
 
 def _opened(path: Path) -> BinaryIO:

@@ -5,7 +5,7 @@ from .folders import claimed, settle, staged
 from .litter import UNFINISHED, clear_litter, scratch, unfinished_file
 from .locks import held, lock
 from .reading import MOST_BYTES, provenance, read_bytes, read_json, require_file, sha256, unchanged
-from .single_files import atomic, sync, to_disk, write_json, write_text
+from .single_files import atomic, open_in_place, sync, to_disk, write_json, write_text
 
 __all__ = [
     "MOST_BYTES",
@@ -16,6 +16,7 @@ __all__ = [
     "clear_litter",
     "held",
     "lock",
+    "open_in_place",
     "provenance",
     "read_bytes",
     "read_json",

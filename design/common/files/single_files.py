@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from design.common.errors import InputError
 
@@ -53,6 +53,19 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write `document` to `path` atomically; NaN and infinities are refused, since JSON has none."""
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def open_in_place(path: Path) -> BinaryIO:
+    """Open a file that is there, to be read and changed where it lies, without a buffer; never what a link leads to.
+
+    Raises:
+        InputError: it is a link. OSError: it cannot be opened.
+    """
+    file = path.open("r+b", buffering=0)
+    if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
+        file.close()
+        raise InputError(f"{path}: is a link, and none is followed where a file is gone on with")
+    return file
 
 
 def sync(path: Path) -> None:

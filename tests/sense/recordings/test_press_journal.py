@@ -1,5 +1,6 @@
 """What a journal that is torn or damaged tells of the presses."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense import Recording
+from sense.recordings.recorder import Recorder
 
 
 def test_a_torn_journal_line_loses_its_press_only(recording: Recording, folder: Path) -> None:
@@ -64,3 +66,52 @@ def test_a_depth_or_force_of_another_kind_is_refused(folder: Path, more: str) ->
     journal.write_text(journal.read_text().replace('"event": "done",', f'"event": "done", {more},', 1))
     with pytest.raises(InputError, match="line 2 is no journal entry"):
         Recording.open(folder)
+
+
+@pytest.mark.parametrize("name", ["journal.ndjson", "readings.bin"])
+def test_a_recording_is_not_gone_on_with_through_links(folder: Path, tmp_path: Path, name: str) -> None:
+    elsewhere = (folder / name).rename(tmp_path / "elsewhere")
+    elsewhere.write_bytes(elsewhere.read_bytes() + b"torn")
+    (folder / name).symlink_to(elsewhere)
+    before = {path: path.read_bytes() for path in (*folder.iterdir(), elsewhere)}
+    with pytest.raises(InputError, match=rf"{name}: is a link"):
+        Recorder.resume(folder)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_presses_without_any_reading_are_not_given_up(folder: Path) -> None:
+    """No break leaves that: the readings are elsewhere, or not yet copied here."""
+    (folder / "readings.bin").write_bytes(b"")
+    before = (folder / "journal.ndjson").read_bytes()
+    with pytest.raises(InputError, match=r"readings\.bin: not the readings of \d+ presses"):
+        Recorder.resume(folder)
+    assert (folder / "journal.ndjson").read_bytes() == before
+
+
+@pytest.mark.parametrize("fibres", [1, 2, 3, 5, 6, 7, 11])
+def test_readings_beside_the_document_of_other_fibres_are_not_cut(folder: Path, fibres: int) -> None:
+    """Blocks of one size hold any of several numbers of fibres."""
+    start = folder / "start.json"
+    document = json.loads(start.read_text())
+    assert document["fibres"] == 4
+    start.write_text(json.dumps(document | {"fibres": fibres}))
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(InputError, match=r"readings\.bin: .* of \d+ fibres"):
+        Recorder.resume(folder)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_presses_that_another_program_has_just_made_count(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may come to its end between the look at the journal and its lock, but not the other way round."""
+
+    def last_made(file: object, busy: str) -> None:
+        monkeypatch.undo()
+        with Recorder.resume(folder) as another:
+            another.append([another.last_s + 1], np.zeros((1, another.fibres)))
+            another.begin((0, 0), another.readings, press=9999)
+            another.append([another.last_s + 1], np.zeros((1, another.fibres)))
+            another.finish(another.readings)
+
+    monkeypatch.setattr("sense.recordings.recorder.lock", last_made)
+    with Recorder.resume(folder) as recorder:
+        assert 9999 in recorder.done
