@@ -4,7 +4,7 @@ The same inputs give the same bytes. Everything is built and checked before the 
 appear together or not at all.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -98,7 +98,8 @@ def build(
     """
     out = path("out", out)
     require_formats(formats)
-    inputs = _require_files(inputs)
+    packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
+    made_by = provenance("fabricate", inputs=_require_files(inputs), packages=packages)  # minutes later they may differ
     profiling.looked_at("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
@@ -120,7 +121,7 @@ def build(
         *_drawings(plan, findings, formats),
         *((name, partial(write_utf8, text=text)) for name, text in by_machine.texts.items()),
     ]
-    document = _document(plan, printed, findings, [name for name, _ in writes], formats, inputs)
+    document = _document(plan, printed, findings, [name for name, _ in writes], formats, made_by)
     writes += [
         (orientation.FILE, partial(write_utf8, text=orientation.orientation_svg(plan))),
         ("laying.md", partial(write_utf8, text=guide.laying_page(document))),
@@ -260,11 +261,10 @@ def _document(
     findings: Sequence[Finding],
     files: Sequence[str],
     formats: Sequence[str],
-    inputs: Sequence[Path],
+    made_by: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The fabrication document: all a lab needs to print, cast, cut and lay."""
     settings = plan.settings
-    packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
     size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
     rim = settings.mould.floor_mm + plan.enlarged.silicone_mm
     pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
@@ -289,5 +289,5 @@ def _document(
             "fibre": settings.fibre.model_dump(),
             **({"dispenser": settings.dispenser.model_dump(mode="json")} if {*LANGUAGES} & {*formats} else {}),
         },
-        "provenance": provenance("fabricate", inputs=inputs, packages=packages),
+        "provenance": dict(made_by),
     }

@@ -150,7 +150,7 @@ def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult
 
     def written(found: "SearchResult") -> None:
         if found.stopped != "interrupted":
-            progress.note("design", made_of)
+            progress.note("design", made_of, ["design.json", "morphology.json"])
 
     return run_search(run.spec, run.out, run.seeds, run=how, written=written)[1]
 

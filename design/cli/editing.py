@@ -2,7 +2,6 @@
 
 import time
 from contextlib import ExitStack
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -71,5 +70,6 @@ def _end(session: Any) -> None:
 def _free(pad: Path | None) -> Path:
     """The first name beside a pad that no file has."""
     folder, stem = pad_folder(pad), "edited" if pad is None else f"{pad.stem}-edited"
-    names = (folder / f"{stem}{f'-{number}' * (number > 1)}.json" for number in count(1))
-    return next(path for path in names if not path.exists())
+    from .editor.session import free_name
+
+    return free_name(folder / f"{stem}.json")

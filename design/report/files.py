@@ -57,10 +57,10 @@ def run_search(
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
     contact = contact_of(spec, settings)
+    made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))  # as they are read
     with progress() as bar:
         run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
         result = search(pad, contact, settings, rules, origin=begin, run=run)
-    made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
     used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     made_by["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}
     document = {

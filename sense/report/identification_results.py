@@ -43,9 +43,9 @@ def identify_into(
     from sense.twin.identification import identify  # here, so that a report that only tells of it does without
 
     refuse_unwritable(out)
+    origin = provenance(COMMAND, seed, inputs or [])  # minutes later they may differ from what was read
     with stage("identify"):
         found = identify(recording, pad, seed, report)
-    origin = provenance(COMMAND, seed, inputs or [])
     twin = found.twin(origin)
     document = identification_document(found, twin) | {"rig_mirrored": recording.mirrored, "provenance": origin}
     with staged(out) as folder, stage("figures"):

@@ -276,3 +276,17 @@ def test_nothing_goes_by_a_document_that_says_nothing(tmp_path, text):
     (tmp_path / "mould.step").write_text("somebody's own")
     build(PAD, tmp_path, [], warn=pytest.fail)
     assert (tmp_path / "mould.step").exists()
+
+
+def test_a_mould_is_of_the_file_that_was_there_as_it_was_begun(tmp_path, monkeypatch):
+    """A search that writes into the folder of the pad meanwhile must not make it one of the new fibres."""
+    pad = tmp_path / "morphology.json"
+    PAD.save(pad)
+    read, inspect = sha256(pad), export.inspect
+
+    def meanwhile(*arguments):
+        Morphology.straight(2).save(pad)
+        return inspect(*arguments)
+
+    monkeypatch.setattr(export, "inspect", meanwhile)
+    assert build(PAD, tmp_path, [], inputs=[pad])["provenance"]["inputs"] == {"morphology.json": read}

@@ -1,6 +1,7 @@
 """A run that goes on where it was broken off, in a time that is given to all of it."""
 
 import json
+import os
 import shutil
 import time
 from pathlib import Path
@@ -206,3 +207,22 @@ def test_a_note_that_is_none_of_padforge_is_named(folder: Path) -> None:
         ended = called("run", "--resume", cwd=folder)
         assert (ended.code, ended.err.count("\n")) == (2, 1)
         assert "run.json: " in ended.err
+
+
+def test_fibres_of_another_search_are_not_kept(folder: Path) -> None:
+    """One that was made in the folder meanwhile, with other settings than the run has."""
+    before = digests(folder)
+    (folder / "other.toml").write_text(SMALL.replace("starts = 1", "starts = 1\nseed = 5"))
+    assert called("design", "--spec", "other.toml", cwd=folder).code == 0
+    assert digests(folder)["morphology.json"] != before["morphology.json"]
+    assert resumed(folder) == "mould, recording, contacts, calibration"
+    assert digests(folder)["morphology.json"] == before["morphology.json"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
+def test_a_pipe_in_place_of_a_result_is_not_waited_for(folder: Path) -> None:
+    (folder / "out" / "pad" / "mould.stl").unlink()
+    os.mkfifo(folder / "out" / "pad" / "mould.stl")
+    ended = called("run", "--resume", "--formats", "svg,stl", cwd=folder)
+    assert (ended.code, ended.err.count("\n")) == (2, 1), ended
+    assert "mould.stl: " in ended.err

@@ -1,8 +1,10 @@
 """One pad being drawn: what a page posts goes in, what it shows comes out, and a morphology is saved."""
 
 import json
+import os
 import secrets
 from collections.abc import Callable, Mapping
+from itertools import count
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -24,7 +26,7 @@ class Session:
     """A pad being drawn; several threads may ask at once.
 
     Attributes:
-        out: the file it is saved to.
+        out: the file it is saved to: the next free name beside it where another one came there after this began.
     """
 
     def __init__(
@@ -35,9 +37,11 @@ class Session:
         Args:
             show: takes what pages show whenever that has changed.
         """
-        self.out = out
+        self.out, self._ours = out, out.exists()
         self._answers, self._source, self._show = answers, source, show
         layout = answers.size.layout
+        self._made_by = provenance("padforge design edit", None, [] if source is None else [source])
+        self._made_by["settings"] = {"pad": answers.size.model_dump(mode="json")}
         begin = straight_courses(layout) if source is None else without_spares(Morphology.load(source).knots, layout)
         self._history = History(tuple(begin))
         self._lock, self._number, self._name = Lock(), 0, secrets.token_hex(8)
@@ -100,10 +104,11 @@ class Session:
         """
         with self._lock:
             courses = self._history.now
-            made_by = provenance("padforge design edit", None, [] if self._source is None else [self._source])
-            made_by["settings"] = {"pad": self._answers.size.model_dump(mode="json")}
+            if not self._ours and self.out.is_file():
+                self.out = free_name(self.out)
             pad = self._answers.morphology(courses)
-            Morphology.of_layout(pad.knots, pad.layout, made_by).save(self.out)
+            Morphology.of_layout(pad.knots, pad.layout, self._made_by).save(self.out)
+            self._ours = True
             self._history.keep(courses)
             self._told = f"saved to {self.out}"
             return self._changed((0, 1))
@@ -159,6 +164,12 @@ class Session:
         layout = self._answers.size.layout
         place_mm = (real(name, asked.get(name), -FARTHEST, FARTHEST) for name in ("x_mm", "y_mm"))
         return [at / layout.unit_mm + extent / 2 for at, extent in zip(place_mm, layout.extent, strict=True)]
+
+
+def free_name(path: Path) -> Path:
+    """The first of NAME.json, NAME-2.json, NAME-3.json, ... that no file has."""
+    names = (path.with_stem(f"{path.stem}{f'-{number}' * (number > 1)}") for number in count(1))
+    return next(each for each in names if not os.path.lexists(each))
 
 
 def _document(body: bytes) -> Mapping[str, Any]:

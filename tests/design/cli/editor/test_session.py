@@ -10,6 +10,7 @@ from design import Contact, InputError, Morphology, PadSettings, RulesSettings, 
 from design.cli.editor.answers import Answers
 from design.cli.editor.session import Session
 from design.cli.main import design
+from design.common.files import sha256
 from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 
 
@@ -151,3 +152,23 @@ def test_a_disk_that_refuses_is_told_and_nothing_is_lost(tmp_path):
     with pytest.raises(InputError, match=r"out.json: cannot be written"):
         begun.save(b"{}")
     assert begun.unsaved
+
+
+def test_what_another_has_saved_meanwhile_stays(tmp_path):
+    """Two that are begun on one pad are to be saved to the same free name."""
+    first, second = (session(tmp_path, grid=1)[0] for _ in range(2))
+    for number, begun in enumerate((first, second, second, first)):
+        move(begun, 1, 1, 0.0, float(number))
+        begun.save(b"{}")
+    assert [begun.out.name for begun in (first, second)] == ["out.json", "out-2.json"]
+    found = [Morphology.load(begun.out) for begun in (first, second)]
+    assert [pad.to_mm(pad.knots[0])[1, 1] for pad in found] == pytest.approx([3.0, 2.0])
+
+
+def test_where_a_pad_came_from_is_the_file_that_was_read(tmp_path):
+    pad = Morphology.random(2, 3, 3)
+    begun, _ = session(tmp_path, pad)
+    read = sha256(tmp_path / "pad.json")
+    Morphology.straight(2).save(tmp_path / "pad.json")
+    begun.save(b"{}")
+    assert Morphology.load(begun.out).provenance["inputs"] == {"pad.json": read}
