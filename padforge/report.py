@@ -1,5 +1,6 @@
 """One page of all that the stages have left in the folder of a pad."""
 
+from functools import cache
 from pathlib import Path
 
 from design.common.errors import Fault, InputError
@@ -10,7 +11,7 @@ def write_report(folder: Path) -> Path:
 
     Raises:
         InputError: no stage has left anything, or a file is damaged.
-        Fault: there are files of another pad among them, which the page tells first.
+        Fault: there are files of another pad or recording among them, which the page tells first.
     """
     from design.common.files import as_written, write_text
     from design.common.page.elements import PageSection, page
@@ -29,7 +30,7 @@ def write_report(folder: Path) -> Path:
         ("fibre-loss", folder / "fibre_loss.json", sensed.fibre_loss_sections),
         ("contacts", folder / "contacts.json", contact_sections),
     )
-    sections, origins, strange = stage_pages(folder, stages)
+    sections, origins, strange = stage_pages(folder, stages, cache(lambda: sensed.recording_digest(folder)))
     studies: list[str] = []
     for path, document in sensed.find_studies(folder):
         with as_written(path):

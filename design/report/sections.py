@@ -86,8 +86,13 @@ Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
 """Its name, the document that it has left, and what a report has to say of that."""
 
 
-def stage_pages(folder: Path, stages: Sequence[Stage]) -> tuple[list[PageSection], list[list[object]], list[str]]:
+def stage_pages(
+    folder: Path, stages: Sequence[Stage], recording: Callable[[], str | None] = lambda: None
+) -> tuple[list[PageSection], list[list[object]], list[str]]:
     """What the documents in `folder` give to a report, as far as they are there.
+
+    Args:
+        recording: gives the digest of the recording there, None where there is none; asked for if a stage is of one.
 
     Returns:
         Parts of the page, rows of their provenance, and what does not belong together, which the first part tells too.
@@ -102,23 +107,28 @@ def stage_pages(folder: Path, stages: Sequence[Stage]) -> tuple[list[PageSection
         if path.exists():
             document = read_json(path, f"padforge-{name}/1")
             with as_written(path):
-                strange += _misfits(folder, name, document)
+                strange += _misfits(folder, name, document, recording)
                 sections += made_of(folder, document)
                 origins.append(provenance_row(folder, name, document))
     return [*([_misfits_section(strange)] if strange else []), *sections], origins, strange
 
 
-def _misfits(folder: Path, stage: str, document: Mapping[str, Any]) -> list[str]:
-    """What of a stage's result in `folder` is of another pad than the morphology.json there.
+def _misfits(
+    folder: Path, stage: str, document: Mapping[str, Any], recording: Callable[[], str | None]
+) -> Iterator[str]:
+    """What of a stage's result in `folder` is of another pad than the morphology.json there, or another recording.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
     """
     made_by = document["provenance"]
-    made_of = made_by.get("inputs", {}).get(PAD) if stage != "design" else document.get("morphology_sha256")
-    if not isinstance(made_of, str) or not (folder / PAD).is_file() or unchanged(folder, {PAD: made_of}):
-        return []
-    return [f"{stage} ({made_by.get('command')}) is of another pad than the {PAD} here"]
+    inputs, told = made_by.get("inputs", {}), f"{stage} ({made_by.get('command')})"
+    made_of = inputs.get(PAD) if stage != "design" else document.get("morphology_sha256")
+    if isinstance(made_of, str) and (folder / PAD).is_file() and not unchanged(folder, {PAD: made_of}):
+        yield f"{told} is of another pad than the {PAD} here"
+    learnt_from = inputs.get("recording")
+    if isinstance(learnt_from, str) and recording() not in (None, learnt_from):
+        yield f"{told} is of another recording than the one here"
 
 
 def _misfits_section(found: Sequence[str]) -> PageSection:

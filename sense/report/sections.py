@@ -13,6 +13,7 @@ from design.common.page.elements import PageSection, beside, figures, folded, he
 from sense.recordings.press_journal import read_journal
 from sense.recordings.processing.limits import MAX_FIBRES
 from sense.recordings.recorder import JOURNAL
+from sense.recordings.recording import Recording
 
 from .loss_chart import Errors, loss_chart
 
@@ -43,6 +44,14 @@ def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSe
         how += f"; presses {deep} mm deep"
     body = [paragraph(f"Readings of {document['fibres']} fibres, from {origin}{how}.")]
     return [PageSection("Recording", [*body, *_measures(folder)])]
+
+
+def recording_digest(folder: Path) -> str | None:
+    """Digest of the recording in `folder`, None where there is none that can be read."""
+    try:
+        return Recording.open(folder / "recording").digest
+    except InputError:
+        return None
 
 
 def _measures(folder: Path) -> list[str]:

@@ -7,6 +7,7 @@ import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 from markupsafe import escape
 
@@ -16,6 +17,8 @@ from design.pad.morphology import Morphology
 from design.report.contact_section import contact_line
 from fabricate import build
 from padforge import write_report
+from sense.recordings.recorder import Recorder
+from sense.recordings.recording import Recording
 from tests.padforge.report.documents import (
     HOSTILE,
     PAD,
@@ -145,6 +148,24 @@ def test_plans_of_another_pad_are_told(pad: Path) -> None:
         written(pad / "design.json", document | {"morphology_sha256": of})
         with pytest.raises(Fault, match=r"design .* is of another pad") if strange else nullcontext():
             write_report(pad)
+
+
+def test_errors_on_another_recording_are_told(pad: Path) -> None:
+    """As a run leaves them that is broken off between recording and calibration, for another pad than before."""
+    shutil.rmtree(pad / "recording")
+    with Recorder(pad / "recording", 1, {"kind": "simulated"}, {}) as recorder:
+        recorder.append(np.arange(4) / 10, np.zeros((4, 1)))
+        recorder.begin((0, 0), 1)
+        recorder.finish(3)
+    document = json.loads((pad / "calibration.json").read_text())
+    for of, strange in ((Recording.open(pad / "recording").digest, False), ("0" * 64, True)):
+        document["provenance"]["inputs"] = {"recording": of}
+        written(pad / "calibration.json", document)
+        with pytest.raises(Fault, match=r"calibration .* is of another recording") if strange else nullcontext():
+            write_report(pad)
+    assert "Does not belong together" in (pad / "report.html").read_text()
+    (pad / "recording" / "readings.bin").unlink()
+    write_report(pad)
 
 
 def test_no_name_in_a_document_leads_out_of_the_folder(pad: Path) -> None:
