@@ -8,6 +8,7 @@ killed, and until then nothing has changed.
 import json
 import os
 import shutil
+import stat
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -79,7 +80,7 @@ def settle(folder: Path) -> None:
         InputError: they cannot be put in place.
     """
     exchange, until = folder / EXCHANGE, time.monotonic() + PATIENCE_S
-    while is_folder(exchange):
+    while is_folder(exchange) and _may_replace(exchange, folder):
         try:
             with writing(folder), held(exchange, f"{folder}: another run is putting files in place; wait for its end"):
                 _put(exchange, folder)
@@ -91,21 +92,35 @@ def settle(folder: Path) -> None:
             time.sleep(0.01)
 
 
+def _may_replace(exchange: Path, folder: Path) -> bool:
+    """Whether whoever has made an exchange may replace files in a folder: in one like /tmp only those of their own."""
+    try:
+        made, about = exchange.lstat(), folder.stat()
+    except FileNotFoundError:  # it is in place
+        return False
+    return not about.st_mode & stat.S_ISVTX or made.st_uid in (os.geteuid(), about.st_uid)
+
+
 def _put(exchange: Path, folder: Path) -> None:
     """Put the files of an exchange in place, and those out of it that go; doing it again does the rest."""
     for name in _gone(exchange):
-        (folder / name).unlink(missing_ok=True)
+        with suppress(ValueError):  # a name that no file can have
+            (folder / name).unlink(missing_ok=True)
     for file in _files(exchange):
         file.replace(folder / file.name)
 
 
 def _gone(exchange: Path) -> list[str]:
     """Names of the files that go; none where these have been noted by nobody, or a power cut has torn the note."""
-    try:
-        names = json.loads((exchange / _GONE).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+    note = exchange / _GONE
+    if note.is_symlink() or not note.is_file():
         return []
-    return [name for name in names if Path(name).name == name not in ("", "..")]
+    try:
+        names = json.loads(note.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError, RecursionError):
+        return []
+    told = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    return [name for name in told if Path(name).name == name not in ("", "..")]
 
 
 def _files(stage: Path) -> list[Path]:
@@ -147,7 +162,7 @@ def _commit(stage: Path, folder: Path) -> None:
         try:
             stage.rename(folder / EXCHANGE)
         except OSError:
-            if not is_folder(folder / EXCHANGE):
+            if not is_folder(folder / EXCHANGE) or not _may_replace(folder / EXCHANGE, folder):
                 raise
 
 

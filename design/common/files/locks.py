@@ -27,7 +27,7 @@ class BusyError(InputError):
 
 
 def lock(file: IO[Any] | int | None, busy: str) -> None:
-    """Keep others off until `file`, or what this descriptor is of, is closed.
+    """Keep others off until `file`, or what this descriptor is of, is closed; on a disk without locks nobody is.
 
     Raises:
         BusyError: saying `busy`, where somebody has locked it.
@@ -40,7 +40,8 @@ def lock(file: IO[Any] | int | None, busy: str) -> None:
         else:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        raise BusyError(busy) from error
+        if fcntl is None or isinstance(error, BlockingIOError):
+            raise BusyError(busy) from error
 
 
 def _lock_far(handle: int) -> None:

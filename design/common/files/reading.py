@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import os
 import platform
 import stat
+import sys
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -71,10 +73,15 @@ def read_json(path: Path, *kinds: str) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file; of a directory, the digest of its files' names and digests in sorted order."""
+    """Hex digest of a file; of a directory, the digest of its files' names and digests in sorted order.
+
+    Raises:
+        InputError: nothing there, or no file, such as a pipe or device that never ends.
+    """
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
-        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        return hashlib.sha256(os.fsencode("\n".join(lines))).hexdigest()
+    require_file(path, sys.maxsize)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

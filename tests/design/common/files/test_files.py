@@ -75,6 +75,8 @@ def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
         read_json(pipe, "x/1")
     with pytest.raises(InputError, match=r"pipe\.json: cannot be written"):
         write_json(pipe, {})
+    with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
+        sha256(pipe)
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
 

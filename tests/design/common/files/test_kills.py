@@ -81,7 +81,10 @@ def test_a_link_is_no_exchange(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "a").read_bytes() == b"another"
 
 
-@pytest.mark.parametrize("note", ["", '["../mine", "", "..", "/", "gone"]'])
+ODD = '["../mine", "", "..", "/", "\\u0000", "\\ud800", 3, null, "gone"]'
+
+
+@pytest.mark.parametrize("note", ["", "3", "[" * 100_000, ODD])
 def test_a_torn_or_odd_note_takes_nothing_out_of_other_folders(tmp_path: Path, note: str) -> None:
     folder = made(tmp_path / "out")
     (tmp_path / "mine").touch()
@@ -92,7 +95,7 @@ def test_a_torn_or_odd_note_takes_nothing_out_of_other_folders(tmp_path: Path, n
     (exchange / ".unfinished-gone").write_text(note)
     assert read_bytes(folder / "a") == b"new"
     assert (folder / "b").read_bytes() == b"old"
-    assert {path.name for path in folder.iterdir()} == {"a", "b", "mine"} | ({"gone"} if not note else set())
+    assert {path.name for path in folder.iterdir()} == {"a", "b", "mine"} | ({"gone"} if note != ODD else set())
     assert {path.name for path in tmp_path.iterdir()} == {"out", "mine"}
 
 
@@ -106,3 +109,31 @@ def test_who_may_not_put_files_in_place_is_told_so(tmp_path: Path) -> None:
         read_bytes(folder / "a")
     folder.chmod(0o755)
     assert read_bytes(folder / "a") == b"new"
+
+
+def test_a_note_that_is_no_file_is_none(tmp_path: Path) -> None:
+    folder = made(tmp_path / "out")
+    for number, make in enumerate((os.mkfifo, lambda note: note.symlink_to("/dev/zero"))):
+        (folder / EXCHANGE).mkdir()
+        (folder / EXCHANGE / "a").write_text(f"new {number}")
+        make(folder / EXCHANGE / ".unfinished-gone")
+        assert read_bytes(folder / "a") == f"new {number}".encode()
+    assert (folder / "gone").exists()
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", int)() != 0, reason="root alone may give files away")
+def test_where_anybody_may_put_files_nobody_replaces_those_of_others(tmp_path: Path) -> None:
+    """As in /tmp: a name there that one reads must not let another user have files deleted by it."""
+    folder = made(tmp_path / "out")
+    folder.chmod(0o1777)
+    exchange = folder / EXCHANGE
+    exchange.mkdir()
+    (exchange / "a").write_bytes(b"another")
+    (exchange / ".unfinished-gone").write_text('["mine"]')
+    os.chown(exchange, 12345, 12345)
+    assert read_bytes(folder / "a") == (folder / "mine").read_bytes() == b"old"
+    with pytest.raises(InputError, match="cannot be written"):
+        renewed(folder)
+    assert (folder / "a").read_bytes() == b"old"
+    folder.chmod(0o775)  # those who share a folder may do so
+    assert read_bytes(folder / "a") == b"another"

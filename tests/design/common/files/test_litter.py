@@ -1,5 +1,6 @@
 """What killed runs leave goes with the next one: by names of exactly their form, where nobody is at work, no links."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -105,3 +106,15 @@ def test_what_is_another_ones_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     clear_litter(tmp_path)
     assert names(tmp_path) == {FILES[0]}
+
+
+def test_on_a_disk_without_locks_work_is_done_and_nothing_cleared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_here(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    (tmp_path / FILES[0]).touch()
+    monkeypatch.setattr("fcntl.flock", none_here)
+    claim(tmp_path)
+    assert names(tmp_path) == {FILES[0], "new.json"}
