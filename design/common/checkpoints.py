@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, shown
-from .files import atomic, clear_litter, read_bytes, read_json, write_json
+from .files import MOST_BYTES, atomic, clear_litter, read_bytes, read_json, write_json
 
 FORMAT = "padforge-search/1"
 
@@ -90,6 +90,8 @@ class Checkpoints:
         content = io.BytesIO(read_bytes(path))
         try:
             with np.load(content, allow_pickle=False) as arrays:
+                if sum(entry.file_size for entry in arrays.zip.infolist()) > MOST_BYTES:
+                    raise ValueError(f"it unpacks to more than {MOST_BYTES} bytes")
                 state = {name: arrays[name] for name in arrays.files}
             if str(state.pop(_SEAL, "")) != self._seal(start, state):
                 raise ValueError("it is not as it was written")

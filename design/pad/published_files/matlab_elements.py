@@ -28,6 +28,8 @@ _STRUCTURE, _OPAQUE = 2, 17
 _CLASSES = {1: "a cell array", _STRUCTURE: "a structure", 3: "an object", 4: "text", 5: "a sparse matrix"}
 """What variables may be that are no full matrices of numbers, which are classes 6 to 15."""
 _COMPLEX = 0x800
+_MOST_SIDES = 32
+"""Of a matrix: the product of very many takes time that grows with their square."""
 _STORED_4, _KINDS_4 = ("f8", "f4", "i4", "i2", "u2", "u1"), ("", "text", "a sparse matrix")
 
 Value = NDArray[Any] | dict[str, Any] | str
@@ -116,8 +118,11 @@ class _Content:
         kind = flags & 0xFF
         if kind == _OPAQUE:
             return _name(parts.next()[1]), "an object"
-        shape = tuple(int(length) for length in parts.numbers())
+        sides = parts.numbers()
         name = _name(parts.next()[1])
+        if len(sides) > _MOST_SIDES:
+            raise ValueError(f"{name} has {len(sides)} dimensions, allowed are {_MOST_SIDES}")
+        shape = tuple(int(length) for length in sides)
         if min(shape, default=-1) < 0:
             raise ValueError(f"{name} has shape {shape}")
         if kind == _STRUCTURE and prod(shape) == 1 and not within:

@@ -1,6 +1,7 @@
 """The states of a search on disk: what goes with them, and what stays."""
 
 import os
+import zipfile
 from itertools import count
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from design.common.checkpoints import Checkpoints
+from design.common.errors import InputError
 from tests.helpers.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
@@ -45,3 +47,18 @@ def test_what_is_no_state_of_a_search_stays(tmp_path: Path) -> None:
     kept.clear()
     names = sorted(path.name for path in (tmp_path / "search").iterdir())
     assert names == [".unfinished-notes.npz", "start_0.npz", "start_0_notes.npz"]
+
+
+def test_a_state_that_unpacks_to_much_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = Checkpoints(tmp_path, {"search": {}})
+    kept.save(0, {"state": np.zeros(10_000)})
+    path = tmp_path / "start_0000.npz"
+    with zipfile.ZipFile(path) as plain:
+        content = {name: plain.read(name) for name in plain.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, each in content.items():
+            packed.writestr(name, each)
+    assert path.stat().st_size < 2000
+    monkeypatch.setattr("design.common.checkpoints.MOST_BYTES", 50_000)
+    with pytest.raises(InputError, match=r"start_0000\.npz: .*unpacks to more than 50000 bytes"):
+        kept.begin(resume=True)

@@ -25,9 +25,10 @@ _UNITS_MM = {
     "pt": 25.4 / 72,
     "pc": 25.4 / 6,
 }
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*([a-zA-Z]*)\s*")
-_TRANSFORM = re.compile(r"\s*,?\s*([a-zA-Z]+)\s*\(([^()]*)\)\s*")
+_NUMBER = re.compile(r"[-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?")
+_LENGTH = re.compile(rf"\s*+({_NUMBER.pattern})\s*+([a-zA-Z]*+)\s*+")
+_TRANSFORM = re.compile(r"\s*+,?\s*+([a-zA-Z]++)\s*+\(([^()]*+)\)\s*+")
+"""A doubled + takes all it can and gives nothing back: a text of a million blanks is read once, not a million times."""
 _UNSEEN = {"defs", "symbol", "clipPath", "mask", "pattern", "marker", "metadata", "style", "title", "desc", "text"}
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _LINK = "{http://www.w3.org/1999/xlink}href"
@@ -199,8 +200,8 @@ def _viewport(element: Any, nested: bool = False) -> Array:
 
 def _transform(element: Any, name: str) -> Array:
     """The matrix of the attribute `transform`."""
-    text, matrix, at = element.get("transform", ""), np.eye(3), 0
-    while at < len(text.rstrip()):
+    text, matrix, at = element.get("transform", "").rstrip(), np.eye(3), 0
+    while at < len(text):
         found = _TRANSFORM.match(text, at)
         if not found:
             raise InputError(f"{name}: transform is {shown(text)}, expected such as translate(1 2)")

@@ -119,6 +119,7 @@ BOMBS = {
         packed(variable(6, (MUCH, MUCH), element(9, bytes(8)))),
         f"voltage claims {MUCH**2} values in 8 bytes of float64",
     ),
+    "dimensions": (packed(variable(6, (MUCH,) * 2**17, element(9, bytes(8)))), "voltage has 131072 dimensions"),
     "a long element": (struct.pack("<II", 14, 2**31), "it ends early"),
     "zeros": (zeros(2**28), "it unpacks to more than 67108864 bytes"),
     "bytes that are numbers": (zeros(2**25), "it holds more than 8388608 values"),

@@ -49,7 +49,10 @@ def _go_through(path: Path, bag: Bag) -> None:
             for number, name, kind, encoding in file.execute("SELECT id, name, type, serialization_format FROM topics")
             if _is(number, int) and _is(name, str) and _is(kind, str) and _is(encoding, str)
         }
-        for number, stamp, message in file.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+        wanted = ", ".join(str(number) for number, topic in topics.items() if topic is not None)
+        # Row by row as they lie: to bring them into an order, or to skip others, SQLite would unpack and keep all.
+        rows = f"SELECT topic_id, timestamp, data FROM messages NOT INDEXED WHERE topic_id IN ({wanted})"
+        for number, stamp, message in file.execute(rows):
             bag.count()
             topic = topics.get(number) if _is(stamp, int) and _is(message, bytes) else None
             if topic is not None:

@@ -141,6 +141,9 @@ def test_ends_are_put_right_within_the_tolerance_and_said(tmp_path: Path) -> Non
         (['<path d="M0 0', "L1 1L2 1" * 101_000, '"/>'], "points"),
         (["<g>" * 5000, "</g>" * 5000], "not an SVG file that can be read"),
         (["<g/>" * 21_000], "elements"),
+        ([f'<rect x="1{" " * 200_000}!"/>'], "x is .* expected a length"),
+        ([f'<g transform="{" " * 200_000}!"/>'], "transform is .* expected such as"),
+        ([f'<g transform="{"scale(1)" * 100_000} "/>'], "no open curve"),
         (['<path d="M0 0L1 1"/>' * 9000], "9000 open curves"),
         (
             [*paths(), *(f'<path d="M{k} 0L{k + 0.5} 1"/>' for k in range(50))],
