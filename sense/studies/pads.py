@@ -47,9 +47,9 @@ def _labelled(parts: list[tuple[str, str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, label, thing in parts:
         # Names of files may hold what no page or table can; matplotlib typesets what is between $ as mathematics, and
-        # leaves labels with a _ in front out of its legends.
+        # leaves labels with a _ in front out of its legends; a spreadsheet works out what begins with = + - or @.
         printable = label.encode("utf-8", "backslashreplace").decode().replace("$", "")
-        label = " ".join(printable.split()).lstrip("_") or "pad"
+        label = " ".join(printable.split()).lstrip("_=+-@ ") or "pad"
         if label in found:
             raise InputError(f"{name}: one called {label} is there already, expected each once")
         found[label] = thing

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import io
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from design.common.checkpoints import Checkpoints, State
 from design.common.computing import one_torch_thread, run_tasks
+from design.common.errors import InputError
 from design.common.files import provenance, write_json, write_text
 
 if TYPE_CHECKING:
@@ -118,9 +120,13 @@ def _alone(out: Path, name: str) -> Iterator[None]:
     from design.common.files import lock
 
     out.mkdir(parents=True, exist_ok=True)
-    path = out / f".{name}.lock"
+    path, busy = out / f".{name}.lock", f"{out}: a {name} study is at work there; wait for it or choose another --out"
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+        raise InputError(f"{path}: is no file, expected one or nothing; remove it, or choose another --out")
     with path.open("a") as file:
-        lock(file, f"{out}: a {name} study is at work there; wait for it or choose another --out")
+        lock(file, busy)
+        if not (path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())):
+            raise InputError(busy)  # who had it came to the end meanwhile, and took it away
         try:
             yield
         finally:

@@ -42,3 +42,9 @@ def test_what_is_said_of_a_square_pad_has_its_grid_and_of_another_one_its_fibres
     told = described({"square": Morphology.straight(2), "wide": Morphology.straight((1, 3), (8.0, 15.0))})
     assert (told["square"]["grid"], told["square"]["pitch_mm"]) == (2, 11.25)
     assert (told["wide"]["fibres"], told["wide"]["pitch_mm"]) == ([1, 3], (8.0, 15.0))
+
+
+def test_no_label_is_a_formula_of_a_spreadsheet(tmp_path: Path) -> None:
+    for name in ("=1+1", "@mine", "-_+x"):
+        Morphology.straight(2).save(tmp_path / f"{name}.json")
+    assert list(load_pads([str(path) for path in sorted(tmp_path.iterdir())], seed=0)) == ["x", "1+1", "mine"]

@@ -1,5 +1,6 @@
 """What every study shares: one at a time in a folder, all results or none."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -64,3 +65,25 @@ def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> No
     with pytest.raises(ZeroDivisionError):
         run(Study("x", "X", {}, [], lambda states: Findings([{"a": 1}], []), draw), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
+def test_a_lock_that_is_no_file_is_neither_waited_for_nor_followed(tmp_path: Path) -> None:
+    study = Study("x", "X", {}, [], lambda states: Findings([{"a": 1}], []), lambda _: Figure())
+    (tmp_path / "mine").touch()
+    for make in (os.mkfifo, lambda lock: lock.symlink_to(tmp_path / "mine")):
+        make(tmp_path / ".x.lock")
+        with pytest.raises(InputError, match=r"\.x\.lock: is no file"):
+            run(study, tmp_path)
+        (tmp_path / ".x.lock").unlink()
+
+
+def test_a_lock_that_has_gone_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who had it may come to the end between the opening of its file and the lock on that."""
+
+    def late(file: object, busy: str) -> None:
+        (tmp_path / ".x.lock").unlink()
+
+    monkeypatch.setattr("design.common.files.lock", late)
+    with pytest.raises(InputError, match="a x study is at work there"), _alone(tmp_path, "x"):
+        pass
