@@ -121,6 +121,7 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
         about=about,
         fibres=localizer.fibres,
         rate=f"{localizer.rate_hz:.4g}",
+        rate_hz=_literal(f"{localizer.rate_hz:.4g}"),
         flash=budget.flash,
         code=CODE,
         ram=budget.ram,
@@ -193,5 +194,9 @@ def _table(name: str, values: Array | Floats) -> dict[str, Any]:
 
 def _float(value: float) -> str:
     """A number as C reads it back to the same float."""
-    text = f"{np.float32(value):.9g}"
-    return f"{text}f" if set(".e") & set(text) else f"{text}.0f"
+    return _literal(f"{np.float32(value):.9g}")
+
+
+def _literal(number: str) -> str:
+    """A number in digits as a float of C, which 13f is not."""
+    return f"{number}f" if set(".e") & set(number) else f"{number}.0f"

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,12 @@ def test_depth_and_force_come_with_the_place_where_they_were_learnt(deeply, prog
     measures = [column for each in found.measures.values() for column in (each.values, each.r90)]
     assert np.hypot(*(told.places[:, 2:4] - found.places_mm).T).max() < OFF_MM
     np.testing.assert_allclose(told.places[:, 7:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
+
+
+def test_a_rate_of_whole_readings_is_a_number_of_c(taught) -> None:
+    for rate, told in ((13.0, "13.0f"), (13.333, "13.33f"), (20_000.0, "2e+04f")):
+        student = replace(taught, localizer=replace(taught.localizer, rate_hz=rate))
+        assert f"#define LOCALIZER_RATE_HZ {told}\n" in c_header(student, BUDGET, [])
 
 
 def test_columns_are_as_wide_as_what_heads_them(taught) -> None:
