@@ -164,5 +164,10 @@ def _require_words(words: list[str]) -> None:
 
 def _fail(name: str, message: str, code: int) -> int:
     with suppress(OSError):  # of a disk that is full: the exit code says the same
-        print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
+        print(f"{name}: {_plain(' '.join(message.split()))}", file=sys.stderr)
     return code
+
+
+def _plain(text: str) -> str:
+    """A text whose control characters are written out: what a file has them for is to order terminals about."""
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)

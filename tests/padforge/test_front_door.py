@@ -125,6 +125,13 @@ def test_mistakes_end_in_one_line_and_exit_2(tmp_path, arguments):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_error_gives_no_orders_to_a_terminal(tmp_path):
+    (tmp_path / "pad.toml").write_text('[pad]\n"\\u001b]0;title\\u0007\\u009b2J\\u202eä" = 1\n')
+    result = called("run", cwd=tmp_path)
+    assert result.code == 2
+    assert r"[pad] \x1b]0;title\x07\x9b2J\u202eä: no such key" in result.err
+
+
 def test_the_readme_names_files_that_are_there():
     root = Path(__file__).parents[2]
     text = (root / "README.md").read_text()
