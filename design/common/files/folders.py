@@ -5,12 +5,13 @@ they become the valid ones: from then on they are put in place, by the next that
 killed, and until then nothing has changed.
 """
 
+import errno
 import json
 import os
 import shutil
 import stat
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -135,17 +136,11 @@ def _exchange(stage: Path, folder: Path, without: Collection[str]) -> None:
     for path in (folder / name for name in names):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'no file'}, expected a file or nothing")
-    kept = stage / _KEPT
-    kept.mkdir()
-    for name in filter(lambda name: os.path.lexists(folder / name), (*names, *without)):
-        try:
-            (kept / name).hardlink_to(folder / name)
-        except OSError:  # a disk without such
-            shutil.copy2(folder / name, kept / name, follow_symlinks=False)
     (stage / _GONE).write_text(json.dumps(without), encoding="utf-8")
     exchange = folder / EXCHANGE
     try:
         _commit(stage, folder)
+        _keep(exchange / _KEPT, folder, (*names, *without))  # now that nobody else replaces them
         _put(exchange, folder)
         exchange.rename(stage)
     except BaseException:
@@ -161,9 +156,21 @@ def _commit(stage: Path, folder: Path) -> None:
         settle(folder)
         try:
             stage.rename(folder / EXCHANGE)
-        except OSError:
-            if not is_folder(folder / EXCHANGE) or not _may_replace(folder / EXCHANGE, folder):
+        except OSError as error:
+            gone = error.errno in (errno.ENOTEMPTY, errno.EEXIST) and not os.path.lexists(folder / EXCHANGE)
+            if not gone and not (is_folder(folder / EXCHANGE) and _may_replace(folder / EXCHANGE, folder)):
                 raise
+
+
+def _keep(kept: Path, folder: Path, names: Iterable[str]) -> None:
+    """Keep what lies in a folder by some names."""
+    kept.mkdir()
+    for name in filter(lambda name: os.path.lexists(folder / name), names):
+        with suppress(FileNotFoundError):  # somebody has taken it away
+            try:
+                (kept / name).hardlink_to(folder / name)
+            except OSError:  # a disk without such
+                shutil.copy2(folder / name, kept / name, follow_symlinks=False)
 
 
 def _put_back(stage: Path, folder: Path, names: Collection[str]) -> None:
@@ -172,5 +179,5 @@ def _put_back(stage: Path, folder: Path, names: Collection[str]) -> None:
     for name in names:
         if not (stage / name).exists() and not os.path.lexists(kept / name):
             (folder / name).unlink(missing_ok=True)
-    for file in list(kept.iterdir()):
+    for file in list(kept.iterdir()) if kept.exists() else ():
         file.replace(folder / file.name)

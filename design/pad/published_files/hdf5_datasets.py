@@ -19,6 +19,8 @@ MOST_FILE_BYTES = 2**33
 """Size of the largest file that is looked at."""
 MOST_OBJECTS = 10_000
 """Most groups and datasets of a file."""
+MOST_DEPTH = 64
+"""Groups within groups: each is looked up by its whole path."""
 FREE_BYTES, PACKED = 2**26, 64
 """What a dataset may always take, bytes; beyond, it takes at most so many bytes for each that it has of the file."""
 
@@ -39,7 +41,7 @@ class Datasets:
         """All datasets that no link leads to, in the order of their names.
 
         Raises:
-            InputError: there are more than MOST_OBJECTS things in the file.
+            InputError: there are more than MOST_OBJECTS things in the file, or groups in more than MOST_DEPTH others.
         """
         import h5py
 
@@ -49,6 +51,8 @@ class Datasets:
             def visit(name: str, each: Any) -> bool | None:
                 nonlocal seen
                 seen += 1
+                if name.count("/") >= MOST_DEPTH:
+                    raise InputError(f"it has groups within groups, more than {MOST_DEPTH} of them")
                 if isinstance(each, h5py.Dataset):
                     found.append(name)
                 return True if seen > MOST_OBJECTS else None

@@ -1,5 +1,6 @@
 """Atomic writing, self-describing JSON, and folders for results: one run at a time, nothing left of one that failed."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from design.common.files import (
     unchanged,
     write_json,
 )
+from design.common.files.folders import EXCHANGE
 
 CLAIM = "import sys\nfrom pathlib import Path\nfrom design.common.files import claimed\n"
 ANOTHER = CLAIM + "try:\n  with claimed(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
@@ -174,10 +176,10 @@ def test_a_folder_in_the_way_of_a_staged_file_moves_none(tmp_path):
     assert [(tmp_path / name).read_text() for name in ("one", "two")] == ["new", "new"]
 
 
-def replaced(folder, *names, without=()):
+def replaced(folder, *names, without=(), text="new"):
     with staged(folder, without) as stage:
         for name in names:
-            (stage / name).write_text("new")
+            (stage / name).write_text(text)
 
 
 def test_files_go_as_others_come(tmp_path):
@@ -205,6 +207,36 @@ def test_what_was_there_is_put_back_where_not_all_can_be_moved(tmp_path, monkeyp
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError):
         replaced(tmp_path, "a", "b", "c", "d", without=["mine"])
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(("b", "d", "mine"), "old")
+
+
+def test_what_another_run_does_meanwhile_is_no_fault_and_is_put_back(tmp_path, monkeypatch):
+    """It takes a file away that is to be kept, and comes to its end as this run looks whether it has."""
+    link, rename, replace = Path.hardlink_to, Path.rename, Path.replace
+    busy = iter([OSError(errno.ENOTEMPTY, "Directory not empty")])
+
+    def taken_away(self, target):
+        if target.name == "gone":
+            target.unlink()
+        link(self, target)
+
+    def late(self, target):
+        if target.name == EXCHANGE and (error := next(busy, None)):
+            replaced(tmp_path, "b", "e", text="another's")
+            raise error
+        return rename(self, target)
+
+    def full(self, target):
+        if self.name == "b" and self.read_text() == "new":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return replace(self, target)
+
+    for name in ("b", "gone"):
+        (tmp_path / name).write_text("old")
+    for name, stand_in in (("hardlink_to", taken_away), ("rename", late), ("replace", full)):
+        monkeypatch.setattr(Path, name, stand_in)
+    with pytest.raises(InputError, match="No space left"):
+        replaced(tmp_path, "a", "b", without=["gone"])
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"b": "another's", "e": "another's"}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="nobody else can tell that a run is no more")

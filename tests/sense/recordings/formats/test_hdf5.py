@@ -1,4 +1,5 @@
 import os
+import time
 from dataclasses import replace
 
 import h5py
@@ -220,3 +221,15 @@ def test_depth_and_force_are_kept_where_they_are_known(recording, tmp_path):
         assert import_hdf5(tmp_path / "r.h5") == each
         with h5py.File(tmp_path / "r.h5") as file:
             assert set(file) & MEASURES == names
+
+
+def test_groups_within_groups_do_not_take_minutes(tmp_path):
+    path = tmp_path / "deep.h5"
+    with h5py.File(path, "w", libver="latest") as file:
+        group = file
+        for _ in range(3000):
+            group = group.create_group("g")
+    begin = time.process_time()
+    with pytest.raises(InputError, match=r"deep\.h5: it has groups within groups, more than 64"):
+        import_hdf5(path, "time=t,fibres=a")
+    assert time.process_time() - begin < 1
