@@ -81,7 +81,7 @@ def settle(folder: Path) -> None:
         InputError: they cannot be put in place.
     """
     exchange, until = folder / EXCHANGE, time.monotonic() + PATIENCE_S
-    while is_folder(exchange) and _may_replace(exchange, folder):
+    while is_folder(exchange) and not _is_strange(exchange, folder):
         try:
             with writing(folder), held(exchange, f"{folder}: another run is putting files in place; wait for its end"):
                 _put(exchange, folder)
@@ -93,13 +93,15 @@ def settle(folder: Path) -> None:
             time.sleep(0.01)
 
 
-def _may_replace(exchange: Path, folder: Path) -> bool:
-    """Whether whoever has made an exchange may replace files in a folder: in one like /tmp only those of their own."""
+def _is_strange(exchange: Path, folder: Path) -> bool:
+    """Whether what lies there is no folder, or of one who may not replace files of others, as in /tmp nobody may."""
     try:
         made, about = exchange.lstat(), folder.stat()
-    except FileNotFoundError:  # it is in place
+    except FileNotFoundError:  # all is in place
         return False
-    return not about.st_mode & stat.S_ISVTX or made.st_uid in (os.geteuid(), about.st_uid)
+    if not stat.S_ISDIR(made.st_mode):
+        return True
+    return bool(about.st_mode & stat.S_ISVTX) and made.st_uid not in (os.geteuid(), about.st_uid)
 
 
 def _put(exchange: Path, folder: Path) -> None:
@@ -134,8 +136,10 @@ def _exchange(stage: Path, folder: Path, without: Collection[str]) -> None:
     names = [file.name for file in _files(stage)]
     without = sorted({*without} - {*names})
     for path in (folder / name for name in names):
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'no file'}, expected a file or nothing")
+        with suppress(OSError):  # there is nothing, or what a link leads to is gone
+            if not stat.S_ISREG(mode := path.stat().st_mode):
+                kind = "a folder" if stat.S_ISDIR(mode) else "no file"
+                raise InputError(f"{path}: is {kind}, expected a file or nothing")
     (stage / _GONE).write_text(json.dumps(without), encoding="utf-8")
     exchange = folder / EXCHANGE
     try:
@@ -157,8 +161,8 @@ def _commit(stage: Path, folder: Path) -> None:
         try:
             stage.rename(folder / EXCHANGE)
         except OSError as error:
-            gone = error.errno in (errno.ENOTEMPTY, errno.EEXIST) and not os.path.lexists(folder / EXCHANGE)
-            if not gone and not (is_folder(folder / EXCHANGE) and _may_replace(folder / EXCHANGE, folder)):
+            busy = error.errno in (errno.ENOTEMPTY, errno.EEXIST) or is_folder(folder / EXCHANGE)
+            if not busy or _is_strange(folder / EXCHANGE, folder):
                 raise
 
 
