@@ -27,6 +27,8 @@ MOST_LOOKS = 1e3
 MOST_CHANNELS = 1024
 LONGEST = 0.02
 """Longest element by which a laid fibre is summed, grid units."""
+MOST_ELEMENTS = 2**23
+"""Of all fibres: 256 + 256 of them, as many as a recording may have, are 6.6 million."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,9 @@ class Twin:
         laid = tuple(None if line is None else reals("laid_mm", line, MOST_MM) for line in self.laid_mm)
         if len(laid) != fibres or any(line is not None and line.shape[1:] != (2,) for line in laid):
             raise InputError(f"laid_mm must have a row of points or null for each of the {fibres} fibres")
+        length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in laid if line is not None)
+        if length > (most := MOST_ELEMENTS * LONGEST * self.morphology.unit_mm):
+            raise InputError(f"laid_mm are {length:.3g} mm long in all, allowed are {most:.3g}")
         object.__setattr__(self, "laid_mm", laid)
         if self.sensitivity is not None:
             found = tuple(None if row is None else reals("sensitivity", row, MOST_MM) for row in self.sensitivity)

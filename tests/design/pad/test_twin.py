@@ -133,3 +133,13 @@ def test_readings_that_cannot_be_are_one_line(twin, tmp_path, name, value):
     path.write_text(json.dumps(document))
     with pytest.raises(InputError, match=rf"^{path}: .*{name}"):
         Twin.load(path)
+
+
+def test_courses_that_are_far_longer_than_a_pad_are_refused(twin, tmp_path):
+    """A file of some kilobytes would take gigabytes, and an hour for a few presses."""
+    twin.save(tmp_path / "twin.json")
+    document = json.loads((tmp_path / "twin.json").read_text())
+    document["laid_mm"][0] = [[-9e3, -9e3], [9e3, 9e3]] * 40
+    (tmp_path / "twin.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"twin\.json: laid_mm are 2.*e\+06 mm long in all, allowed are 1\.89e\+06"):
+        Twin.load(tmp_path / "twin.json")
