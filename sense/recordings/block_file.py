@@ -158,11 +158,15 @@ def _sound(blocks: NDArray[np.void]) -> Mask:
 
 def _begins_with_block(content: bytes) -> bool:
     """Whether an intact block comes first, of any number of fibres."""
-    return content.startswith(_MAGIC) and any(
-        _checksums(np.frombuffer(content, dtype, count=1))[0] == np.frombuffer(content, dtype, count=1)["crc"][0]
-        for dtype in {block_dtype(fibres).itemsize: block_dtype(fibres) for fibres in range(1, MAX_FIBRES + 1)}.values()
-        if len(content) >= dtype.itemsize
-    )
+    if not content.startswith(_MAGIC):
+        return False
+    for dtype in map(block_dtype, range(1, MAX_FIBRES + 1)):
+        if len(content) < dtype.itemsize:
+            return False
+        block = np.frombuffer(content, dtype, count=1)
+        if block["crc"][0] == _checksums(block)[0]:
+            return True
+    return False
 
 
 def _holds_block(content: bytes, dtype: np.dtype[np.void]) -> bool:

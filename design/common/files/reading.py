@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import platform
 import stat
 import sys
@@ -80,7 +79,7 @@ def sha256(path: Path) -> str:
     """
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
-        return hashlib.sha256(os.fsencode("\n".join(lines))).hexdigest()
+        return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
     require_file(path, sys.maxsize)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

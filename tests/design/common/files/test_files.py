@@ -67,6 +67,9 @@ def test_a_folder_has_a_digest_that_follows_its_content(tmp_path):
     assert sha256(tmp_path) == before
     (tmp_path / "a").rename(tmp_path / "b")
     assert sha256(tmp_path) != before
+    if sys.platform == "linux":
+        (tmp_path / os.fsdecode(b"\xff")).touch()
+        assert len(sha256(tmp_path)) == 64
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
