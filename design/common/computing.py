@@ -12,7 +12,7 @@ from hashlib import sha256
 from itertools import islice, pairwise
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -70,7 +70,13 @@ def run_tasks(
 
 
 class DaemonThreads(Executor):
-    """A thread for whatever is submitted, which does not hold up the end of the program."""
+    """A thread for whatever is submitted, which does not hold up the end of the program.
+
+    Attributes:
+        at_work: the threads of all that have not come to their end.
+    """
+
+    at_work: ClassVar[set[Thread]] = set()
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         """Begin at once."""
@@ -83,9 +89,13 @@ class DaemonThreads(Executor):
                 future.set_exception(error)
             else:
                 future.set_result(result)
+            finally:
+                self.at_work.discard(thread)
 
         future.set_running_or_notify_cancel()
-        Thread(target=run, daemon=True).start()
+        thread = Thread(target=run, daemon=True)
+        self.at_work.add(thread)
+        thread.start()
         return future
 
 
