@@ -6,7 +6,7 @@ compiled code is shared.
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from itertools import islice, pairwise
@@ -16,7 +16,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from .errors import InputError
+from .errors import Fault, InputError
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
@@ -105,12 +105,14 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers there.
+        Fault: in the body, once its scheduler is gone, or a task has ended one worker after another.
     """
     if address is None:
         yield None
         return
     try:
         from distributed import Client
+        from distributed.scheduler import KilledWorker
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'padforge[cluster]'") from error
     try:
@@ -118,7 +120,12 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler is {address}: no Dask scheduler answers there ({error})") from error
     with client, client.get_executor(pure=False, retries=10) as there:
-        yield there
+        try:
+            yield there
+        except (CancelledError, KilledWorker) as error:
+            what = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
+            advice = "what was finished is kept: see why, and go on with --resume"
+            raise Fault(f"the cluster at {address} {what}; {advice}") from error
 
 
 def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:
