@@ -27,7 +27,7 @@ class RigFault(Fault):
 
     def __init__(self, cause: Cause, message: str, advice: str = "") -> None:
         super().__init__(f"{message}; {advice}" if advice else message)
-        self.cause = cause
+        self.cause: Cause = cause
         self.exit_code = 2 if cause == "refused" else 1
 
 
