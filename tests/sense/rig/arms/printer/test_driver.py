@@ -176,6 +176,8 @@ def test_other_firmware_and_silent_ports_are_refused(monkeypatch):
     monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:RepRapFirmware FIRMWARE_VERSION:3.4")
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         fault_of(arm.connect, "refused", "'RepRapFirmware', allowed is Marlin")
+        monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:Marlin 1.1.9 (Github) PROTOCOL_VERSION:1.0")
+        fault_of(arm.connect, "refused", "only once it stands; allowed is Marlin 2")
         monkeypatch.setattr(module, "CONNECT_S", 0.2)
         printer.busy(60)
         fault_of(arm.connect, "refused", "no printer answers; check .* printer_baud")
