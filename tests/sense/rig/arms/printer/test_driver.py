@@ -140,6 +140,8 @@ def test_a_stop_that_is_not_confirmed_halts_the_printer():
         begun = time.monotonic()
         with pytest.raises(RigFault, match="did not confirm the stop, and was told to halt"):
             arm.stop()
+        with pytest.raises(RigFault, match="told to halt; see that it stands"):  # whoever looks next is told why
+            arm.state()
         time.sleep(0.05)
         assert printer.firmware.halted
         assert printer.nozzle_at(begun + 0.6)[0] == pytest.approx(printer.nozzle_at(begun + 5)[0])
