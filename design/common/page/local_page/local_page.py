@@ -196,8 +196,10 @@ class _Handler(BaseHTTPRequestHandler):
         elif length > self.server.longest:
             self.rfile.read(min(length, _SWALLOWED))  # who is still sending does not listen
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        elif len(body := self.rfile.read(length)) < length:
+            self.send_error(HTTPStatus.BAD_REQUEST)  # a half of what was meant is something else
         else:
-            self._answer(hear, self.rfile.read(length))
+            self._answer(hear, body)
 
     def _answer(self, hear: Hear, body: bytes) -> None:
         try:

@@ -108,6 +108,14 @@ def test_an_address_that_is_none_is_refused_in_silence(page: LocalPage, capfd: p
     assert capfd.readouterr().err == ""
 
 
+def test_half_of_what_was_posted_is_not_heard(page: LocalPage) -> None:
+    asked = f"POST /double HTTP/1.0\r\nHost: {HOST}:{port_of(page)}\r\nOrigin: http://{HOST}:{port_of(page)}\r\n"
+    with socket.create_connection((HOST, port_of(page)), timeout=10) as browser:
+        browser.sendall(f"{asked}Content-Length: 2\r\n\r\n4".encode())
+        browser.shutdown(socket.SHUT_WR)
+        assert browser.recv(100).split()[1] == b"400"
+
+
 def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are shown out however slowly they go on to ask; who was let in is not."""
     monkeypatch.setattr(listening, "ADMIT_S", 1.0)
