@@ -89,8 +89,11 @@ Place = Annotated[tuple[Coordinate, Coordinate], BeforeValidator(as_tuple)]
 Box = Annotated[
     tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(as_tuple)
 ]
+Metres = Annotated[float, Field(ge=-10, le=10)]
+"""No arm reaches farther: what is beyond was meant to be mm."""
+Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Pose = Annotated[
-    tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate] | None,
+    tuple[Metres, Metres, Metres, Angle, Angle, Angle] | None,
     BeforeValidator(as_tuple),
     *none_as("unknown"),
 ]

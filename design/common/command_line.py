@@ -1,5 +1,6 @@
 """What every stage's command line shares: the settings file, progress on stderr, results on stdout."""
 
+import atexit
 import functools
 import json
 import os
@@ -111,18 +112,40 @@ INTERRUPTED = 130
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     """Run a command line on the arguments of this process; its exit code, with one line on stderr where it failed.
 
+    The process is to end with that code, and does so at once where tasks are left at work by then.
+
     Args:
         extras: what has to be installed for its commands, by the first word of each; for others it is all of these.
     """
     _prepare()
+    code = _run(command, name, extras)
+    atexit.register(_leave_tasks, code)
+    return code
+
+
+def _leave_tasks(code: int) -> None:
+    """End this process if tasks are at work: they can neither be told to stop nor be waited for.
+
+    Where the interpreter ends under them, those in torch crash it.
+    """
+    computing = sys.modules.get(f"{__package__}.computing")
+    if computing is not None and computing.DaemonThreads.at_work:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
+
+
+def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
         _require_words(sys.argv[1:])
         return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         return 2
-    except (click.exceptions.Abort, KeyboardInterrupt):
-        return _fail(name, "interrupted; what was finished is kept", INTERRUPTED)
+    except (click.exceptions.Abort, KeyboardInterrupt) as error:
+        told = str(error if isinstance(error, KeyboardInterrupt) else error.__cause__ or "")
+        return _fail(name, f"interrupted; {told or 'what was finished is kept'}", INTERRUPTED)
     except click.ClickException as error:
         return _fail(name, error.format_message(), 2)
     except InputError as error:

@@ -6,17 +6,17 @@ compiled code is shared.
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from itertools import islice, pairwise
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from .errors import InputError
+from .errors import Fault, InputError
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
@@ -70,7 +70,13 @@ def run_tasks(
 
 
 class DaemonThreads(Executor):
-    """A thread for whatever is submitted, which does not hold up the end of the program."""
+    """A thread for whatever is submitted, which does not hold up the end of the program.
+
+    Attributes:
+        at_work: the threads of all that have not come to their end.
+    """
+
+    at_work: ClassVar[set[Thread]] = set()
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         """Begin at once."""
@@ -83,9 +89,13 @@ class DaemonThreads(Executor):
                 future.set_exception(error)
             else:
                 future.set_result(result)
+            finally:
+                self.at_work.discard(thread)
 
         future.set_running_or_notify_cancel()
-        Thread(target=run, daemon=True).start()
+        thread = Thread(target=run, daemon=True)
+        self.at_work.add(thread)
+        thread.start()
         return future
 
 
@@ -95,12 +105,14 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers there.
+        Fault: in the body, once its scheduler is gone, or a task has ended one worker after another.
     """
     if address is None:
         yield None
         return
     try:
         from distributed import Client
+        from distributed.scheduler import KilledWorker
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'padforge[cluster]'") from error
     try:
@@ -108,7 +120,12 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler is {address}: no Dask scheduler answers there ({error})") from error
     with client, client.get_executor(pure=False, retries=10) as there:
-        yield there
+        try:
+            yield there
+        except (CancelledError, KilledWorker) as error:
+            what = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
+            advice = "what was finished is kept: see why, and go on with --resume"
+            raise Fault(f"the cluster at {address} {what}; {advice}") from error
 
 
 def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:

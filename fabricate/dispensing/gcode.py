@@ -1,4 +1,7 @@
-"""The work as G-code that Marlin and GRBL both read: G0 and G1 in mm and mm/min, M0 to wait, nothing else."""
+"""The work as G-code that Marlin and GRBL both read: G1 in mm and mm/min, M0 to wait, nothing else.
+
+G0 is left out: GRBL goes it as fast as the machine can, whatever speed is said, and hands are near.
+"""
 
 from collections.abc import Iterable, Iterator
 
@@ -13,7 +16,7 @@ _DIGITS = 3
 def gcode(work: Iterable[Instruction], summary: Iterable[str], dispenser: DispenserSettings) -> str:
     """The program: axes as the machine counts them, with the pad's middle at the dispenser's origin.
 
-    Ways on which a fibre is laid are G1, others G0. M0 waits until all ways are gone, then for the person.
+    M0 waits until all ways are gone, then for the person.
     """
     x, y = dispenser.origin_mm
     head = [
@@ -22,7 +25,7 @@ def gcode(work: Iterable[Instruction], summary: Iterable[str], dispenser: Dispen
         "G21",
         "G90",
         "M0 (needle over the pad, zero of z is set)",
-        f"G0 Z{_number(dispenser.travel_height_mm)} F{_per_minute(dispenser.travel_mm_s)}",
+        f"G1 Z{_number(dispenser.travel_height_mm)} F{_per_minute(dispenser.travel_mm_s)}",
     ]
     return "\n".join([*head, *_body(work, dispenser), ""])
 
@@ -37,7 +40,7 @@ def _body(work: Iterable[Instruction], dispenser: DispenserSettings) -> Iterator
             words = _words(place, speed, dispenser)
             changed = [letter + word for letter, word in words.items() if last.get(letter) != word]
             if any(word[0] != "F" for word in changed):  # else it stands there already
-                yield " ".join(["G1" if isinstance(told, Lay) else "G0", *changed])
+                yield " ".join(["G1", *changed])
                 last = words
 
 

@@ -147,23 +147,24 @@ def record(
         RigFault: the rig failed, or the plan is not safe.
     """
     inputs = setup.rig.inputs(len(setup.pad.knots))
-    with Interrupts() as interrupts, opened_rig(kind, setup, inputs, through_drivers) as (arm, converter, rig):
-        plan = plan_of(setup, rig, resume)
-        steer = _steering(setup, rig, model)
-        require_safe_plan(plan, rig)
-        if resume and (told := kept_plan(setup)):
-            say(told)
-        if not (resume or dry):
-            refuse_begun(setup.out)
-        devices = {"board": converter.connect(), "arm": arm.connect()}
-        require_tool(rig.tcp_mm, devices["arm"])
-        require_ready(arm.state(), Limits.of(rig))  # before there is a folder that would be in the way
+    with opened_rig(kind, setup, inputs, through_drivers) as (arm, converter, rig):
+        with Interrupts() as interrupts:
+            plan = plan_of(setup, rig, resume)
+            steer = _steering(setup, rig, model)
+            require_safe_plan(plan, rig)
+            if resume and (told := kept_plan(setup)):
+                say(told)
+            if not (resume or dry):
+                refuse_begun(setup.out)
+            devices = {"board": converter.connect(), "arm": arm.connect()}
+            require_tool(rig.tcp_mm, devices["arm"])
+            require_ready(arm.state(), Limits.of(rig))  # before there is a folder that would be in the way
+            interrupts.check()
         if rig.max_force_n is None:
             say('[rig] max_force_n is "unwatched": no force stops the arm')
         with scratch(Path(tempfile.gettempdir()), _DRY) if dry else nullcontext(setup.out) as folder:
             with recorder_of(setup, rig, plan, folder, resume, devices) as recorder:
                 report(len(recorder.done), len(plan))
-                interrupts.check()
                 Session(arm, converter, recorder, rig, dry=dry).run(plan, report, steer)
             return None if dry else Recording.open(folder)
 

@@ -32,8 +32,8 @@ class Limits:
             and then no target is safe. max_depth_mm: below it. max_speed_mm_s, max_acceleration_mm_s2: of the tip.
         tool: rotation vector of the tool as it should be held. max_tilt_deg: between its axis and a target's.
         max_turn_deg: about its axis, from how the arm holds it before the first move.
-        max_force_n: on the tool, either way; None where nobody watches it. max_state_age_s: of the latest state.
-        deadline_s: longest duration of a move.
+        max_force_n: on the tool, whatever its direction; None where nobody watches it.
+        max_state_age_s: of the latest state. deadline_s: longest duration of a move.
     """
 
     box_mm: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -185,8 +185,8 @@ def watch(state: ArmState, limits: Limits, now_s: float, until_s: float = math.i
         raise RigFault("protective_stop", "the arm is in a protective stop", look)
     if not (age := now_s - state.time_s) <= limits.max_state_age_s:
         raise RigFault("stale", f"the arm's last state is {age:.2f} s old; allowed {limits.max_state_age_s:g} s")
-    force_n, most_n = state.force_n, limits.max_force_n
-    if force_n is not None and most_n is not None and not abs(force_n) <= most_n:
+    force_n, most_n = state.pushed_n, limits.max_force_n
+    if force_n is not None and most_n is not None and not force_n <= most_n:
         raise RigFault("force", f"the force is {force_n:.1f} N; allowed {most_n:g} N")
     depth = -math.inf if limits.contact_mm is None else limits.contact_mm - state.pose[2]
     if not depth <= limits.max_depth_mm + DEPTH_SLACK_MM:

@@ -27,6 +27,7 @@ def test_defaults_come_back_from_their_own_file(tmp_path):
         ({"dispenser": {"box_mm": [0.0, 9.0, 5.0, 5.0, 0.0, 9.0]}}, ("[dispenser] box_mm", "5.0", "from low to high")),
         ({"dispenser": {"arm_pose": [0.0, 1.0]}}, ("[dispenser] arm_pose", "1.0")),
         ({"dispenser": {"arm_pose": "known"}}, ("[dispenser] arm_pose", "'known'")),
+        ({"dispenser": {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}}, ("[dispenser] arm_pose", "400.0", "10")),
         ({"printer": {"layer_mm": 0.0}}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
     ],
 )

@@ -2,6 +2,7 @@
 
 import hmac
 import queue
+import socket
 import socketserver
 import threading
 from collections.abc import Iterable, Mapping
@@ -9,7 +10,7 @@ from contextlib import suppress
 from typing import Any, Protocol, Self
 
 from design.common.errors import InputError
-from design.common.page.local_page.listening import POLL_S, listening, refuse_open
+from design.common.page.local_page.listening import END_S, POLL_S, ConnectionServer, listening, refuse_open
 from sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
 from .messages import Message
@@ -17,8 +18,8 @@ from .messages import Message
 MOST_BEHIND = 4096
 """Lines that wait for a client; one that is further behind is let go, so that nobody else waits for it."""
 MOST_CLIENTS = 32
-TOKEN_S = 10.0
-"""A client has so long to say the token."""
+TAKEN_S = 10.0
+"""A client that takes nothing for so long is let go."""
 PLACE = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm"}
 """What of a touch OSC and LSL tell, and its units."""
 
@@ -71,31 +72,34 @@ class Lines:
 
     def __exit__(self, *error: object) -> None:
         self._server.shutdown()
-        self._server.tell(None)
+        self._server.end(END_S)
         self._server.server_close()
 
 
-class _LineServer(socketserver.ThreadingTCPServer):
-    daemon_threads = True
-    block_on_close = True  # what was told before the end still goes out
-    allow_reuse_address = True
-
+class _LineServer(ConnectionServer):
     def __init__(self, address: tuple[str, int], token: str) -> None:
         self.token = token.encode()
         self._clients: set[_Client] = set()
         self._kept: bytes | None = None
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
         super().__init__(address, _Client)
 
-    def tell(self, line: bytes | None, kept: bool = False) -> None:
-        """Give a line to all who listen, and if it is `kept` to those who come later; None is the end."""
-        with self._lock:
+    def tell(self, line: bytes, kept: bool = False) -> None:
+        """Give a line to all who listen, and if it is `kept` to those who come later."""
+        with self._changed:
             self._kept = line if kept else self._kept
             for client in self._clients:
                 client.take(line)
 
+    def end(self, wait_s: float) -> None:
+        """There will be no more; waits until all who listen have been sent all, for `wait_s` at most."""
+        with self._changed:
+            for client in self._clients:
+                client.take(None)
+            self._changed.wait_for(lambda: not self._clients, wait_s)
+
     def join(self, client: "_Client") -> bool:
-        with self._lock:
+        with self._changed:
             if len(self._clients) >= MOST_CLIENTS:
                 return False
             self._clients.add(client)
@@ -104,20 +108,14 @@ class _LineServer(socketserver.ThreadingTCPServer):
             return True
 
     def leave(self, client: "_Client") -> None:
-        with self._lock:
+        with self._changed:
             self._clients.discard(client)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that has gone away is no error of this program; any other is told as usual."""
-        import sys
-
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)
+            self._changed.notify_all()
 
 
 class _Client(socketserver.StreamRequestHandler):
     server: _LineServer  # pyright: ignore[reportIncompatibleVariableOverride]
-    timeout = TOKEN_S  # of one that says no token, or takes nothing
+    timeout = TAKEN_S
 
     def setup(self) -> None:
         super().setup()
@@ -134,6 +132,7 @@ class _Client(socketserver.StreamRequestHandler):
         token = self.server.token
         if token and not hmac.compare_digest(self.rfile.readline(len(token) + 2).rstrip(b"\r\n"), token):
             return
+        self.server.admit(self.request)
         if not self.server.join(self):
             return
         try:
@@ -150,7 +149,7 @@ class Osc:
         """Send to `address`, HOST:PORT.
 
         Raises:
-            InputError: no such address.
+            InputError: no such address, or one that nothing can be sent to.
             ModuleNotFoundError: python-osc is not installed.
         """
         from pythonosc.udp_client import SimpleUDPClient
@@ -159,9 +158,16 @@ class Osc:
         if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
             raise InputError(f"--osc is {address!r}, expected HOST:PORT")
         try:
-            self._client = SimpleUDPClient(host, int(port))
-        except OSError as error:
+            family, *_, there = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
+        except (OSError, UnicodeError) as error:
             raise InputError(f"--osc is {address!r}: no such host ({error})") from error
+        try:
+            with socket.socket(family, socket.SOCK_DGRAM) as asking:
+                asking.connect(there)
+        except OSError as error:
+            raise InputError(f"--osc is {address!r}: nothing can be sent there ({error})") from error
+        # By its number: a name would be looked up for every message, and all wait for that.
+        self._client = SimpleUDPClient(str(there[0]), int(port), family=family)
 
     def __enter__(self) -> Self:
         return self
@@ -171,7 +177,7 @@ class Osc:
 
     def tell(self, message: Message) -> None:
         """Send one message."""
-        with suppress(BlockingIOError, ConnectionRefusedError):  # nobody listens, or too slowly, as UDP has it
+        with suppress(OSError):  # nobody listens, or too slowly, or a cable is out: as UDP has it, that is lost
             self._client.send_message(message.topic, _osc_values(message))
 
 

@@ -4,6 +4,7 @@ Real and simulated devices are used alike. All times are seconds of one clock, t
 mm in the arm's base frame, angles radians.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -26,7 +27,7 @@ class RigFault(Fault):
 
     def __init__(self, cause: Cause, message: str, advice: str = "") -> None:
         super().__init__(f"{message}; {advice}" if advice else message)
-        self.cause = cause
+        self.cause: Cause = cause
         self.exit_code = 2 if cause == "refused" else 1
 
 
@@ -39,6 +40,7 @@ class ArmState:
         force_n: at the tool, along z, None without a sensor; then `[rig]` has to say that nobody watches it.
         protective_stop, emergency_stop: whether the controller has stopped the arm.
         moving: whether the last move that was begun is still under way.
+        sideways_n: force on the tool across z, >= 0; 0 without a sensor.
     """
 
     time_s: float
@@ -48,6 +50,12 @@ class ArmState:
     protective_stop: bool
     emergency_stop: bool
     moving: bool
+    sideways_n: float = 0.0
+
+    @property
+    def pushed_n(self) -> float | None:
+        """Force on the tool in all, whatever its direction, >= 0; None without a sensor."""
+        return None if self.force_n is None else math.hypot(self.force_n, self.sideways_n)
 
 
 class Arm(Protocol):

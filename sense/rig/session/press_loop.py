@@ -211,26 +211,26 @@ class Session:
             yield
         except BaseException as error:
             with self._interrupts.held():
-                with contextlib.suppress(Exception):
-                    self._arm.stop()
                 stuck = self._retreat()
             self._disk.end()
             with contextlib.suppress(Exception):
                 self._recorder.abort(str(error) or type(error).__name__)
                 self._recorder.sync()
-            if isinstance(error, OSError):
-                raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
-            if isinstance(error, RigFault) and error.cause == "force":
-                how = f"and it cannot be lifted off: {stuck}" if stuck else "the tool was lifted off"
-                raise RigFault("force", str(error), how) from error
-            raise
+            if (told := _told(error, stuck)) is error:
+                raise
+            raise told from error
 
     def _retreat(self) -> str | None:
-        """Lift the tool off the pad after a fault; why that cannot be, if so."""
+        """Stop the arm and lift the tool off the pad after a fault; why it may still press the pad, if so."""
+        stopped = ""
+        try:
+            self._arm.stop()
+        except Exception as error:
+            stopped = str(error)
         try:
             retreat(self._arm, self._limits, self._rig.acceleration_mm_s2, self._clock, self._sleep)
         except Exception as error:
-            return str(error)
+            return stopped or str(error)
         return None
 
     def _lift(self) -> None:
@@ -258,3 +258,18 @@ def require_safe_plan(plan: PressPlan, rig: RigSettings) -> None:
     for place, depth in zip(plan.places_mm, plan.depths_mm.tolist(), strict=True):
         require_safe(frame.pose(place, -rig.clearance_mm), rig.travel_mm_s, rig.acceleration_mm_s2, limits)
         require_safe(frame.pose(place, depth), rig.press_mm_s, rig.acceleration_mm_s2, limits)
+
+
+def _told(error: BaseException, stuck: str | None) -> BaseException:
+    """What is raised for an error, once it is known whether the tool was lifted off, and why not: `stuck`."""
+    if isinstance(error, OSError):
+        error = RigFault("disk", f"the recording cannot be written ({error.strerror or error})")
+    force = isinstance(error, RigFault) and error.cause == "force"
+    if stuck is None and not force:
+        return error
+    how = "the tool was lifted off" if stuck is None else "the tool was not lifted off"
+    if stuck is not None and stuck != str(error):
+        how += f": {stuck}"
+    if isinstance(error, RigFault):
+        return RigFault(error.cause, str(error), how)
+    return KeyboardInterrupt(how) if isinstance(error, KeyboardInterrupt) else error

@@ -13,6 +13,8 @@ START_S, FALL_S = 0.2, 1.0
 """When a force that was too great has to begin to fall, and when it has to be below its limit."""
 RISE_N = 5.0
 """How far it may rise above the least it was: what sensors are off by."""
+EDGE_MM = 1.0
+"""How far outside the box a tool may stand that was sent to its edge: no arm stands quite where it was sent."""
 
 
 def retreat(
@@ -20,8 +22,8 @@ def retreat(
 ) -> None:
     """Lift the tool straight up, unless it is above the pad already and no force is too great.
 
-    All is watched as in any move, but that a force or depth beyond its limit has to become less. The arm is stopped
-    where it does not.
+    All is watched as in any move, but that a force or depth beyond its limit has to become less, and that the tool may
+    stand at the edge of the box. The arm is stopped where the force does not become less.
 
     Raises:
         RigFault: see `watch` and `require_safe`; "force" where the force does not fall.
@@ -31,8 +33,10 @@ def retreat(
         return
     z, most_n = state.pose[2], limits.max_force_n
     pressed = most_n is not None and _force(state) > most_n
+    sides = ((low - EDGE_MM, high + EDGE_MM) for low, high in limits.box_mm[:2])
     eased = replace(
         limits,
+        box_mm=(*sides, limits.box_mm[2]),
         max_force_n=None if pressed else most_n,
         max_depth_mm=max(limits.max_depth_mm, limits.contact_mm - z),
     )
@@ -64,5 +68,5 @@ def _falling(arm: Arm, first_n: float, most_n: float, clock: Callable[[], float]
 
 
 def _force(state: ArmState) -> float:
-    """Force on the tool, either way, N; 0 where the arm tells none."""
-    return abs(state.force_n or 0.0)
+    """Force on the tool, whatever its direction, N; 0 where the arm tells none."""
+    return state.pushed_n or 0.0

@@ -3,13 +3,15 @@
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 
 import pytest
 import torch
 
-from design.common.computing import forget_outdated, one_torch_thread, run_tasks
+from design.common.computing import cluster, forget_outdated, one_torch_thread, run_tasks
+from design.common.errors import Fault
 
 KERNELS = {
     "__init__.py": "from pathlib import Path\nfrom design.common.computing import forget_outdated\n"
@@ -125,6 +127,33 @@ def test_an_error_of_a_task_comes_out():
 
     with pytest.raises(ZeroDivisionError):
         list(run_tasks([("a", fail), ("b", lambda: 1)]))
+
+
+@pytest.mark.parametrize(("killed", "said"), [(False, "has lost its scheduler"), (True, "loses every worker")])
+def test_a_cluster_that_is_lost_is_one_line(monkeypatch, killed, said):
+    distributed = pytest.importorskip("distributed")
+
+    class Client:
+        def __init__(self, address, timeout):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+        @contextmanager
+        def get_executor(self, **how):
+            with ThreadPoolExecutor(1) as there:
+                yield there
+
+    def lost():
+        raise distributed.scheduler.KilledWorker("a task", None, 3) if killed else CancelledError
+
+    monkeypatch.setattr(distributed, "Client", Client)
+    with pytest.raises(Fault, match=f"the cluster at tcp://there {said}; .* --resume"), cluster("tcp://there") as there:
+        list(run_tasks([("a", lost)], there))
 
 
 def test_torch_has_one_thread_until_the_last_one_leaves():

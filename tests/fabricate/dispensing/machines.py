@@ -52,10 +52,11 @@ class Run:
 
 
 def run_gcode(text: str) -> Run:
-    """G0, G1, G21, G90 and M0 as the standard has them, modal; anything else is refused."""
+    """G1, G21, G90 and M0 as the standard has them, modal; anything else is refused, as G0, which heeds no speed."""
     run, corners, speeds, lays = Run(), [], [], []
+    highest = -math.inf
     at: dict[str, float] = {}
-    motion, speed = "", math.nan
+    speed = math.nan
     for line in text.splitlines():
         comment = "".join(re.findall(r"\(([^()]*)\)", line))
         words = G_CODE.findall(re.sub(r"\([^()]*\)", "", line.partition(";")[0]))
@@ -65,9 +66,7 @@ def run_gcode(text: str) -> Run:
         target = dict(at)
         for letter, number in words:
             match letter + number:
-                case "G0" | "G1" as command:
-                    motion = command
-                case "G21" | "G90":
+                case "G1" | "G21" | "G90":
                     pass
                 case "M0":
                     run.end_way(np.array(corners), speeds, lays)
@@ -79,10 +78,11 @@ def run_gcode(text: str) -> Run:
                     assert letter in "XYZ"
                     target[letter] = float(number)
         if target != at:
-            at = target
+            level, at = at.get("Z") == target.get("Z"), target
+            highest = max(highest, at["Z"])
             if {"X", "Y"} <= at.keys():
                 speeds += [speed] if corners else []
-                lays += [motion == "G1"] if corners else []
+                lays += [level and at["Z"] < highest] if corners else []
                 corners.append([at["X"], at["Y"], at["Z"]])
     run.end_way(np.array(corners), speeds, lays)
     return run

@@ -27,5 +27,5 @@ def test_it_begins_with_units_and_a_lift_before_anything_goes_sideways():
     code = [line for line in lines if not line.startswith(";")]
     assert code[:2] == ["G21", "G90"]
     assert code[2].startswith("M0 ")
-    assert code[3] == "G0 Z5 F1800"
-    assert code[4].startswith("G0 X")
+    assert code[3] == "G1 Z5 F1800"
+    assert code[4].startswith("G1 X")

@@ -9,8 +9,6 @@ import base64
 import hashlib
 import hmac
 import json
-import os
-import socketserver
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +20,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 from design.common.errors import InputError
 
 from ..shipped import resource
-from .listening import HOST, POLL_S, listening, refuse_open
+from .listening import END_S, HOST, POLL_S, ConnectionServer, listening, refuse_open
 
 HTTP_PORT = 80
 """Which browsers leave out of the name that they ask for."""
@@ -30,8 +28,6 @@ LEAST_PAUSE_S = 0.04
 """Between two messages to a browser: faster than eyes."""
 ALIVE_S = 5.0
 """After so long without a message a browser is sent an empty one, which fails if it is gone."""
-END_S = 1.0
-"""Longest wait for the browsers to be told of the end."""
 RETRY_MS = 1000
 """After so long a browser that has lost its connection tries again."""
 
@@ -85,8 +81,8 @@ class LocalPage:
 
     def __exit__(self, *error: object) -> None:
         self._server.shutdown()
-        self._server.server_close()
         self._server.news.end(END_S)
+        self._server.server_close()
 
     def show(self, view: Mapping[str, Any]) -> None:
         """Show `view`, JSON, from now on.
@@ -153,11 +149,7 @@ class News:
             return None if self._ended else (number, "")
 
 
-class _Server(socketserver.ThreadingTCPServer):
-    daemon_threads = True
-    # Elsewhere the flag lets two programs share a port; here it only lets go of one that was used a minute ago.
-    allow_reuse_address = os.name == "posix"
-
+class _Server(ConnectionServer):
     def __init__(
         self, address: tuple[str, int], token: str, page: str, heard: Mapping[str, Hear], longest: int
     ) -> None:
@@ -166,20 +158,24 @@ class _Server(socketserver.ThreadingTCPServer):
         self.page, self.policy = page.encode(), _policy(page)
         super().__init__(address, _Handler)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that has gone away is no error of this program; any other is told as usual."""
-        import sys
-
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)
-
 
 class _Handler(BaseHTTPRequestHandler):
     server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
     timeout = 10  # of a browser that neither asks nor takes what it is sent
 
+    def parse_request(self) -> bool:
+        """Also refuses an address that is none."""
+        if not super().parse_request():
+            return False
+        try:
+            self._asked = urlsplit(self.path)
+        except ValueError:
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return False
+        return True
+
     def do_GET(self) -> None:
-        path = urlsplit(self.path).path
+        path = self._asked.path
         if not self._may_ask():
             self.send_error(HTTPStatus.FORBIDDEN)
         elif path == "/":
@@ -193,15 +189,17 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         if not (self._may_ask() and self.headers.get("Origin") == f"http://{self.headers['Host']}"):
             self.send_error(HTTPStatus.FORBIDDEN)
-        elif (hear := self.server.heard.get(urlsplit(self.path).path)) is None:
+        elif (hear := self.server.heard.get(self._asked.path)) is None:
             self.send_error(HTTPStatus.NOT_FOUND)
         elif (length := self._length()) is None:
             self.send_error(HTTPStatus.LENGTH_REQUIRED)
         elif length > self.server.longest:
             self.rfile.read(min(length, _SWALLOWED))  # who is still sending does not listen
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        elif len(body := self.rfile.read(length)) < length:
+            self.send_error(HTTPStatus.BAD_REQUEST)  # a half of what was meant is something else
         else:
-            self._answer(hear, self.rfile.read(length))
+            self._answer(hear, body)
 
     def _answer(self, hear: Hear, body: bytes) -> None:
         try:
@@ -223,12 +221,16 @@ class _Handler(BaseHTTPRequestHandler):
         """Whether the token is known, where there is one; else whether this machine was asked by its own name: no page
         from elsewhere gets at it by renaming it."""
         if self.server.token:
-            said = parse_qs(urlsplit(self.path).query).get("token", [""])[0]
+            said = parse_qs(self._asked.query).get("token", [""])[0]
             said = said or self.headers.get("Authorization", "").removeprefix("Bearer ")
-            return hmac.compare_digest(said.encode(), self.server.token.encode())
-        port = self.server.server_address[1]
-        left_out = (HOST, "localhost") if port == HTTP_PORT else ()
-        return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}", *left_out)
+            may = hmac.compare_digest(said.encode(), self.server.token.encode())
+        else:
+            port = self.server.server_address[1]
+            left_out = (HOST, "localhost") if port == HTTP_PORT else ()
+            may = self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}", *left_out)
+        if may:
+            self.server.admit(self.request)
+        return may
 
     def _send(self, status: HTTPStatus, kind: str = "", body: bytes = b"", **headers: str) -> None:
         self.send_response(status)

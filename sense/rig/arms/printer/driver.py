@@ -72,6 +72,9 @@ class Printer:
             firmware = marlin.Firmware.of(link.ask("M115"))
             if marlin.FIRMWARE not in firmware.name:
                 raise RigFault("refused", f"the firmware is {firmware.name or 'of no name'!r}, allowed is Marlin")
+            if marlin.waits_for_moves(firmware.name):
+                message = f"the firmware is {firmware.name!r}, which says where it is only once it stands"
+                raise RigFault("refused", message, "allowed is Marlin 2")
             speeds, accelerations = self._limits(link)
             self._require_quick(speeds, accelerations)
             for command in SETTINGS:

@@ -119,9 +119,10 @@ class MarlinLink:
         return True
 
     def _quiet(self) -> Iterator[str]:
-        """The lines that come until nothing does."""
+        """The lines that come until nothing does, for `ANSWER_S` at most: what never falls silent is no printer."""
+        latest = time.monotonic() + ANSWER_S
         end = time.monotonic() + _QUIET_S
-        while time.monotonic() < end:
+        while time.monotonic() < min(end, latest):
             for line in self._receive():
                 end = time.monotonic() + _QUIET_S
                 yield line

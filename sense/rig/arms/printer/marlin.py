@@ -40,6 +40,11 @@ def place(line: str) -> Place | None:
     return (float(found[1]), float(found[2]), float(found[3])) if found else None
 
 
+def waits_for_moves(name: str) -> bool:
+    """Whether a firmware of this name answers M114 only once all moves are over, as Marlin did before 2."""
+    return re.match(r"Marlin (bugfix-)?1\.", name) is not None
+
+
 def halts(line: str) -> bool:
     """Whether the line says that the firmware has stopped for good."""
     return line.startswith("Error:") and any(words in line for words in HALTED)

@@ -105,7 +105,8 @@ class Mover(threading.Thread):
             self._link.shout("M112")
             self._move = None
             reason = "the printer did not confirm the stop, and was told to halt"
-            raise RigFault("lost", reason, f"see that it stands, or switch it off; {HOME}") from None
+            self.fault = RigFault("lost", reason, f"see that it stands, or switch it off; {HOME}")
+            raise self.fault from None
 
     def end(self) -> None:
         """End the thread."""

@@ -260,6 +260,7 @@ class Child:
             emergency_stop=emergency,
             moving=self._before is not None,
             skipped=reading.skipped,
+            sideways_n=reading.sideways_n,
         )
 
     def _halt(self, cause: str, message: str) -> None:

@@ -93,6 +93,7 @@ class UR5:
             protective_stop=bool(row.protective_stop),
             emergency_stop=bool(row.emergency_stop),
             moving=bool(row.moving) or row.time_s < self._moved_s,
+            sideways_n=row.sideways_n,
         )
 
     def drain(self) -> Array:

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-_STATE = struct.Struct("<c13d")
+_STATE = struct.Struct("<c14d")
 _ANSWER = struct.Struct("<cI")
 
 
@@ -25,6 +25,7 @@ class Row(NamedTuple):
     emergency_stop: float
     moving: float
     skipped: float
+    sideways_n: float
 
 
 def pack_row(row: Row) -> bytes:

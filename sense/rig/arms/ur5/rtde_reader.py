@@ -27,6 +27,7 @@ class Reading:
     Attributes:
         time_s: when it was taken, on the host's monotonic clock. skipped: how many states are missing before it.
         pose: m and rad. speed: of the tool, m/s. force_n: on the tool along z, None without a sensor.
+        sideways_n: across z, 0 without one.
         mode: of the robot. runtime: state of the program. safety: bits. progress: ur-rtde's register of moves.
     """
 
@@ -35,6 +36,7 @@ class Reading:
     pose: tuple[float, ...]
     speed: float
     force_n: float | None
+    sideways_n: float
     mode: int
     runtime: int
     safety: int
@@ -119,7 +121,8 @@ class RtdeReader:
         return others
 
     def _reading(self, arrived: float, values: tuple[float, ...]) -> Reading:
-        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[15]
+        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
+        felt = self.version[0] >= FORCE_SERIES
         if not all(map(math.isfinite, values)):
             raise ValueError("the controller sent a state that holds NaN or infinity")
         skipped = 0 if self._stamp is None else max(0, round((stamp - self._stamp) * self.rate_hz) - 1)
@@ -129,7 +132,8 @@ class RtdeReader:
             skipped=skipped,
             pose=pose,
             speed=sum(value * value for value in speed) ** 0.5,
-            force_n=force if self.version[0] >= FORCE_SERIES else None,
+            force_n=force[2] if felt else None,
+            sideways_n=math.hypot(*force[:2]) if felt else 0.0,
             **dict(zip(("mode", "runtime", "safety", "progress"), map(int, values[19:]), strict=True)),
         )
 

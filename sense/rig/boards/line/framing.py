@@ -34,6 +34,8 @@ _LIMITS = {
     "channels": (1, MAX_FIBRES),
 }
 _MAX_LINE = 8192
+_MAX_TIME = 2**63
+"""Of a clock that does not wrap around."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,8 @@ def _sample(line: bytes, header: Header) -> Sample:
     if not all(map(bytes.isdigit, numbers)):
         raise ValueError(f"a line begins {line[:20].decode('ascii', 'replace')!r}, expected whole numbers only")
     time_us, *counts = map(int, numbers)
+    if time_us >= _MAX_TIME:
+        raise ValueError("the time of a line is beyond all clocks")
     if max(counts) > header.full_scale:
         raise ValueError(f"a count is {max(counts)}, its header allows {header.full_scale}")
     return Sample(time_us, tuple(counts))

@@ -43,7 +43,8 @@ class Controller:
 
     Attributes:
         motion: of the tool. inputs: registers that clients write. outputs: registers that clients read.
-        remote: whether the arm is in remote control. asked: every line the dashboard was sent.
+        remote: whether the arm is in remote control. sideways_n: force that pushes the tool along x.
+        asked: every line the dashboard was sent.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Controller:
         self._installed = tcp
         self.motion = Motion(pose)
         self.surface = surface
-        self.remote = True
+        self.remote, self.sideways_n = True, 0.0
         self.asked: list[str] = []
         self.restart(now)
 
@@ -150,7 +151,7 @@ class Controller:
     def state(self) -> dict[str, Any]:
         """The variables that are not zero, by name."""
         force = np.zeros(6)
-        force[2] = self.surface.force(self.motion.pose) if self.surface else 0.0
+        force[0], force[2] = self.sideways_n, self.surface.force(self.motion.pose) if self.surface else 0.0
         return self.outputs | {
             "timestamp": self._now - self._boot,
             "actual_TCP_pose": self.motion.pose,

@@ -105,6 +105,8 @@ class UrEmulator:
     """Nothing comes in and nothing goes out, and no link is closed: the cable is out."""
     slow = partialmethod(_order, "slow")
     """Let every answer and every order take this much longer."""
+    push = partialmethod(_order, "set", "sideways_n")
+    """Push the tool sideways with so many N."""
     remote_control = partialmethod(_order, "set", "remote")
     """Switch between local and remote control."""
     restart = partialmethod(_order, "restart")

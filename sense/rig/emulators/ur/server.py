@@ -230,7 +230,7 @@ class Server:
             "restart": self.restart,
             "slow": self.slow,
             "asked": lambda: self.controller.asked,
-            "set": lambda key, value: setattr(self.controller if key == "remote" else self, key, value),
+            "set": lambda key, value: setattr(self.controller if hasattr(self.controller, key) else self, key, value),
         }
         return orders.get(name) or getattr(self.controller, name)
 

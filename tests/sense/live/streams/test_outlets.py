@@ -1,10 +1,12 @@
 """Ways out: who hears what, who does not, and that nobody has to wait."""
 
+import errno
 import json
 import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from design.common.errors import InputError
+from design.common.page.local_page import listening
 from sense.live.streams import outlets
 from sense.live.streams.messages import Message
 from sense.live.streams.outlets import Lines, Osc
@@ -98,6 +101,45 @@ def test_one_that_does_not_listen_holds_up_nobody(monkeypatch: pytest.MonkeyPatc
         stack.close()  # whoever sends to the deaf one would wait until it is given up
 
 
+def test_a_stranger_has_a_moment_to_say_the_token_however_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "ADMIT_S", 0.5)
+    with ExitStack() as stack:
+        lines = stack.enter_context(Lines("127.0.0.1", 0, "long" * 60))
+        lines.tell(STATES)
+        known, stranger = (stack.enter_context(socket.create_connection(lines.address)) for _ in range(2))
+        known.sendall(b"long" * 60 + b"\n")
+        begun = time.monotonic()
+        with suppress(OSError):
+            while time.monotonic() < begun + 10:
+                stranger.sendall(b"x")
+                time.sleep(0.1)
+        assert time.monotonic() < begun + 5
+        lines.tell(TOUCH)
+        told = known.makefile()
+        assert [json.loads(told.readline())["topic"] for _ in range(2)] == [HEALTH, TOUCHES]
+
+
+def test_what_was_told_before_the_end_still_arrives() -> None:
+    """To one that is slow: the end of the program would cut it off."""
+    heard: list[str] = []
+
+    def listen(client: socket.socket) -> None:
+        time.sleep(0.2)
+        heard.extend(client.makefile())
+
+    with ExitStack() as stack:
+        with Lines("127.0.0.1", 0) as lines:
+            client = stack.enter_context(socket.create_connection(lines.address))
+            wait_for(lines, 1)
+            for _ in range(30):
+                lines.tell(Long(READINGS, {}, {}))
+            slow = threading.Thread(target=listen, args=(client,))
+            slow.start()
+        assert not lines._server._clients  # pyright: ignore[reportPrivateUsage]
+        slow.join(20)
+    assert len(heard) == 30
+
+
 def test_others_may_listen_only_with_a_token() -> None:
     for host, token, message in (
         ("0.0.0.0", "", "whoever knows a token may listen"),
@@ -130,6 +172,31 @@ def test_osc_tells_numbers() -> None:
             volts = OscMessage(heard.recv(4096)).params
             assert volts[0] == 1.0
             assert volts[1] != volts[1]
+
+
+def test_osc_goes_on_while_its_network_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And looks no name up again, which may take long then."""
+    with Osc("localhost:9") as osc:
+        looked_up, gone = [], OSError(errno.ENETUNREACH, "Network is unreachable")
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *asked, **more: looked_up.append(asked))
+
+        class Away:
+            def sendto(self, data: bytes, address: tuple[str, int]) -> None:
+                looked_up.extend([address] if address[0] == "localhost" else [])
+                raise gone
+
+            def close(self) -> None: ...
+
+        osc._client._sock.close()  # pyright: ignore[reportPrivateUsage]
+        osc._client._sock = Away()  # pyright: ignore[reportPrivateUsage, reportAttributeAccessIssue]
+        osc.tell(TOUCH)
+    assert looked_up == []
+
+
+def test_an_address_that_nothing_can_be_sent_to_is_told() -> None:
+    for address, reason in (("255.255.255.255:9", "nothing can be sent there"), ("a..b:9", "no such host")):
+        with pytest.raises(InputError, match=reason):
+            Osc(address)
 
 
 @pytest.mark.parametrize("address", ["", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x", ":9000", "127.0.0.1:99999"])

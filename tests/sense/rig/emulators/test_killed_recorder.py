@@ -46,6 +46,8 @@ def await_the_end_of_its_arm(address: str) -> None:
             socket.create_connection((address, RTDE_PORT), 1.0).close()
         except ConnectionRefusedError:
             return
+        except ConnectionResetError:  # it ends at this moment
+            pass
         time.sleep(0.01)
 
 

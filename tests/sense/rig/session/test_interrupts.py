@@ -2,16 +2,21 @@
 
 import contextlib
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from design.settings import PUBLISHED_CONTACT
 from sense.recordings.press_plan import PressPlan
 from sense.recordings.recorder import Recorder
+from sense.rig import operation
 from sense.rig.devices.protocols import RigFault
+from sense.rig.planning.setup import Setup
 from sense.rig.session.press_loop import Session
-from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
+from sense.settings import RigSettings
+from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4]], float), np.full(3, 4.0))
 
@@ -66,3 +71,33 @@ def test_what_was_done_with_a_signal_is_done_again_afterwards(arm: FakeArm, tmp_
     before = signal.getsignal(signal.SIGINT)
     run(arm, tmp_path / "run")
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_is_heard_where_the_session_has_done_its_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the disk hangs, which nobody else could end then."""
+    heard = []
+
+    @contextlib.contextmanager
+    def opened(kind: str, setup: Setup, *more: object) -> Iterator[tuple[FakeArm, FakeConverter, RigSettings]]:
+        arm = FakeArm(Time())
+        yield arm, FakeConverter(arm), setup.rig
+
+    class Interrupted:
+        def __init__(self, *devices: object, **more: object) -> None:
+            pass
+
+        def run(self, *plan: object) -> None:
+            for _ in range(2):
+                try:
+                    signal.raise_signal(signal.SIGINT)
+                except KeyboardInterrupt:
+                    heard.append(signal.SIGINT)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(operation, "opened_rig", opened)
+    monkeypatch.setattr(operation, "Session", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        operation.record("ur5", Setup(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test"))
+    assert heard == [signal.SIGINT] * 2

@@ -171,7 +171,7 @@ def test_too_much_force_stops_the_arm(tmp_path):
 def test_a_force_that_stays_is_told_as_well(tmp_path):
     arm, converter, options = rig(tmp_path)
     arm.hook = lambda arm: setattr(arm, "force_n", 80.0 if arm.pose[2] < 48 or arm.force_n else 0.0)
-    with pytest.raises(RigFault, match=r"80\.0 N; allowed 60 N; and it cannot be lifted off: the force does not fall"):
+    with pytest.raises(RigFault, match=r"80\.0 N; allowed 60 N; the tool was not lifted off: the force does not fall"):
         run(tmp_path, arm, converter, options)
     assert arm.pose[2] < 52
 

@@ -77,6 +77,22 @@ def test_a_tool_deeper_than_allowed_may_come_up() -> None:
     assert retreated(pressed(42.0, lambda arm: 0.0)).pose[2] == pytest.approx(50 + HEIGHT_MM)
 
 
+@pytest.mark.parametrize(("x", "y"), [(100.4, -400.0), (-100.4, -400.0), (0.0, -299.6), (0.0, -500.4)])
+def test_a_tool_that_pressed_at_the_edge_of_the_box_comes_up(x: float, y: float) -> None:
+    """No arm stands quite where it was sent: half of those at the edge stand beyond it."""
+    arm = pressed(DEEP_MM, lambda arm: 0.0)
+    arm.pose = (x, y, *arm.pose[2:])
+    assert retreated(arm).pose[:3] == (x, y, pytest.approx(50 + HEIGHT_MM))
+
+
+def test_a_tool_that_stands_elsewhere_is_left_there() -> None:
+    arm = pressed(DEEP_MM, lambda arm: 0.0)
+    arm.pose = (102.0, *arm.pose[1:])
+    with pytest.raises(RigFault, match="x 102 mm"):
+        retreated(arm)
+    assert arm.moves == []
+
+
 def test_a_tool_above_the_pad_is_only_lifted_off_what_it_presses() -> None:
     assert retreated(pressed(75.0, lambda arm: 0.0)).moves == []
     arm = retreated(pressed(75.0, lambda arm: 80.0 if arm.pose[2] < 76 else 0.0))

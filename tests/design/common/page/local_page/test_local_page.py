@@ -1,13 +1,17 @@
 """Pages of this machine that post: who is heard, and what becomes of what cannot be used."""
 
 import json
+import socket
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from http.client import HTTPConnection, HTTPResponse
 from typing import Any
 
 import pytest
 
 from design.common.errors import InputError
+from design.common.page.local_page import listening
 from design.common.page.local_page.listening import HOST
 from design.common.page.local_page.local_page import LocalPage
 
@@ -88,6 +92,55 @@ def test_with_a_token_only_those_who_know_it_are_answered_by_whatever_name_they_
         assert asked("/") == asked("/events") == asked("/?token=") == asked("/?token=known+to+few") == 403
         assert asked("/?token=known+to+few+%26+all") == asked("/", Authorization=f"Bearer {token}") == 200
         assert asked("/", Authorization="Bearer another") == 403
+
+
+def port_of(page: LocalPage) -> int:
+    return int(page.url.split("/")[2].rsplit(":", 1)[1])
+
+
+def test_an_address_that_is_none_is_refused_in_silence(page: LocalPage, capfd: pytest.CaptureFixture[str]) -> None:
+    """Whoever asks for it knows no token yet, and would fill the terminal."""
+    for asked in (b"GET http://[ HTTP/1.0", b"POST http://[x]y/double HTTP/1.0"):
+        with socket.create_connection((HOST, port_of(page)), timeout=10) as stranger:
+            stranger.sendall(asked + b"\r\n\r\n")
+            assert stranger.recv(100).split()[1] == b"400"
+    assert posted(page, b"1").status == 200
+    assert capfd.readouterr().err == ""
+
+
+def test_half_of_what_was_posted_is_not_heard(page: LocalPage) -> None:
+    asked = f"POST /double HTTP/1.0\r\nHost: {HOST}:{port_of(page)}\r\nOrigin: http://{HOST}:{port_of(page)}\r\n"
+    with socket.create_connection((HOST, port_of(page)), timeout=10) as browser:
+        browser.sendall(f"{asked}Content-Length: 2\r\n\r\n4".encode())
+        browser.shutdown(socket.SHUT_WR)
+        assert browser.recv(100).split()[1] == b"400"
+
+
+def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are shown out however slowly they go on to ask; who was let in is not."""
+    monkeypatch.setattr(listening, "ADMIT_S", 1.0)
+    monkeypatch.setattr(listening, "MOST_CONNECTIONS", 8)
+    page.show({"at": 0})
+    with ExitStack() as stack:
+        browser = HTTPConnection(HOST, port_of(page), timeout=10)
+        browser.request("GET", "/events")
+        events = stack.enter_context(browser.getresponse())
+        strangers = [socket.create_connection((HOST, port_of(page)), timeout=10) for _ in range(20)]
+        for stranger in strangers:
+            stack.enter_context(stranger)
+        end = time.monotonic() + 20
+        while strangers:
+            assert time.monotonic() < end
+            for stranger in list(strangers):
+                try:
+                    stranger.sendall(b"G")
+                except OSError:
+                    strangers.remove(stranger)
+            time.sleep(0.1)
+        assert posted(page, b"1").status == 200
+        page.show({"at": 1})
+        told = (line for line in events if line.startswith(b"data: "))
+        assert [json.loads(next(told)[6:])["at"] for _ in range(2)] == [0, 1]
 
 
 def test_other_machines_are_let_in_only_with_a_token() -> None:

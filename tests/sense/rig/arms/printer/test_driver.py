@@ -140,6 +140,8 @@ def test_a_stop_that_is_not_confirmed_halts_the_printer():
         begun = time.monotonic()
         with pytest.raises(RigFault, match="did not confirm the stop, and was told to halt"):
             arm.stop()
+        with pytest.raises(RigFault, match="told to halt; see that it stands"):  # whoever looks next is told why
+            arm.state()
         time.sleep(0.05)
         assert printer.firmware.halted
         assert printer.nozzle_at(begun + 0.6)[0] == pytest.approx(printer.nozzle_at(begun + 5)[0])
@@ -176,6 +178,8 @@ def test_other_firmware_and_silent_ports_are_refused(monkeypatch):
     monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:RepRapFirmware FIRMWARE_VERSION:3.4")
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         fault_of(arm.connect, "refused", "'RepRapFirmware', allowed is Marlin")
+        monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:Marlin 1.1.9 (Github) PROTOCOL_VERSION:1.0")
+        fault_of(arm.connect, "refused", "only once it stands; allowed is Marlin 2")
         monkeypatch.setattr(module, "CONNECT_S", 0.2)
         printer.busy(60)
         fault_of(arm.connect, "refused", "no printer answers; check .* printer_baud")

@@ -1,6 +1,7 @@
 """Lines over a real pseudo-terminal: each is executed once and in its turn, whatever noise there is."""
 
 import os
+import time
 from contextlib import closing
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 
 from sense.rig.arms.printer import marlin
 from sense.rig.arms.printer.link import MarlinLink
+from sense.rig.boards.line.framing import Header
 from sense.rig.devices.protocols import RigFault
+from sense.rig.emulators.line_board import EmulatedLineBoard
 from sense.rig.emulators.printer.emulator import EmulatedPrinter
 
 pytest.importorskip("serial")
@@ -49,6 +52,15 @@ def test_silence_is_told():
         with pytest.raises(RigFault, match=r"not answered for 0\.3 s; it may be busy") as fault:
             link.ask("M114", 0.3)
         assert fault.value.cause == "stale"
+
+
+def test_what_never_falls_silent_is_no_printer():
+    """As where the port is that of the board that reads the fibres."""
+    with EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4)) as board:
+        begun = time.monotonic()
+        with closing(MarlinLink(board.port, 115_200)) as link, pytest.raises(RigFault, match="no printer answers"):
+            link.begin(0.5)
+        assert time.monotonic() < begun + 5
 
 
 def test_a_board_that_restarts_as_its_port_is_opened_does_so_once():

@@ -163,3 +163,17 @@ def test_force_is_felt_and_limited(robots: Robots, host: str) -> None:
     assert 50 < (state.force_n or 0) < 60
     arm.close()
     robots.free()
+
+
+def test_what_pushes_the_tool_sideways_stops_it_too(robots: Robots, host: str) -> None:
+    robot = robots.get("e", surface_mm=100)
+    arm = UR5(host)
+    arm.connect()
+    arm.move((HOME[0] + 80, *HOME[1:]), 40, 500)
+    robot.push(60.0)
+    assert fault_of(wait_until_still, arm, LIMITS) == "force"
+    state = arm.state()
+    assert state.pose[0] < HOME[0] + 40
+    assert (state.force_n, state.sideways_n) == (0, 60)
+    arm.close()
+    robots.free()
