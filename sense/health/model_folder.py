@@ -31,7 +31,7 @@ def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[Fibre
 
 def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:
     """Names of the files in a folder by which it tells health, for those of its models that are named."""
-    return {file.name for name in names for file in files_of("", name)}
+    return {file.name for name in names for file in files_of(Path(), name)}
 
 
 def copy_health(model: Path, folder: Path) -> None:
