@@ -65,7 +65,7 @@ WORK: dict[str, tuple[Callable[[], object], str]] = {
     "no line": (lambda: refuse("a"), "refused in 0 lines"),
     "traceback": (lambda: [][0], "traceback: IndexError: list index out of range"),
     "another exit": (lambda: sys.exit(3), "ended with 3"),
-    "a signal": (lambda: os.kill(os.getpid(), signal.SIGSEGV), "ended with -11"),
+    "a signal": (lambda: os.kill(os.getpid(), signal.SIGTERM), "ended with -15"),
     "refused and changed": (changed_and_refused, "refused, and changed"),
     "gone": (lambda: (Path("old.json").unlink(), refuse("padforge: no")), "refused, and changed"),
     "litter": (lambda: Path(".unfinished-1").touch(), "left "),
@@ -88,7 +88,7 @@ def test_what_may_not_be_is_told(folder: Path, name: str) -> None:
     assert bool(found) == bool(expected), found
     assert expected in "; ".join(found)
     if name == "computes":
-        assert 0.9 < ended.cpu_s < 3
+        assert 0.5 < ended.cpu_s < 3
     if name == "waits":
         assert outcome(ended) == "hung"
 
@@ -159,10 +159,15 @@ def test_every_public_function_is_called() -> None:
     assert {"design.Morphology.load", "sense.Localizer.locate", "sense.Live.feed"} <= functions().keys()
 
 
-def good_files(folder: Path) -> list[Path]:
-    """A file of each kind that is spoiled in a way of its own."""
+NAMES = ("a.json", "a.csv", "a.h5", "a.mat", "a.npz", "b.safetensors", "a.db3", "a.bin")
+
+
+@pytest.fixture(scope="module")
+def good_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a file of each kind that is spoiled in a way of its own."""
+    folder = tmp_path_factory.mktemp("good")
     arrays = {"a": np.ones((3, 2), np.float32), "b": np.arange(4)}
-    names = [folder / name for name in ("a.json", "a.csv", "a.h5", "a.mat", "a.npz", "b.safetensors", "a.db3", "a.bin")]
+    names = [folder / name for name in NAMES]
     names[0].write_text(json.dumps({"a": [1, {"b": 2.5}], "c": "d"}))
     names[1].write_text("x,y\n1,2\n3,4e5\n")
     with h5py.File(names[2], "w") as file:
@@ -176,23 +181,20 @@ def good_files(folder: Path) -> list[Path]:
         database.execute("insert into messages values (1, x'00')")
         database.commit()
     names[7].write_bytes(bytes(range(256)))
-    return names
+    return folder
 
 
-@pytest.mark.parametrize("number", range(8))
-def test_files_are_spoiled_the_same_from_the_same_seed(tmp_path: Path, number: int) -> None:
-    seen = []
-    for name in ("one", "other"):
-        told = []
-        for seed in range(60):
-            folder = tmp_path / name
-            folder.mkdir()
-            path = good_files(folder)[number]
-            told.append(spoil(np.random.default_rng(seed), path))
-            shutil.rmtree(folder)
-        seen.append(told)
-    assert seen[0] == seen[1]
-    assert len(set(seen[0])) > 5
+@pytest.mark.parametrize("name", NAMES)
+def test_files_are_spoiled_the_same_from_the_same_seed(good_files: Path, tmp_path: Path, name: str) -> None:
+    def spoiled(seed: int) -> str:
+        folder = tmp_path / "spoiled"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(good_files, folder)
+        return spoil(np.random.default_rng(seed), folder / name)
+
+    told = [spoiled(seed) for seed in range(40)]
+    assert told[:10] == [spoiled(seed) for seed in range(10)]
+    assert len(set(told)) > 5
 
 
 @LONG

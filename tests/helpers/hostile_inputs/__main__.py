@@ -31,11 +31,11 @@ from .texts import Rng
 from .workplace import Workplace
 
 LIBRARIES = (
-    *("torch", "matplotlib.figure", "matplotlib.font_manager", "build123d", "shapely", "trimesh", "h5py", "pyarrow"),
+    *("torch", "matplotlib.figure", "matplotlib.font_manager", "shapely", "trimesh", "h5py", "pyarrow"),
     *("rosbags.rosbag2", "scipy.io", "onnx", "onnxruntime", "ezdxf", "lxml.etree", "pymoo.core.problem"),
     *("fabricate.export", "sense.report.sections", "sense.live.pipeline", "sense.rig.operation"),
 )
-"""Imported before, not by each process again."""
+"""Imported before, not by each process again; not build123d, which few need and which makes each copy take longer."""
 SHARES = {"command line": 0.35, "file": 0.4, "call": 0.25}
 SERVED_S = 1.0
 """How long a command that serves is let to, before it is interrupted."""

@@ -30,7 +30,7 @@ RIGHT: dict[str, tuple[str, ...]] = {
     "--time-budget": ("0", "1e-3", "0.5"),
     "--scheduler": ("nobody.invalid:1", "x", "tcp://127.0.0.1:1"),
     "--vary": ("pad.grid=1,2", "search.knots=1"),
-    "--formats": ("stl", "svg", "", "gcode"),
+    "--formats": ("stl", "svg", "", "gcode", "step"),
     "--picture": ("new.png",),
     "--map": (LAB, LAB_H5, BAG, "fibres=*", "time=time_s:ms,fibres=fibre?:mV"),
     "--mask": ("1", "1,2,3"),
@@ -60,9 +60,11 @@ RIGHT: dict[str, tuple[str, ...]] = {
     "folder": ("pad", "empty"),
 }
 """Values that suit an argument or option of that name, wherever it is."""
-ALWAYS = {"--speed": "1e6", "--port": "0", "--formats": "stl", "--model": "pad"}
+ALWAYS = {"--speed": "1e6", "--port": "0", "--formats": "stl", "--model": "pad", "--time-budget": "0.1"}
 """What a command is given that has the option: without, it lasts as long as the recording, takes a port that others
-may have, or is about CAD, which takes long."""
+may have, or is about CAD or the defaults, which take long."""
+EMPTY = {"file", *(f"nothing.{kind}" for kind in ("json", "stl", "mat", "toml", "csv", "h5"))}
+"""Files that stand for the defaults where they are taken for settings: a training by these takes minutes."""
 SERVING = {"edit", "live", "record", "doctor"}
 """They wait for people or devices, until they are interrupted."""
 
@@ -120,6 +122,7 @@ def drawn(rng: Rng) -> list[str]:
             words.append([name, ALWAYS[name]])
         else:
             words.append([name] if right is None else [name, value(right)])
+            words[-1] = ["--spec", "pad.toml"] if name == "--spec" and words[-1][1] in EMPTY else words[-1]
     _misuse(rng, words)
     if command.words[:1] in (("study",), ("bench",)) and "--against" not in names:
         words.append(["no-such-one"])  # else it takes minutes

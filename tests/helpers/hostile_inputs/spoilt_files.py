@@ -40,15 +40,11 @@ _PAD = (
 )
 _RUN_DIRECTORY = tuple(words.format("pad/recording") for words in _RECORDING)
 READERS: dict[str, tuple[str, ...]] = {
-    "pad.toml": (
-        *(
-            "design check pad/morphology.json",
-            "fabricate check pad/morphology.json",
-            "sense doctor",
-            "design --out new",
-        ),
-        *("design show pad/morphology.json --out new.svg", "design import plan.svg --out new", "run --out new"),
-        *("sense record --presses 4 --out new", "sense calibrate pad/recording --out new"),
+    "pad.toml": (  # which may be left empty, and stand for the defaults: these take minutes
+        *("design check pad/morphology.json", "fabricate check pad/morphology.json", "sense doctor"),
+        *("design show pad/morphology.json --out new.svg", "design import plan.svg --out new"),
+        *("sense record --presses 4 --out new", "sense calibrate pad/recording --time-budget 0.1 --out new"),
+        *("design --time-budget 0.1 --out new", "run --time-budget 0.1 --formats svg --out new"),
         "fabricate pad/morphology.json --formats svg,gcode --out new",
     ),
     "pad/morphology.json": _PAD,
