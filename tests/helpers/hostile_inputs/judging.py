@@ -17,8 +17,8 @@ _ENDS = {0: "done", 1: "a check fails", 2: "refused", 130: "interrupted", -2: "i
 """What an exit code means; a program that is interrupted while it begins or ends dies of the signal."""
 _REFUSED = ("padforge: ", "Usage: ")
 _TOO_MUCH = "this takes more memory than there is"
-_BEGIN = {".json": b"{[", ".png": b"\x89", ".svg": b"<", ".html": b"<"}
-"""What files of a kind begin with, one of these bytes."""
+_OF_ANY_NAME = (b"press,", b"[pad]\n")
+"""What tables of places and settings begin with, which are written to whatever name is asked for."""
 _LASTING = re.compile(r"padforge-arm-.*")
 """Names of temporary files that stay: locks."""
 
@@ -65,9 +65,8 @@ def suspect(ended: Ended) -> bool:
 
 def _whole(path: Path) -> bool:
     with path.open("rb") as file:
-        begin = file.read(1)
-    if begin and begin not in _BEGIN.get(path.suffix, begin):
-        return True  # somebody has called a file of another kind so
+        if file.read(6) in _OF_ANY_NAME:
+            return True
     try:
         require_whole_file(path)
     except Exception:  # whatever a reader raises for a torn file
