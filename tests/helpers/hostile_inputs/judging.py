@@ -17,7 +17,7 @@ _ENDS = {0: "done", 1: "a check fails", 2: "refused", 130: "interrupted", -2: "i
 """What an exit code means; a program that is interrupted while it begins or ends dies of the signal."""
 _REFUSED = ("padforge: ", "Usage: ")
 _TOO_MUCH = "this takes more memory than there is"
-_OF_ANY_NAME = (b"press,", b"[pad]\n")
+_OF_ANY_NAME = (b"press,", b"# padf")
 """What tables of places and settings begin with, which are written to whatever name is asked for."""
 _LASTING = re.compile(r"padforge-arm-.*")
 """Names of temporary files that stay: locks."""
