@@ -12,6 +12,7 @@ from tests.helpers.effort import EVERY_DAY
 
 # a worker a core leaves nothing for the threads that numpy would take besides; to be said before it is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # as padforge has it, also where tests load onnxruntime first
 
 settings.load_profile(EVERY_DAY)
 

@@ -25,14 +25,14 @@ import padforge
 from tests.helpers.effort import on_one_thread
 
 from . import calls, command_lines, spoilt_files
-from .judging import MOST_MEMORY, outcome, suspect, violations
+from .judging import MOST_CPU_S, MOST_MEMORY, outcome, suspect, violations
 from .limited import MIB, Ended, Limits, fresh, limited
 from .texts import Rng
 from .workplace import Workplace
 
 LIBRARIES = (
     *("torch", "matplotlib.figure", "matplotlib.font_manager", "shapely", "trimesh", "h5py", "pyarrow"),
-    *("rosbags.rosbag2", "scipy.io", "onnx", "onnxruntime", "ezdxf", "lxml.etree", "pymoo.core.problem"),
+    *("rosbags.rosbag2", "scipy.io", "sense.live.deployment.onnx_file", "ezdxf", "lxml.etree", "pymoo.core.problem"),
     *("fabricate.export", "sense.report.sections", "sense.live.pipeline", "sense.rig.operation"),
 )
 """Imported before, not by each process again; not build123d, which few need and which makes each copy take longer."""
@@ -105,6 +105,9 @@ class Campaign:
 
     Args:
         where: an empty folder. seed: of all that is drawn.
+
+    Attributes:
+        tallies: by kind of input. fresh: bytes of memory that processes had which began with nothing.
     """
 
     def __init__(self, where: Path, seed: int) -> None:
@@ -114,33 +117,37 @@ class Campaign:
             calls.sound()
         calls.functions()
         self.tallies: dict[str, Tally] = defaultdict(Tally)
+        self.fresh: list[int] = []
         gc.collect()
         gc.freeze()
 
     def round(self, number: int) -> list[str]:
         """Try an input; what of its end may not be."""
-        rng = np.random.default_rng([self._seed, number])
-        self.workplace.renew()
         try:
-            hostile = drawn(rng, self.workplace)
+            hostile, anew = self._made(number)
         except Exception as error:  # of the libraries that spoil files: others are still to be tried
             return [f"NOT MADE {number}: {error!r}"]
-        begun_anew = bool(hostile.words) and rng.random() < FRESH_SHARE
-        ended, found = self._tried(hostile, begun_anew)
-        if not begun_anew and (suspect(ended) or any(each.startswith("computed") for each in found)):
-            memory = self._memory_of_fresh(number, hostile)
+        ended, found = self._tried(hostile, anew)
+        if ended.cpu_s > MOST_CPU_S:  # once more, now that whatever it compiled is kept
+            ended, found = self._tried(self._made(number)[0], anew)
+        if anew or suspect(ended):
+            memory = ended.memory if anew else self._memory_of_fresh(number)
+            self.fresh.append(memory)
             found += [f"takes {memory / MIB:.0f} MiB"] * (memory > MOST_MEMORY)
-        elif begun_anew and ended.memory > MOST_MEMORY:
-            found.append(f"takes {ended.memory / MIB:.0f} MiB")
-        self.tallies[hostile.kind].add(replace(ended, memory=0) if begun_anew else ended)
+        self.tallies[hostile.kind].add(replace(ended, memory=0) if anew else ended)
         if found:
+            self._made(number)
             kept = self._where / f"violation-{number}"
-            shutil.rmtree(kept, ignore_errors=True)
-            self.workplace.renew()
-            drawn(np.random.default_rng([self._seed, number]), self.workplace)
-            shutil.copytree(self.workplace.folder, kept, symlinks=True, ignore=_no_files, dirs_exist_ok=True)
+            shutil.copytree(self.workplace.folder, kept, symlinks=True, ignore=_no_files)
             found = [f"VIOLATION {number} {hostile.kind}: {'; '.join(found)}", f"    {hostile.told}"]
         return found
+
+    def _made(self, number: int) -> tuple[Hostile, bool]:
+        """An input, in a folder as it wants it, and whether it is for a process that begins with nothing."""
+        rng = np.random.default_rng([self._seed, number])
+        self.workplace.renew()
+        hostile = drawn(rng, self.workplace)
+        return hostile, bool(hostile.words) and rng.random() < FRESH_SHARE
 
     def _tried(self, hostile: Hostile, anew: bool) -> tuple[Ended, list[str]]:
         """How an input ended, and what of that may not be."""
@@ -153,10 +160,9 @@ class Campaign:
         left = list(self.workplace.temporary.iterdir())
         return ended, violations(ended, self.workplace.changed(before), left)
 
-    def _memory_of_fresh(self, number: int, hostile: Hostile) -> int:
+    def _memory_of_fresh(self, number: int) -> int:
         """Most memory of a process that begins with nothing and does the same."""
-        self.workplace.renew()
-        drawn(np.random.default_rng([self._seed, number]), self.workplace)
+        hostile, _ = self._made(number)
         words = ["-m", "padforge", *hostile.words]
         if not hostile.words:
             script = "import numpy as np; from tests.helpers.hostile_inputs import calls; "
@@ -192,6 +198,8 @@ def main(where: Path, rounds: int, seed: int, first: int = 0) -> int:
             print(f"{number + 1 - first} inputs, {failed} violations", flush=True)
     for kind, tally in sorted(campaign.tallies.items()):
         print(f"{kind:<28} {tally}")
+    fresh_mib = max(campaign.fresh, default=0) / MIB
+    print(f"{len(campaign.fresh)} of them in a process that began with nothing: at most {fresh_mib:.0f} MiB")
     print(f"{rounds} inputs, {failed} violations")
     return failed
 

@@ -107,7 +107,7 @@ def _right(parameter: click.Parameter) -> tuple[str, ...] | None:
 def drawn(rng: Rng) -> list[str]:
     """A command line with about one thing wrong, or several, or none; rarely, with words in any order."""
     command = pick(rng, commands())
-    one_in = pick(rng, (1, 2, 4))
+    one_in = pick(rng, (1, 3, 6))
 
     def value(right: tuple[str, ...]) -> str:
         if rng.integers(one_in) == 0:
