@@ -1,6 +1,5 @@
 """Health in the folder of a model, as `calibrate` leaves it there: what is known of a recording's fibres by it."""
 
-import shutil
 from collections.abc import Collection
 from pathlib import Path
 
@@ -35,8 +34,11 @@ def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:
 
 
 def copy_health(model: Path, folder: Path) -> None:
-    """What a model tells health by goes to another folder: it was learnt without places."""
-    settle(model)
-    for name in health_files():
-        if (model / name).exists():
-            shutil.copyfile(model / name, folder / name)
+    """What a model tells health by goes to another folder: it was learnt without places.
+
+    Raises:
+        InputError: it is damaged, or cannot be written.
+    """
+    for name in (COMMANDED, DETECTED):
+        if has_health(model, name):
+            HealthModel.load(model, name).save(folder, name)

@@ -10,11 +10,12 @@ import pytest
 from design.common.errors import InputError
 from sense import Recording
 from sense.health.fault_likelihoods import HYPOTHESES
-from sense.health.health_model import COMMANDED, HealthModel, checked_presses
+from sense.health.health_model import COMMANDED, DETECTED, HealthModel, checked_presses
+from sense.health.model_folder import copy_health, health_files
 from sense.health.trained_model import files_of
 from tests.sense.health.pads import BAD_FROM, later, weak
 
-DOCUMENT, WEIGHTS = (path.name for path in files_of("", COMMANDED))
+DOCUMENT, WEIGHTS = (path.name for path in files_of(Path(), COMMANDED))
 
 
 def test_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path) -> None:
@@ -96,3 +97,29 @@ def test_presses_follow_each_other_within_the_readings(begun: list[int], lifted:
 def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthModel) -> None:
     for alarms in (1e-3, 1e-5):
         assert np.exp(-replace(model, false_alarms=alarms).threshold) == pytest.approx(alarms / len(HYPOTHESES))
+
+
+def test_health_goes_to_another_folder_bit_by_bit(model: HealthModel, tmp_path: Path) -> None:
+    model.save(tmp_path / "old")
+    model.save(tmp_path / "old", DETECTED)
+    copy_health(tmp_path / "old", tmp_path / "new")
+    for name in health_files():
+        assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
+    copy_health(tmp_path, tmp_path / "none")  # where none was learnt
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("name", sorted(health_files()))
+def test_health_that_is_damaged_or_endless_goes_nowhere(model: HealthModel, tmp_path: Path, name: str) -> None:
+    """A copy of a device would never end."""
+    for spoilt in (b"{", b"", None):
+        for detected in (COMMANDED, DETECTED):
+            model.save(tmp_path / "old", detected)
+        (tmp_path / "old" / name).unlink()
+        if spoilt is None:
+            (tmp_path / "old" / name).symlink_to("/dev/zero")
+        else:
+            (tmp_path / "old" / name).write_bytes(spoilt)
+        with pytest.raises(InputError, match=name):
+            copy_health(tmp_path / "old", tmp_path / "new")
+        (tmp_path / "old" / name).unlink()
