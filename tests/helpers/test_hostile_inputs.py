@@ -65,7 +65,7 @@ WORK: dict[str, tuple[Callable[[], object], str]] = {
     "no line": (lambda: refuse("a"), "refused in 0 lines"),
     "traceback": (lambda: [][0], "traceback: IndexError: list index out of range"),
     "another exit": (lambda: sys.exit(3), "ended with 3"),
-    "a signal": (lambda: os.kill(os.getpid(), signal.SIGTERM), "ended with -15"),
+    "a signal": (lambda: os.kill(os.getpid(), signal.SIGKILL), "ended with -9"),
     "refused and changed": (changed_and_refused, "refused, and changed"),
     "gone": (lambda: (Path("old.json").unlink(), refuse("padforge: no")), "refused, and changed"),
     "litter": (lambda: Path(".unfinished-1").touch(), "left "),

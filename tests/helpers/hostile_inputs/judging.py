@@ -18,7 +18,9 @@ _ENDS = {0: "done", 1: "a check fails", 2: "refused", 130: "interrupted", -2: "i
 _REFUSED = ("padforge: ", "Usage: ")
 _TOO_MUCH = "this takes more memory than there is"
 _OF_ANY_NAME = (b"press,", b"# padf")
-"""What tables of places and settings begin with, which are written to whatever name is asked for."""
+"""What tables of places and settings begin with, which are written to whatever name is asked for, as pictures are."""
+_BEGIN = {".json": b"{[", ".png": b"\x89", ".svg": b"<", ".html": b"<"}
+"""Bytes that a file of a kind begins with, one of them; with another one it is no part of such a file."""
 _LASTING = re.compile(r"padforge-arm-.*")
 """Names of temporary files that stay: locks."""
 
@@ -40,7 +42,8 @@ def violations(ended: Ended, changed: Sequence[Path], temporary: Sequence[Path])
     found = []
     if ended.code not in _ENDS or ended.hung:
         found.append(f"ended with {ended.code}" + " after its time" * ended.hung)
-    if "Traceback (most recent call last)" in ended.err + ended.out:
+    ignored = outcome(ended) == "interrupted" and "Exception ignored in" in ended.err  # of Python, in a destructor
+    if "Traceback (most recent call last)" in ended.err + ended.out and not ignored:
         found.append(f"traceback: {(ended.err + ended.out).strip().splitlines()[-1][:300]}")
     if re.search(r"^\S*:\d+: \w*Warning: ", ended.err, re.MULTILINE):
         found.append("warns of its own code")
@@ -65,8 +68,9 @@ def suspect(ended: Ended) -> bool:
 
 def _whole(path: Path) -> bool:
     with path.open("rb") as file:
-        if file.read(6) in _OF_ANY_NAME:
-            return True
+        begin = file.read(6)
+    if begin in _OF_ANY_NAME or begin[:1] not in _BEGIN.get(path.suffix, begin[:1]):
+        return True
     try:
         require_whole_file(path)
     except Exception:  # whatever a reader raises for a torn file

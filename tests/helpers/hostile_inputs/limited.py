@@ -50,7 +50,8 @@ def limited(work: Callable[[], object], folder: Path, limits: Limits, interrupt_
     """Do `work` in a copy of this process, in `folder`, see `kills.forked`.
 
     Args:
-        interrupt_s: after how long it is interrupted as by Ctrl-C; None for never.
+        interrupt_s: after how long it is interrupted as by Ctrl-C, and again, for Python loses one that comes while it
+            clears up; None for never.
     """
     begun_with = Path(f"{folder}.memory")
 
@@ -63,15 +64,15 @@ def limited(work: Callable[[], object], folder: Path, limits: Limits, interrupt_
         resource.setrlimit(resource.RLIMIT_CPU, (limits.cpu_s, limits.cpu_s + 1))
         signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell ignores for what runs behind it
 
-    begin, interrupted, hung = time.monotonic(), False, False
+    begin, interrupts, hung = time.monotonic(), 0, False
     child = forked(work, folder, limit)
     while True:
         number, status, used = os.wait4(child, os.WNOHANG)
         if number:
             break
         passed = time.monotonic() - begin
-        if interrupt_s is not None and passed > interrupt_s and not interrupted:
-            interrupted = True
+        if interrupt_s is not None and passed > interrupt_s * (1 + 5 * interrupts):
+            interrupts += 1
             with suppress(ProcessLookupError):  # it leads no group yet
                 os.killpg(child, signal.SIGINT)
         if passed > limits.wall_s and not hung:
