@@ -33,12 +33,10 @@ def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:
     return {file.name for name in names for file in files_of(Path(), name)}
 
 
-def copy_health(model: Path, folder: Path) -> None:
-    """What a model tells health by goes to another folder: it was learnt without places.
+def health_in(model: Path) -> dict[str, HealthModel]:
+    """What the folder of a model tells health by, by the names of its files; nothing where none was learnt.
 
     Raises:
-        InputError: it is damaged, or cannot be written.
+        InputError: it is damaged.
     """
-    for name in (COMMANDED, DETECTED):
-        if has_health(model, name):
-            HealthModel.load(model, name).save(folder, name)
+    return {name: HealthModel.load(model, name) for name in (COMMANDED, DETECTED) if has_health(model, name)}

@@ -11,7 +11,7 @@ from design.common.errors import InputError
 from sense import Recording
 from sense.health.fault_likelihoods import HYPOTHESES
 from sense.health.health_model import COMMANDED, DETECTED, HealthModel, checked_presses
-from sense.health.model_folder import copy_health, health_files
+from sense.health.model_folder import health_files, health_in
 from sense.health.trained_model import files_of
 from tests.sense.health.pads import BAD_FROM, later, weak
 
@@ -100,26 +100,25 @@ def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthMod
 
 
 def test_health_goes_to_another_folder_bit_by_bit(model: HealthModel, tmp_path: Path) -> None:
-    model.save(tmp_path / "old")
-    model.save(tmp_path / "old", DETECTED)
-    copy_health(tmp_path / "old", tmp_path / "new")
+    assert health_in(tmp_path) == {}
+    for name in (COMMANDED, DETECTED):
+        model.save(tmp_path / "old", name)
+    for name, each in health_in(tmp_path / "old").items():
+        each.save(tmp_path / "new", name)
     for name in health_files():
         assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
-    copy_health(tmp_path, tmp_path / "none")  # where none was learnt
-    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("name", sorted(health_files()))
-def test_health_that_is_damaged_or_endless_goes_nowhere(model: HealthModel, tmp_path: Path, name: str) -> None:
-    """A copy of a device would never end."""
+def test_health_that_is_damaged_or_endless_is_none(model: HealthModel, tmp_path: Path, name: str) -> None:
     for spoilt in (b"{", b"", None):
         for detected in (COMMANDED, DETECTED):
-            model.save(tmp_path / "old", detected)
-        (tmp_path / "old" / name).unlink()
+            model.save(tmp_path, detected)
+        (tmp_path / name).unlink()
         if spoilt is None:
-            (tmp_path / "old" / name).symlink_to("/dev/zero")
+            (tmp_path / name).symlink_to("/dev/zero")
         else:
-            (tmp_path / "old" / name).write_bytes(spoilt)
+            (tmp_path / name).write_bytes(spoilt)
         with pytest.raises(InputError, match=name):
-            copy_health(tmp_path / "old", tmp_path / "new")
-        (tmp_path / "old" / name).unlink()
+            health_in(tmp_path)
+        (tmp_path / name).unlink()
