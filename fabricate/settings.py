@@ -194,7 +194,7 @@ class FabricationSettings:
     @classmethod
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """The sections of one `pad.toml`."""
-        return cls(*map(spec.section, _SECTIONS.values()))
+        return cls(*map(instance("spec", spec, Spec).section, _SECTIONS.values()))
 
     @property
     def flare_mm(self) -> float:

@@ -4,6 +4,7 @@ from functools import cache
 from pathlib import Path
 
 from design.common.errors import Fault, InputError
+from design.common.errors import path as as_path
 
 
 def write_report(folder: Path) -> Path:
@@ -21,6 +22,7 @@ def write_report(folder: Path) -> Path:
     from sense.report import sections as sensed
     from sense.report.identification_results import identification_sections
 
+    folder = as_path("folder", folder)
     stages = (
         ("design", folder / "design.json", design_sections),
         ("fabrication", folder / "fabrication.json", fabrication_sections),

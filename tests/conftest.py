@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.helpers.effort import EVERY_DAY
+
 # a worker a core leaves nothing for the threads that numpy would take besides; to be said before it is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # as padforge has it, also where tests load onnxruntime first
 
-settings.register_profile("padforge", deadline=None, derandomize=True)
-settings.register_profile("stress", deadline=None, max_examples=1000, print_blob=True)
-settings.load_profile("padforge")
+settings.load_profile(EVERY_DAY)
 
 coverage = sys.modules.get("coverage")
 if coverage is not None and coverage.Coverage.current() is not None:

@@ -41,7 +41,7 @@ def import_(
     from design.settings import PadSettings, RulesSettings
 
     settings = load_spec(spec)
-    size = settings.section(PadSettings)
+    size, rules = settings.section(PadSettings), settings.section(RulesSettings)
     found = import_plan(plan, size.layout, tolerance_mm)
     made_by: dict[str, Any] = provenance(
         "padforge design import", None, [plan], packages=("ezdxf", "lxml", "fonttools")
@@ -50,7 +50,7 @@ def import_(
     folder = out or pad_folder(plan)
     with staged(folder) as together:
         Morphology.of_layout(found.pad.knots, size.layout, made_by).save(together / "morphology.json")
-    broken = check_rules(found.pad, settings.section(RulesSettings), size)
+    broken = check_rules(found.pad, rules, size)
     fibres = [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(found.fibres, 1)]
     knots = found.pad.knots.shape[1] - 2
     lines = [

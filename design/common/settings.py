@@ -71,9 +71,12 @@ class Spec:
         sections: Collection[str] | None = None,
     ) -> None:
         mapping("tables", tables)
-        unknown = [name for name in tables if sections is not None and name not in sections]
+        allowed = tables if sections is None else [*instance("sections", sections, Collection)]
+        if not all(isinstance(name, str) for name in allowed):
+            raise InputError(f"sections are {shown(sections)}, expected names")
+        unknown = [name for name in tables if name not in allowed]
         if unknown:
-            raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(sections or ())}")
+            raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(allowed)}")
         for name, table in tables.items():
             if not isinstance(table, Mapping):
                 raise InputError(f"{source}: {name} is {shown(table)}, expected a section [{name}]")
@@ -106,18 +109,19 @@ class Spec:
         Raises:
             InputError: an unknown key or a value out of range, naming the key, the value and what is allowed.
         """
-        if not (isinstance(model, type) and issubclass(model, Settings)):
-            raise InputError(f"model is {shown(model)}, expected a section such as Pad")
         given = {key: value for key, value in overrides.items() if value is not None}
         return validated(model, {**self.given(model), **given}, f"{self.source}: [{model.section()}]")
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
         """These settings, with the values in `tables`, by section, in place of their own."""
+        Spec(tables, self.source)
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
 
     def given(self, model: type[Settings]) -> Mapping[str, Any]:
         """What the file states of the section `model` stands for, as it stands there."""
+        if not (isinstance(model, type) and issubclass(model, Settings)):
+            raise InputError(f"model is {shown(model)}, expected a section such as Pad")
         return self._tables.get(model.section(), {})
 
 

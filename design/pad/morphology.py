@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from design.common.errors import InputError, mapping, reals, shown, whole
+from design.common.errors import InputError, instance, mapping, reals, shown, whole
 from design.common.errors import path as as_path
 from design.common.files import read_json, write_json
 from design.settings import MOST_FIBRES, Counts, Layout, Pitch
@@ -107,7 +107,8 @@ class Morphology:
     @classmethod
     def of_layout(cls, knots: Array, layout: Layout, provenance: Mapping[str, Any] | None = None) -> "Morphology":
         """Of knots (H + V, N+2, 2) in grid units, whose ends lie as the layout says."""
-        return cls(knots, layout.pitch_mm, provenance or {}, layout.counts)
+        instance("layout", layout, Layout)
+        return cls(knots, layout.pitch_mm, {} if provenance is None else provenance, layout.counts)
 
     @classmethod
     def random(
@@ -182,6 +183,7 @@ class Morphology:
         Raises:
             InputError: something is missing, or breaks the rules of the class.
         """
+        mapping("document", document)
         try:
             knots = np.array(document["knots"], dtype=np.float64)
             square = document.get("format", SQUARE_FORMAT) == SQUARE_FORMAT

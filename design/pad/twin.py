@@ -180,7 +180,7 @@ class Twin:
 
     def contact(self, unit_mm: float | None = None) -> Contact:
         """The measured contact, on a pad of that grid unit; of the twin's own if None."""
-        unit_mm = self.morphology.unit_mm if unit_mm is None else unit_mm
+        unit_mm = self.morphology.unit_mm if unit_mm is None else real("unit_mm", unit_mm, 1e-3, MOST_MM)
         points = zip((self.distance_mm / unit_mm).tolist(), self.weight.tolist(), strict=True)
         return Contact(reach=tuple(points), length="euclidean")
 
@@ -189,7 +189,10 @@ class Twin:
 
         0 for a fibre that no channel reads. Summed over elements of at most LONGEST, within some 1e-4 of the integral.
         """
-        places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(reals("places_mm", places_mm, MOST_MM))))
+        pressed_mm = reals("places_mm", places_mm, MOST_MM)
+        if pressed_mm.ndim != 2 or pressed_mm.shape[1] != 2:
+            raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
+        places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
         reach = self.contact().reach
         profiles = [profile_of(reach)]
         if self.angle_weight is not None:

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
+from numpy.typing import NDArray
 
-from design.common.errors import InputError, instance, shown
+from design.common.errors import InputError, instance, reals, shown
 from design.common.figures import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
 from design.criteria.rules import Violation
 from design.pad.courses.curves import crossings, flatten
@@ -24,6 +25,7 @@ def draw_plan(
     at the centre.
     """
     pad, contact = instance("pad", pad, Morphology), instance("contact", contact, Contact)
+    holes = _polygons(keep_out_mm)
     if not isinstance(violations, Sequence) or not all(isinstance(found, Violation) for found in violations):
         raise InputError(f"violations is {shown(violations)}, expected what check_rules found")
     width, height = (side / 2 for side in pad.layout.size_mm)
@@ -31,8 +33,8 @@ def draw_plan(
     figure = Figure(figsize=(max(longer * width, 4.8), max(longer * height, 2.4)), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT, gid="pad"))
-    for corners in keep_out_mm:
-        axes.add_patch(Polygon(np.array(corners), facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
+    for corners in holes:
+        axes.add_patch(Polygon(corners, facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
     for fibre, points in enumerate(flatten(pad, 1e-3)):
         horizontal = not pad.layout.family(fibre)
         x, y = pad.to_mm(points).T
@@ -79,3 +81,14 @@ def _half_width(reach: Sequence[tuple[float, float]]) -> float:
     last = int(np.flatnonzero(weight >= half)[-1])  # the last point of all is 0
     share = (weight[last] - half) / (weight[last] - weight[last + 1])
     return float(distance[last] + share * (distance[last + 1] - distance[last]))
+
+
+def _polygons(keep_out_mm: object) -> list[NDArray[np.float64]]:
+    """Polygons (n, 2) in mm, of one corner or more."""
+    if not isinstance(keep_out_mm, Sequence):
+        raise InputError(f"keep_out_mm is {shown(keep_out_mm)}, expected polygons as [pad] has them")
+    found = [reals("keep_out_mm", corners) for corners in keep_out_mm]
+    for corners in found:
+        if corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
+            raise InputError(f"keep_out_mm has a polygon of shape {corners.shape}, expected (n, 2)")
+    return found

@@ -26,7 +26,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     if it did not, places are found as before. The old model is written over only where --out says so.
     """
     from design.common.files import refuse_unwritable, staged, write_json
-    from sense.health.model_folder import copy_health, health_files
+    from sense.health.model_folder import health_files, health_in
     from sense.localizer.calibration import recalibration
     from sense.localizer.localizer import Localizer
     from sense.recordings.import_export import open_recording
@@ -35,13 +35,14 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
     refuse_unwritable(target)
-    old, opened = Localizer.load(model), open_recording(recording)
+    old, health, opened = Localizer.load(model), health_in(model), open_recording(recording)
     with reported("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
     with staged(target, without=health_files()) as folder:
         localizer.save(folder)
         write_json(folder / "recalibration.json", document)
-        copy_health(model, folder)
+        for name, known in health.items():  # it was learnt without places
+            known.save(folder, name)
     common.show_result(document, recalibration.recalibration_lines(document), as_json)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError, instance, real
-from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
+from design.common.errors import InputError, instance, mapping, real, shown, whole
+from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask, as_numbers
 from sense.recordings.recording import Recording, rate_of
 
 from .alarm_thresholds import Tail
@@ -36,19 +36,23 @@ def learn_health(
         By name of the files, one model for recordings whose presses were commanded, and one for those that are found.
 
     Raises:
-        InputError: too few presses, or no living fibre.
+        InputError: too few presses, no living fibre, or an argument of another kind.
     """
     from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
 
-    learnt = np.ones(len(recording.presses_mm), dtype=bool)
-    learnt[list(held_back)] = False
+    learnt = np.ones(len(instance("recording", recording, Recording).presses_mm), dtype=bool)
+    away = as_numbers(held_back, np.int64, "held_back")
+    if away.ndim != 1 or not ((away >= 0) & (away < len(learnt))).all():
+        raise InputError(f"held_back is {shown(held_back)}, allowed are presses from 0 to {len(learnt) - 1}")
+    learnt[away] = False
+    seed = whole("the seed of provenance", mapping("provenance", provenance).get("seed"), 0, 2**64 - 1)
     readings, times_s = recording.readings, recording.times_s
     commanded = recording.begun, recording.lifted
     edges = {COMMANDED: commanded, DETECTED: as_detected(readings, times_s, *commanded)}
 
     def fit(name: str) -> HealthModel:
         begun, lifted = (edge[learnt] for edge in edges[name])
-        rng = np.random.default_rng(int(provenance["seed"]))
+        rng = np.random.default_rng(seed)
         return fit_health_model(readings, times_s, begun, lifted, rng=rng, provenance=provenance)
 
     with one_torch_thread():

@@ -1,6 +1,5 @@
 """Health in the folder of a model, as `calibrate` leaves it there: what is known of a recording's fibres by it."""
 
-import shutil
 from collections.abc import Collection
 from pathlib import Path
 
@@ -31,12 +30,13 @@ def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[Fibre
 
 def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:
     """Names of the files in a folder by which it tells health, for those of its models that are named."""
-    return {file.name for name in names for file in files_of("", name)}
+    return {file.name for name in names for file in files_of(Path(), name)}
 
 
-def copy_health(model: Path, folder: Path) -> None:
-    """What a model tells health by goes to another folder: it was learnt without places."""
-    settle(model)
-    for name in health_files():
-        if (model / name).exists():
-            shutil.copyfile(model / name, folder / name)
+def health_in(model: Path) -> dict[str, HealthModel]:
+    """What the folder of a model tells health by, by the names of its files; nothing where none was learnt.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    return {name: HealthModel.load(model, name) for name in (COMMANDED, DETECTED) if has_health(model, name)}

@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from design.common.errors import InputError
+from design.common.errors import path as as_path
 from design.common.files import read_bytes, staged
 
 if TYPE_CHECKING:
@@ -70,7 +71,8 @@ class ModelFiles(NamedTuple):
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
     """The files of the model `name` in a folder."""
-    return ModelFiles(Path(folder) / f"{name}.json", Path(folder) / f"{name}.safetensors")
+    folder = as_path("folder", folder)
+    return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 
 class TrainedModel(Protocol):

@@ -131,6 +131,7 @@ class Localizer:
         Raises:
             InputError: a lost fibre that is not there, or none left, or a published localizer that is to do without.
         """
+        instance("presses", presses, Scaled)
         alive: Mask = np.logical_and(presses.alive, self._alive(lost))
         if self.method == "published" and np.size(lost):
             raise InputError("fibres are lost: a published localizer knows none, train one of method masked")

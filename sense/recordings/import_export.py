@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from design.common.errors import InputError
+from design.common.errors import path as as_path
 from design.pad.published_files.matlab import load_mat
 from sense.recordings.processing.limits import Array
 
@@ -39,7 +40,7 @@ def open_recording(path: str | Path) -> Recording:
     Raises:
         InputError: as `Recording.open` and `import_file`.
     """
-    path = Path(path)
+    path = as_path("path", path)
     return import_file(path) if _is_bag(path) or _is_file(path) else Recording.open(path)
 
 

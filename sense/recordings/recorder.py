@@ -18,7 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from design.common.errors import InputError, shown, whole
+from design.common.errors import InputError, mapping, shown, whole
+from design.common.errors import path as as_path
 from design.common.files import (
     UNFINISHED,
     lock,
@@ -58,9 +59,10 @@ class Recorder:
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
-        fibres = whole("fibres", fibres, 1, MAX_FIBRES)
+        fibres, path = whole("fibres", fibres, 1, MAX_FIBRES), as_path("path", path)
+        told = {"source": dict(mapping("source", source)), "provenance": dict(mapping("provenance", provenance))}
         refuse_begun(path)
-        document = {"format": FORMAT, "fibres": fibres, "source": dict(source), "provenance": dict(provenance)}
+        document = {"format": FORMAT, "fibres": fibres, **told}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
             there = {file.name for file in path.iterdir()}
@@ -96,6 +98,7 @@ class Recorder:
         Raises:
             InputError: no run directory, damage elsewhere than at its end, links, or presses without any reading.
         """
+        path = as_path("path", path)
         fibres = fibres_of(path)
         if unborn(path):  # broken off before the first reading
             with writing(path):

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from design.common.errors import InputError, shown
+from design.common.errors import InputError, instance, shown
+from design.common.errors import path as as_path
 from design.common.files import held, read_json, scratch, sync, writing
 from sense.recordings.processing import limits
 from sense.recordings.processing.limits import Array, Indices, Mask
@@ -146,7 +147,7 @@ class Recording:
         Raises:
             InputError: no run directory, a file damaged elsewhere than at its end, or no press in it.
         """
-        path = Path(path)
+        path = as_path("path", path)
         fibres = fibres_of(path)
         start = read_json(path / START, FORMAT)
         rows, _ = read_blocks(path / READINGS, fibres)
@@ -179,9 +180,9 @@ class Recording:
             InputError: `path` exists and is not an empty directory (no other recording is written over, not even one
                 that appeared meanwhile), or cannot be written.
         """
-        refuse = refuse_replacing if replacing else refuse_existing
-        refuse(Path(path))
-        path = Path(path).resolve()
+        refuse = refuse_replacing if instance("replacing", replacing, bool) else refuse_existing
+        refuse(path := as_path("path", path))
+        path = path.resolve()
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with scratch(path.parent) as folder:

@@ -276,3 +276,18 @@ def test_keys_of_very_many_parts_are_refused_at_once(tmp_path):
     path.write_text("a" + ".a" * 100_000 + " = 1")
     with pytest.raises(InputError, match="a line has more than 200 dots"):
         Spec.load(path)
+
+
+@pytest.mark.parametrize("other", [None, 3, "a", int, np.ones((2, 2)), [1], {1: 2}])
+def test_what_is_no_section_and_no_table_is_refused(other):
+    for ask in (Spec({}).section, Spec({}).given):
+        with pytest.raises(InputError, match=r"model is .*, expected a section"):
+            ask(other)
+    for tables in (other, {"pad": other}):
+        with pytest.raises(InputError, match=r"expected a (table|section)"):
+            Spec({}).replaced(tables)
+    for sections in (3, [3], {None}, np.ones(2)):
+        with pytest.raises(InputError, match=r"sections (is|are)"):
+            Spec({"pad": {}}, sections=sections)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"unknown section \[pad\]"):
+        Spec({"pad": {}}, sections=np.array([]))  # pyright: ignore[reportArgumentType]

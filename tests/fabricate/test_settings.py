@@ -144,3 +144,9 @@ def test_the_defaults_are_those_the_pads_were_made_with():
         "bed_mm": [220.0, 220.0, 250.0],
         "resin": False,
     }
+
+
+@pytest.mark.parametrize("other", [None, 3, "pad.toml", {"mould": {}}])
+def test_settings_are_read_from_a_spec_and_nothing_else(other):
+    with pytest.raises(InputError, match=r"spec is .*, expected a Spec"):
+        FabricationSettings.from_spec(other)

@@ -5,13 +5,11 @@ with the results of an earlier run in place, or with none, kills the command tha
 files that belong together must be all old or all new, the second run must end well, and nothing else must be left.
 """
 
-import io
 import os
 import random
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,7 +20,7 @@ from pathlib import Path
 from design.common.errors import InputError
 from design.common.files import read_json, settle, sha256
 from sense.recordings.recording import Recording
-from tests.helpers.kills import KILLED, kill_at
+from tests.helpers.kills import KILLED, forked, kill_at
 
 SETTINGS = """
 [pad]
@@ -107,27 +105,13 @@ _EXPORTED = {"csv": "csv", "hdf5": "h5", "mcap": "mcap"}
 
 
 def started(words: Sequence[str], folder: Path, prepare: Callable[[], None] = lambda: None) -> int:
-    """Begin a command in a copy of this process, which has its imports done; the number of that process."""
-    child = os.fork()
-    if child:
-        return child
-    code = 1
-    try:
-        os.setsid()
-        os.chdir(folder)
-        for number, name in ((1, "out"), (2, "err")):
-            os.dup2(os.open(f"{folder}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-        sys.stdout, sys.stderr = (
-            io.TextIOWrapper(os.fdopen(number, "wb", buffering=0), write_through=True) for number in (1, 2)
-        )
-        os.environ["TMPDIR"] = tempfile.tempdir = f"{folder}.tmp"
-        prepare()
+    """Begin a command in a copy of this process; the number of that process."""
+
+    def command() -> None:
         sys.argv = ["padforge", *words]
         import_module("padforge").main()
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else int(bool(end.code))
-    finally:
-        os._exit(code)
+
+    return forked(command, folder, prepare)
 
 
 def ended(child: int) -> int:

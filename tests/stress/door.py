@@ -1,6 +1,7 @@
 """The front door for stress tests: a folder full of files to choose from, a command run in it, and the verdict."""
 
 import io
+import json
 import os
 import shutil
 import sys
@@ -9,10 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 
 import padforge
 from design.common.errors import InputError
+from fabricate.mesh_files import read_mesh
 from tests.stress.clock import LIMIT_S, ends_in_time
 
 CHEAP = """
@@ -90,6 +93,25 @@ def judge(ended: Ended, changed: bool, allowed: Sequence[int] = (0, 1, 2, 130)) 
         assert not changed, ended
 
 
+def require_whole_file(path: Path) -> None:
+    """See that a file can be read to its end by what reads its kind."""
+    match path.suffix:
+        case ".json":
+            json.loads(path.read_text())
+        case ".stl" | ".3mf":
+            read_mesh(path)
+        case ".png":
+            assert path.read_bytes().endswith(b"IEND\xaeB`\x82"), path
+        case ".svg":
+            assert path.read_text().rstrip().endswith("</svg>"), path
+        case ".dxf":
+            assert path.read_text().rstrip().endswith("EOF"), path
+        case ".npz":
+            np.load(path).close()
+        case ".html":
+            assert path.read_text().rstrip().endswith("</html>"), path
+
+
 def require_one_line(error: InputError, about: str = "") -> None:
     """See that a refusal is one line, no endless one, that names what it is `about`."""
     assert "\n" not in str(error)
@@ -110,7 +132,7 @@ class Workshop:
         before = Path.cwd()
         os.chdir(self.master)
         try:
-            _fill()
+            fill()
         finally:
             os.chdir(before)
         self._renew()
@@ -147,8 +169,8 @@ SPECIAL = ("pipe", "pipe.json", "pipe.stl", "pipe.mat", "pipe.csv", "pipe.toml",
 """Pipes that nobody writes to: who opens one waits for ever."""
 
 
-def _fill() -> None:
-    """Put files of every kind, good and bad, into the current folder."""
+def fill() -> None:
+    """Put files of every kind, good and bad, into the current folder; the pipes of SPECIAL are not among them."""
     Path("pad.toml").write_text(CHEAP)
     Path("other.toml").write_text(CHEAP.replace("grid = 2", "grid = 1"))
     Path("bad.toml").write_text("[pad]\ngrid = 'x'\n")
@@ -180,3 +202,80 @@ def _fill() -> None:
     Path("nested.json").write_text("[" * 100_000)
     Path("nested.toml").write_text("a = " + "[" * 100_000)
     Path("list.json").write_text("[]")
+
+
+LONG = "x" * 300
+"""Longer than a name may be."""
+HOSTILE = (
+    *("", " ", "-", "--", "-1", "0", "1", "2", "3", "9" * 20, "-" + "9" * 20, "1e400", "nan", "inf"),
+    *("-inf", "NaN", "0x10", "1_000", "1.5", "٣", "½", "true", "none", "None", "null", "é", "日本"),
+    *(
+        "\udc80\udcff",
+        "\x01",
+        "a\nb",
+        "a\tb",
+        "\x1b[31m",
+        "%s%n",
+        "{0}",
+        "$HOME",
+        "~",
+        "*",
+        "../x",
+        "0,1",
+        "0,,1",
+        ",",
+        "0,0",
+    ),
+    *("1" * 5000, "x" * 70_000),
+)
+"""Values that are wrong nearly everywhere."""
+
+PATHS = (
+    *(
+        ".",
+        "..",
+        "",
+        "pad",
+        "empty",
+        "file",
+        "file/below",
+        "new",
+        "new/deep/er",
+        "nowhere/",
+        "pad/",
+        "pad/recording",
+    ),
+    *("pad/morphology.json", "pad/mould.stl", "pad/mould.3mf", "pad/design.json", "pad/recording/start.json"),
+    *("presses.csv", "presses.h5", "pad.toml", "other.toml", "bad.toml", "nested.json", "nested.toml", "list.json"),
+    *(f"{kind}.{suffix}" for kind in ("junk", "zero", "dangling", "loop") for suffix in ("json", "stl", "mat", "toml")),
+    *(f"{kind}.{suffix}" for kind in ("junk", "zero", "dangling") for suffix in ("csv", "h5", "3mf")),
+    *(f"{kind}.{suffix}" for kind in ("folder", "nothing") for suffix in ("json", "stl", "mat")),
+    *SPECIAL,
+    *("/dev/null", "/dev/full", "/dev/zero", "/dev/stdin/x", "/proc/self/mem", "/proc/nowhere/x", "/sys/x", "new.svg"),
+    *(
+        LONG,
+        f"{LONG}.json",
+        f"new/{LONG}/x",
+        "/".join(["y" * 100] * 60),
+        "日本",
+        "\udc80\udcff",
+        "a\nb",
+        "-",
+        "--",
+        " ",
+        "~",
+    ),
+    *(
+        "new.json",
+        "new.csv",
+        "new.h5",
+        "new.png",
+        "new.stl",
+        "new.mat",
+        "\x1b[31m.json",
+        "pad/../pad",
+        "con",
+        "x" * 250 + ".svg",
+    ),
+)
+"""Paths of all kinds, some of which are right for each command."""

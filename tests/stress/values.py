@@ -81,8 +81,12 @@ _ARRAYS: list[Any] = [
 ]
 
 
+ODD = (*_NUMBERS, *_OTHERS, *_ARRAYS)
+"""Values of any kind: numbers that are no sizes, names that are none, arrays of odd shapes, objects that raise."""
+
+
 def anything() -> st.SearchStrategy[Any]:
-    """Values of any kind: numbers that are no sizes, names that are none, arrays of odd shapes, objects that raise."""
+    """Any of `ODD`, or any number."""
     return st.sampled_from(_NUMBERS) | st.sampled_from(_OTHERS) | st.sampled_from(_ARRAYS) | st.floats() | st.integers()
 
 

@@ -24,7 +24,8 @@ from sense.recordings.recording import Recording
 
 from .assembly import MEASURES, assembled
 from .csv_table import CsvTable
-from .mapping import Part, chosen, parse_mapping
+from .mapping import Part, chosen, file_and_mapping, parse_mapping
+from .model_findings import export_path
 
 QUANTITIES = ("time", "fibres", "x", "y", "depth", "reached", "force", "press")
 """What a line can hold."""
@@ -39,7 +40,7 @@ def import_csv(path: str | Path, mapping: str = "") -> Recording:
     Raises:
         InputError: the file is no such CSV, or no press is in it; the message names the line.
     """
-    path = Path(path)
+    path, mapping = file_and_mapping(path, mapping)
     parts = parse_mapping(mapping, QUANTITIES) if mapping else None
     table = CsvTable(path)
     try:
@@ -85,7 +86,7 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     Raises:
         InputError: `path` cannot be written.
     """
-    path = Path(path)
+    path = export_path(recording, path)
     measures = {part.name: getattr(recording, MEASURES[part.quantity]) for part in MEASURED}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}
     header = ["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures]

@@ -17,7 +17,8 @@ from design.pad.published_files.hdf5_datasets import plain_datasets
 from sense.recordings.recording import Recording
 
 from .assembly import MEASURES, assembled
-from .mapping import chosen, listed, parse_mapping
+from .mapping import chosen, file_and_mapping, listed, parse_mapping
+from .model_findings import export_path
 
 FORMAT = "padforge-hdf5/1"
 _ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {key: key for key in ("presses_mm", "begun", "lifted")}
@@ -34,7 +35,7 @@ def export_hdf5(recording: Recording, path: str | Path) -> None:
     """
     import h5py
 
-    path = Path(path)
+    path = export_path(recording, path)
     with writing(path), atomic(path) as temporary, h5py.File(temporary, "w", track_order=True, locking=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["source"] = json.dumps(dict(recording.source))
@@ -52,7 +53,7 @@ def import_hdf5(path: str | Path, mapping: str = "") -> Recording:
         InputError: the file is missing, torn, of another kind, takes values from other files, or its datasets do not
             fit together.
     """
-    path = Path(path)
+    path, mapping = file_and_mapping(path, mapping)
     if mapping:
         return _mapped(path, mapping)
     with plain_datasets(path) as file:

@@ -21,7 +21,7 @@ from sense.recordings.processing.limits import Indices
 from sense.recordings.recorder import refuse_existing
 from sense.recordings.recording import Recording
 
-from .model_findings import ModelFindings
+from .model_findings import ModelFindings, export_path
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -50,6 +50,7 @@ def export_lerobot(recording: Recording, path: Path, findings: ModelFindings | N
         InputError: pyarrow is not installed, no place is known, `path` exists and is not an empty folder, or cannot be
             written.
     """
+    path = export_path(recording, path, findings)
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:

@@ -8,9 +8,11 @@ factor, such as 0.001; without any, times are s, readings V, places and depths m
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from math import isfinite
+from pathlib import Path
 from typing import NamedTuple
 
-from design.common.errors import InputError, shown
+from design.common.errors import InputError, instance, shown
+from design.common.errors import path as as_path
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6}
@@ -49,6 +51,15 @@ class Part(NamedTuple):
     quantity: str
     name: str
     factor: float | None = None
+
+
+def file_and_mapping(path: object, mapping: object) -> tuple[Path, str]:
+    """What a caller hands to a reader of files: a path and the text of a mapping, "" for none.
+
+    Raises:
+        InputError: one of them is something else.
+    """
+    return as_path("path", path), instance("mapping", mapping, str)
 
 
 def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part]:

@@ -2,8 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from design.common.errors import instance
+from design.common.errors import path as as_path
 from sense.recordings.processing.limits import Array
+from sense.recordings.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -34,3 +38,15 @@ class ModelFindings:
     depths_r90_mm: Array
     faults: Sequence[FaultFound] | None = None
     dead: Sequence[int] = ()
+
+
+def export_path(recording: object, path: object, findings: object = None) -> Path:
+    """Where a recording, and what a model says of it, is to be written.
+
+    Raises:
+        InputError: one of them is something else.
+    """
+    instance("recording", recording, Recording)
+    if findings is not None:
+        instance("findings", findings, ModelFindings)
+    return as_path("path", path)

@@ -10,7 +10,7 @@ from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
 
 from .assembly import assembled
-from .mapping import chosen, parse_mapping
+from .mapping import chosen, file_and_mapping, parse_mapping
 
 READINGS_PER_PRESS = 40
 """Length of the published cycle of a press, readings."""
@@ -30,7 +30,7 @@ def import_mat(path: str | Path, mapping: str = "") -> Recording:
     Raises:
         InputError: the file is torn, of another kind, or its variables do not fit together.
     """
-    path = Path(path)
+    path, mapping = file_and_mapping(path, mapping)
     return _mapped(path, mapping) if mapping else _published(path)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from design.common.errors import InputError, shown
+from design.common.errors import MOST_VALUES, InputError, shown
 
 MAX_FIBRES = 512
 MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
@@ -38,6 +38,8 @@ def as_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool 
         raise InputError(f"{name} are {shown(values)}, expected an array of {what} ({error})") from error
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} are {shown(values)} ({array.dtype}), expected an array of {what}")
+    if array.size > MOST_VALUES:
+        raise InputError(f"{name} are {array.size} numbers, allowed are {MOST_VALUES}")
     with np.errstate(over="ignore"):  # of longer floats, which become infinity
         array = array.astype(np.float64, copy=copy) if array.dtype.kind == "f" else array
     if kind is np.int64 and not ((array >= -MAX_INDEX) & (array <= MAX_INDEX) & (array == np.trunc(array))).all():

@@ -143,3 +143,14 @@ def test_the_plan_goes_to_the_folder_of_the_pad_unless_told_otherwise(tmp_path, 
     assert (tmp_path / "a.png").exists()
     with pytest.raises(InputError, match=r"--out is a\.pdf, allowed are \.svg and \.png"):
         CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.pdf"], catch_exceptions=False)
+
+
+def test_rules_that_cannot_be_are_told_before_an_import_writes_anything(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Morphology.straight(2).save(tmp_path / "pad.json")
+    (tmp_path / "pad.toml").write_text("[pad]\ngrid = 2\n")
+    CliRunner().invoke(design, ["show", "pad.json", "--out", "plan.svg"], catch_exceptions=False)
+    (tmp_path / "pad.toml").write_text("[pad]\ngrid = 2\n[rules]\nlost = 1\n")
+    with pytest.raises(InputError, match=r"\[rules\] lost: no such key"):
+        CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.json", "pad.toml", "plan.svg"]

@@ -175,3 +175,14 @@ def test_published_samples_that_are_not_as_published_are_one_line(settings, tmp_
 def test_parameters_of_another_kind_are_refused(para):
     with pytest.raises(InputError, match="parameters"):
         Morphology.from_parameters(para)
+
+
+@pytest.mark.parametrize("other", [None, 3, "a", np.ones((2, 2)), [1], {1: 2}])
+def test_a_document_or_layout_of_another_kind_is_one_line(other):
+    pad = Morphology.straight(1)
+    with pytest.raises(InputError, match=r"document is .*, expected a table"):
+        Morphology.of_document(other)
+    with pytest.raises(InputError, match=r"layout is .*, expected a Layout"):
+        Morphology.of_layout(pad.knots, other)
+    with pytest.raises(InputError, match="provenance"):
+        Morphology.of_layout(pad.knots, pad.layout, 0 if other is None else other)  # pyright: ignore

@@ -143,3 +143,15 @@ def test_courses_that_are_far_longer_than_a_pad_are_refused(twin, tmp_path):
     (tmp_path / "twin.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"twin\.json: laid_mm are 2.*e\+06 mm long in all, allowed are 1\.89e\+06"):
         Twin.load(tmp_path / "twin.json")
+
+
+@pytest.mark.parametrize("unit_mm", ["", 0.0, -1, np.nan, [3.0], True])
+def test_a_unit_that_no_pad_has_is_refused(twin, unit_mm):
+    with pytest.raises(InputError, match="unit_mm is"):
+        twin.contact(unit_mm)
+
+
+@pytest.mark.parametrize("places_mm", [[[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]])
+def test_places_that_are_none_are_refused_in_one_line(twin, places_mm):
+    with pytest.raises(InputError, match="places_mm"):
+        twin.laid_signals(places_mm)

@@ -283,3 +283,9 @@ def test_the_report_tells_how_deep_and_hard_presses_were(pad: Path) -> None:
     (pad / "recording" / "journal.ndjson").write_text("{}\n")
     with pytest.raises(InputError, match=r"journal\.ndjson: line 1"):
         write_report(pad)
+
+
+@pytest.mark.parametrize("folder", [None, 3, False, ["a"], object(), "", "a\0b"])
+def test_a_folder_that_is_no_path_is_refused_in_one_line(folder):
+    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+        write_report(folder)

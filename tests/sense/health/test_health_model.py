@@ -10,11 +10,12 @@ import pytest
 from design.common.errors import InputError
 from sense import Recording
 from sense.health.fault_likelihoods import HYPOTHESES
-from sense.health.health_model import COMMANDED, HealthModel, checked_presses
+from sense.health.health_model import COMMANDED, DETECTED, HealthModel, checked_presses
+from sense.health.model_folder import health_files, health_in
 from sense.health.trained_model import files_of
 from tests.sense.health.pads import BAD_FROM, later, weak
 
-DOCUMENT, WEIGHTS = (path.name for path in files_of("", COMMANDED))
+DOCUMENT, WEIGHTS = (path.name for path in files_of(Path(), COMMANDED))
 
 
 def test_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path) -> None:
@@ -96,3 +97,28 @@ def test_presses_follow_each_other_within_the_readings(begun: list[int], lifted:
 def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthModel) -> None:
     for alarms in (1e-3, 1e-5):
         assert np.exp(-replace(model, false_alarms=alarms).threshold) == pytest.approx(alarms / len(HYPOTHESES))
+
+
+def test_health_goes_to_another_folder_bit_by_bit(model: HealthModel, tmp_path: Path) -> None:
+    assert health_in(tmp_path) == {}
+    for name in (COMMANDED, DETECTED):
+        model.save(tmp_path / "old", name)
+    for name, each in health_in(tmp_path / "old").items():
+        each.save(tmp_path / "new", name)
+    for name in health_files():
+        assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", sorted(health_files()))
+def test_health_that_is_damaged_or_endless_is_none(model: HealthModel, tmp_path: Path, name: str) -> None:
+    for spoilt in (b"{", b"", None):
+        for detected in (COMMANDED, DETECTED):
+            model.save(tmp_path, detected)
+        (tmp_path / name).unlink()
+        if spoilt is None:
+            (tmp_path / name).symlink_to("/dev/zero")
+        else:
+            (tmp_path / name).write_bytes(spoilt)
+        with pytest.raises(InputError, match=name):
+            health_in(tmp_path)
+        (tmp_path / name).unlink()

@@ -79,3 +79,22 @@ def test_health_is_learnt_from_the_presses_that_were_not_held_back(
     assert 0 < len(localizer.test) < len(learnt)
     np.testing.assert_array_equal(edges[COMMANDED], (recording.begun[learnt], recording.lifted[learnt]))
     assert len(edges[DETECTED][0]) == len(edges[DETECTED][1]) == len(learnt)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"recording": 3}, "recording is 3, expected a Recording"),
+        ({"held_back": [0, 10**6]}, "held_back is .*, allowed are presses from 0 to"),
+        ({"held_back": [-1]}, "held_back is .*, allowed are presses from 0 to"),
+        ({"held_back": "ab"}, "held_back"),
+        ({"provenance": None}, "provenance is None, expected a table"),
+        ({"provenance": {}}, "the seed of provenance is None"),
+        ({"provenance": {"seed": "a"}}, "the seed of provenance is 'a'"),
+    ],
+)
+def test_what_health_is_not_learnt_from_is_refused_in_one_line(
+    pad: Recording, change: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        learning.learn_health(**{"recording": pad, "held_back": (), "provenance": {"seed": 0}, **change})

@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -250,3 +251,16 @@ def test_parts_are_joined_press_by_press(deep_localizer: Localizer, deep_recordi
     expected = deep_localizer.locate(presses[:9])
     np.testing.assert_allclose(found.places_mm, expected.places_mm, atol=1e-3)
     np.testing.assert_allclose(found.measures["force_n"].r90, expected.measures["force_n"].r90, rtol=1e-3)
+
+
+@pytest.mark.parametrize("folder", [None, 3, ["a"], np.ones(3), ""])
+def test_a_model_is_kept_in_a_folder_and_nothing_else(localizer: Localizer, folder: Any) -> None:
+    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+        Localizer.load(folder)
+    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+        localizer.save(folder)
+
+
+def test_what_are_no_inputs_of_presses_is_refused(localizer: Localizer, recording: Recording) -> None:
+    with pytest.raises(InputError, match=r"presses is .*, expected a Scaled"):
+        localizer.locate(recording)  # pyright: ignore[reportArgumentType]

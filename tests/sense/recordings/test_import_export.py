@@ -1,6 +1,8 @@
 """Import and export: the published recording, CSV, and files that are neither."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,19 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from design.common.errors import InputError
-from sense import Recorder, Recording, export_csv, import_csv, import_mat, open_recording
+from sense import (
+    Recorder,
+    Recording,
+    export_bag,
+    export_csv,
+    export_hdf5,
+    export_lerobot,
+    import_bag,
+    import_csv,
+    import_hdf5,
+    import_mat,
+    open_recording,
+)
 from sense.cli.main import sense
 from sense.recordings.import_export import arm_states, export_file
 from tests.helpers.effort import few
@@ -97,3 +111,60 @@ def test_states_of_an_arm_are_read_from_a_run_directory_that_has_them(tmp_path: 
         recorder.append([0.0, 1.0], [[1.0], [2.0]])
     assert arm_states(tmp_path / "none") is None
     assert arm_states(tmp_path / "run.csv") is None
+
+
+OTHERS: tuple[Any, ...] = (None, 3, np.nan, b"x", ["a"], {"radius": 0.5}, np.ones((2, 2)), object())
+"""What is no path, no text, no recording."""
+
+
+@pytest.mark.parametrize(
+    "read", [import_csv, import_mat, import_hdf5, import_bag, open_recording, Recording.open, Recorder.resume]
+)
+def test_what_is_no_path_is_refused_in_one_line(read: Callable[..., Any]) -> None:
+    for other in OTHERS:
+        with pytest.raises(InputError, match=r"path is .*, expected a path"):
+            read(other)
+
+
+@pytest.mark.parametrize(
+    ("read", "name"), [(import_csv, "a.csv"), (import_mat, "a.mat"), (import_hdf5, "a.h5"), (import_bag, "a.mcap")]
+)
+def test_a_mapping_that_is_no_text_is_refused_in_one_line(read: Callable[..., Any], name: str) -> None:
+    for other in OTHERS:
+        with pytest.raises(InputError, match=r"mapping is .*, expected a str"):
+            read("file", other)
+
+
+@pytest.mark.parametrize("write", [export_csv, export_hdf5, export_bag, export_lerobot])
+def test_what_cannot_be_exported_is_refused_in_one_line(
+    recording: Recording, tmp_path: Path, write: Callable[..., Any]
+) -> None:
+    for other in OTHERS:
+        with pytest.raises(InputError, match=r"recording is .*, expected a Recording"):
+            write(other, tmp_path / "x")
+        with pytest.raises(InputError, match=r"path is .*, expected a path"):
+            write(recording, other)
+    if write in (export_bag, export_lerobot):
+        with pytest.raises(InputError, match="findings is 3, expected a ModelFindings"):
+            write(recording, tmp_path / "x", 3)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("states", [np.ones((3, 9)), np.ones(10), "a", 3.0])
+def test_states_that_no_arm_has_are_refused(recording: Recording, tmp_path: Path, states: Any) -> None:
+    with pytest.raises(InputError, match="states"):
+        export_bag(recording, tmp_path / "x.mcap", states=states)
+
+
+def test_a_recording_is_written_only_to_a_path_and_with_tables(recording: Recording, tmp_path: Path) -> None:
+    for other in OTHERS:
+        with pytest.raises(InputError, match=r"path is .*, expected a path"):
+            recording.save(other, {})
+        with pytest.raises(InputError, match=r"path is .*, expected a path"):
+            Recorder(other, 4, {}, {})
+    for other in ("a", 3, [1], {1: 2}):
+        with pytest.raises(InputError, match=r"source is .*, expected a table"):
+            Recorder(tmp_path / "x", 4, other, {})  # pyright: ignore[reportArgumentType]
+        with pytest.raises(InputError, match=r"provenance is .*, expected a table"):
+            Recorder(tmp_path / "x", 4, {}, other)  # pyright: ignore[reportArgumentType]
+    assert list(tmp_path.iterdir()) == []

@@ -10,14 +10,12 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from design.common.files import atomic, unchanged, write_json
 from design.pad.morphology import Morphology
-from fabricate.mesh_files import read_mesh
 from tests.helpers.effort import LONG, few
-from tests.stress.door import CHEAP, contents
+from tests.stress.door import CHEAP, contents, require_whole_file
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")
 
@@ -85,23 +83,8 @@ def start(folder: Path, *arguments: str, limit: int = -1, tied: bool = False) ->
 def require_whole(folder: Path) -> None:
     """Every file in a folder can be read to its end by what reads its kind; temporary ones are none."""
     for path in folder.rglob("*"):
-        if not path.is_file() or any(part.startswith(".") for part in path.relative_to(folder).parts):
-            continue
-        match path.suffix:
-            case ".json":
-                json.loads(path.read_text())
-            case ".stl" | ".3mf":
-                read_mesh(path)
-            case ".png":
-                assert path.read_bytes().endswith(b"IEND\xaeB`\x82"), path
-            case ".svg":
-                assert path.read_text().rstrip().endswith("</svg>"), path
-            case ".dxf":
-                assert path.read_text().rstrip().endswith("EOF"), path
-            case ".npz":
-                np.load(path).close()
-            case ".html":
-                assert path.read_text().rstrip().endswith("</html>"), path
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts):
+            require_whole_file(path)
 
 
 def litter(folder: Path) -> list[str]:

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError
 from design.common.files import UNFINISHED, staged, writing
-from sense.recordings.formats.model_findings import ModelFindings
-from sense.recordings.processing.limits import Array
+from sense.recordings.formats.model_findings import ModelFindings, export_path
+from sense.recordings.processing.limits import Array, as_numbers
+from sense.recordings.recorder import STATE_COLUMNS
 from sense.recordings.recording import Recording
 
 from . import exact, topics
@@ -37,8 +38,12 @@ def export_bag(
         states: (n, 10) of an arm, by `recorder.STATE_COLUMNS`; its poses become a topic.
 
     Raises:
-        InputError: rosbags is not installed, `path` cannot be written, or the recording is too long for a bag.
+        InputError: rosbags is not installed, `path` cannot be written, the recording is too long for a bag, or an
+            argument is of another kind.
     """
+    path = export_path(recording, path, findings)
+    if states is not None and (states := as_numbers(states, np.float64, "states")).shape[1:] != (len(STATE_COLUMNS),):
+        raise InputError(f"states have shape {states.shape}, expected (n, {len(STATE_COLUMNS)})")
     store = typestore(f"{path}: MCAP")
     epoch_s = topics.epoch_of(recording.times_s)
     streams = topics.streams_of(recording, epoch_s)

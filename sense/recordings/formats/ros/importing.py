@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from design.common.errors import InputError, shown
 from sense.recordings.formats.assembly import assembled
-from sense.recordings.formats.mapping import MILLIMETRES, UNITS, Part, chosen, listed, parse_mapping
+from sense.recordings.formats.mapping import MILLIMETRES, UNITS, Part, chosen, file_and_mapping, listed, parse_mapping
 from sense.recordings.formats.published_mat import NOTE
 from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
@@ -77,7 +77,7 @@ def import_bag(path: str | Path, mapping: str = "") -> Recording:
         InputError: rosbags is not installed, no bag, one that is cut off or damaged, beyond the limits of `bags.bag`,
             or messages that do not fit together; the message names the file.
     """
-    path = Path(path)
+    path, mapping = file_and_mapping(path, mapping)
     store = typestore(f"{path}: a bag of ROS 2")
     with np.errstate(all="ignore"):  # whatever damaged numbers give is refused as such
         return _mapped(store, path, mapping) if mapping else _exported(store, path)

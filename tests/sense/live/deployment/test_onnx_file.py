@@ -1,6 +1,9 @@
 """`localizer.onnx`: onnxruntime finds in it what the localizer finds, whatever is lost and however many presses."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +21,7 @@ from tests.sense.conftest import QUICK
 from tests.sense.live.deployment.conftest import tutorial
 
 DIGEST = "0" * 64
+ROOT = Path(__file__).resolve().parents[4]
 
 
 def session(path: Path) -> onnxruntime.InferenceSession:
@@ -116,3 +120,11 @@ def test_the_script_of_the_tutorial_does_as_it_says(localizer, brief, tmp_path, 
     assert np.array_equal(found["begun"], brief.begun)
     places_mm = localizer.locate(localizer.inputs(brief)).places_mm
     assert np.hypot(*(found["places_mm"][:-1] - places_mm[:-1]).T).max() < MOST_OFF_MM
+
+
+def test_onnxruntime_is_kept_from_telling_its_maker_of_its_use(tmp_path: Path) -> None:
+    """Where it does, it leaves a file in the folder for temporary ones."""
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    command = [sys.executable, "-c", "import sense.live.deployment.onnx_file"]
+    subprocess.run(command, cwd=ROOT, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
+    assert list(tmp_path.iterdir()) == []

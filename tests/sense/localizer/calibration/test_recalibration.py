@@ -264,7 +264,6 @@ def test_the_command_writes_a_whole_model(
     localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     localizer.save(tmp_path / "old")
-    (tmp_path / "old" / "health.json").write_text("{}")
     known_only(remade(recording), slice(0, 20)).save(tmp_path / "new", {})
     command = ["recalibrate", "--model", "old", "new", "--out", "now", "--json"]
     monkeypatch.chdir(tmp_path)
@@ -276,7 +275,12 @@ def test_the_command_writes_a_whole_model(
     assert document == json.loads(Path("now/recalibration.json").read_text())
     assert (document["format"], document["presses"]) == ("padforge-recalibration/1", 20)
     assert Localizer.load("now").fibres == 4
-    assert Path("now/health.json").exists()
+    Path("old/health.json").write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["padforge", "sense", *command[:-2], "later"])
+    with pytest.raises(SystemExit) as caught:
+        padforge.main()
+    assert (caught.value.code, capsys.readouterr().err[:28]) == (2, "padforge: old/health.json: f")
+    assert not Path("later").exists()
 
 
 def test_a_localizer_of_several_depths_follows_presses_of_known_and_of_unknown_depth(

@@ -262,6 +262,7 @@ def test_stretches_begin_after_long_intervals():
         (lambda: stretches([0, 2, 1], 1), "times_s are .*, expected finite numbers that ascend"),
         (lambda: stretches([np.inf, np.inf], 1), "finite"),
         (lambda: stretches([[0]], 1), "shape"),
+        (lambda: stretches(np.broadcast_to(1.0, 2**40), 1), "times_s are 1099511627776 numbers, allowed are"),
         (lambda: stretches([0], 0), "longest_s is 0, allowed is a number above 0"),
     ],
 )

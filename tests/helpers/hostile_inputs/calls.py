@@ -1,0 +1,207 @@
+"""Hostile calls: public functions and methods, with an argument or two that are of another type or value."""
+
+import inspect
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import design
+import fabricate
+import padforge
+import sense
+from design import InputError
+from design.common.errors import Fault, shown
+from sense.health.health_model import DETECTED
+from tests.stress.sense.cases import TINY, spoiled
+from tests.stress.values import ODD
+
+from .texts import Rng, pick
+
+TRUSTED = {"sense.HealthModel.refuse_other", "sense.Finder.follow"}
+"""They are handed what those who call them have checked."""
+CALLBACKS = {"progress", "report", "warn", "executor", "keep_in"}
+"""Parameters that are left alone: what is called back may raise what it likes."""
+
+
+@cache
+def sound() -> dict[str, Any]:
+    """Arguments that suit, by the name of a parameter, of the files in the current folder."""
+    pad = design.Morphology.load("pad/morphology.json")
+    recording = sense.open_recording("pad/recording")
+    search = design.SearchSettings(knots=1, starts=1, steps=2, lost=1)
+    found = {
+        "pad": pad,
+        "knots": pad.knots,
+        "presses": np.array([[1.0, 1.0], [1.5, 2.0]]),
+        "places": np.array([[1.0, 2.0]]),
+        "places_mm": np.array([[1.0, 2.0]]),
+        "parameters": np.ones((3, 8)),
+        "contact": design.Contact(),
+        "rules": design.RulesSettings(enforce=False),
+        "settings": fabricate.FabricationSettings(),
+        "search": search,
+        "twin": design.Twin.load("pad/twin.json"),
+        "recording": recording,
+        "localizer": sense.Localizer.load(Path("pad")),
+        "localizers": [sense.Localizer.load(Path("pad"))],
+        "model": sense.HealthModel.load(Path("pad")),
+        "health": sense.HealthModel.load(Path("pad"), DETECTED),
+        "options": TINY,
+        "rig": sense.RigSettings(presses=4, readings_per_press=8),
+        "readings": recording.readings,
+        "times_s": recording.times_s,
+        "begun": recording.begun,
+        "lifted": recording.lifted,
+        "presses_mm": recording.presses_mm,
+        "rng": np.random.default_rng(0),
+        "indenter": design.Indenter(),
+        "layout": pad.layout,
+        "size": design.PadSettings(grid=2),
+        "path": "new.json",
+        "out": "new",
+        "folder": "pad",
+        "formats": ("svg",),
+        "fibres": 4,
+        "channels": 4,
+        "rate_hz": 13.3,
+        "width": 5,
+        "lam": 2.0,
+        "times": 2,
+        "depths": np.array([0.1]),
+        "tables": {"contact": {"radius": 0.5}},
+        "held_back": (0, 1),
+        "document": pad.document(),
+        "levels": (0, 1),
+        "tolerance": 1e-2,
+        "provenance": {},
+        "source": {"a": 1},
+        "unit_mm": 11.25,
+        "lost": 1,
+    }
+    return found | {f"{name} of {where}": value for (where, name), value in _elsewhere(found).items()}
+
+
+def _elsewhere(found: dict[str, Any]) -> dict[tuple[str, str], Any]:
+    """Arguments that suit where a name means something else than elsewhere."""
+    return {
+        ("sense.locate", "lost"): (1,),
+        ("sense.Live", "localizers"): found["localizers"],
+        ("design.search", "pad"): design.PadSettings(grid=1),
+        ("design.search", "search"): found["search"],
+        ("design.search", "contact"): found["contact"],
+        ("fabricate.check_mesh", "path"): "pad/mould.stl",
+        ("design.Morphology.load", "path"): "pad/morphology.json",
+        ("design.Twin.load", "path"): "pad/twin.json",
+        ("sense.open_recording", "path"): "pad/recording",
+        ("sense.Recording.open", "path"): Path("pad/recording"),
+        ("sense.import_csv", "path"): "presses.csv",
+        ("sense.import_hdf5", "path"): "presses.h5",
+        ("sense.import_mat", "path"): "pad.mat",
+        ("sense.import_bag", "path"): Path("presses.mcap"),
+        ("sense.export_csv", "path"): "new.csv",
+        ("sense.export_hdf5", "path"): "new.h5",
+        ("sense.export_bag", "path"): Path("new.mcap"),
+        ("sense.export_lerobot", "path"): Path("new"),
+        ("sense.export_bag", "findings"): None,
+        ("sense.export_lerobot", "findings"): None,
+        ("design.Spec.load", "path"): Path("pad.toml"),
+        ("design.Spec.section", "model"): design.Contact,
+        ("design.Spec.given", "model"): design.Contact,
+        ("sense.HealthModel.load", "folder"): Path("pad"),
+        ("sense.Localizer.load", "folder"): Path("pad"),
+    }
+
+
+_OF_CLASS = {"Morphology": "pad", "Twin": "twin", "Recording": "recording", "Localizer": "localizer"}
+_OF_CLASS |= {"Indenter": "indenter", "HealthModel": "health"}
+"""Sound arguments that are of a class, whose methods are called as well."""
+
+
+@cache
+def functions() -> dict[str, Callable[..., Any]]:
+    """All that the packages hand out and that can be called, by name; records that check nothing are not among them."""
+    found: dict[str, Callable[..., Any]] = {"padforge.write_report": padforge.write_report}
+    made = {
+        "Finder": lambda: sense.Finder(4),
+        "RunningMedian": lambda: sense.RunningMedian(4, 5),
+        "TotalVariation": lambda: sense.TotalVariation(4, 2.0),
+        "Live": lambda: sense.Live(sound()["localizers"], sound()["health"], 4, 13.3),
+        "Monitor": lambda: sense.Monitor(sound()["model"]),
+        "Spec": lambda: design.Spec({}),
+        **{name: lambda key=key: sound()[key] for name, key in _OF_CLASS.items()},
+    }
+    for package in (design, fabricate, sense):
+        for name in sorted(package.__all__):
+            thing, full = getattr(package, name), f"{package.__name__}.{name}"
+            if not inspect.isclass(thing):
+                found[full] = thing
+                continue
+            if issubclass(thing, Exception):
+                continue
+            if not is_dataclass(thing) or hasattr(thing, "__post_init__"):
+                found[full] = thing
+            for key, method in inspect.getmembers(thing, callable):
+                inherited = (getattr(method, "__module__", "") or "").partition(".")[0] != package.__name__
+                if key.startswith("_") or f"{full}.{key}" in TRUSTED or inherited:
+                    continue
+                if inspect.ismethod(method) or isinstance(inspect.getattr_static(thing, key), staticmethod):
+                    found[f"{full}.{key}"] = method
+                elif name in made:
+                    found[f"{full}.{key}"] = _of_instance(made[name], method)
+    return found
+
+
+def _of_instance(make: Callable[[], Any], method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of whatever `make` gives when it is called, with the parameters it has beside `self`."""
+
+    def call(**arguments: Any) -> Any:
+        return method(make(), **arguments)
+
+    signature = inspect.signature(method)
+    call.__signature__ = signature.replace(parameters=list(signature.parameters.values())[1:])  # pyright: ignore
+    return call
+
+
+def _numbers(value: Any) -> bool:
+    """Whether a value is an array of numbers, and no endless one."""
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fi" and value.ndim > 0 and 0 < value.size < 10**6
+
+
+def drawn(rng: Rng) -> tuple[Callable[[], None], str]:
+    """A call of a public function with some of its arguments spoiled, and what it is."""
+    name = pick(rng, sorted(functions()))
+    function, suits = functions()[name], sound()
+    given: dict[str, Any] = {}
+    names = []
+    for key, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL) or key in CALLBACKS:
+            continue
+        names.append(key)
+        if f"{key} of {name}" in suits or key in suits:
+            given[key] = suits.get(f"{key} of {name}", suits.get(key))
+        elif parameter.default is inspect.Parameter.empty:
+            given[key] = pick(rng, ODD)
+    for key in rng.permutation(names)[: pick(rng, (1, 1, 2, 3))].tolist():
+        value: Any = given.get(key)
+        if _numbers(value) and rng.random() < 0.7:
+            given[key] = spoiled(rng, value)
+        else:
+            given[key] = pick(rng, ODD) if rng.random() < 0.7 else pick(rng, list(suits.values()))
+    told = f"{name}({', '.join(f'{key}={shown(value)}' for key, value in given.items())})"
+
+    def call() -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            try:
+                function(**given)
+            except (InputError, Fault) as error:
+                print(f"padforge: {error}".encode(errors="backslashreplace").decode(), file=sys.stderr)
+                raise SystemExit(2) from error
+
+    return call, told

@@ -1,0 +1,135 @@
+"""A folder of good and bad files that inputs work in, put back as it was after each of them."""
+
+import os
+import shutil
+from collections.abc import Iterable
+from contextlib import chdir
+from itertools import count
+from pathlib import Path
+
+import h5py
+import numpy as np
+import scipy.io
+
+from tests.helpers.kills import killed
+from tests.sense.recordings.formats.ros.foreign import array, pose, write_bag
+from tests.stress.damage import published
+from tests.stress.door import CHEAP, SPECIAL, Ended, call, contents, fill
+
+LAB = "time=time_s,fibres=fibre*,x=x_mm,y=y_mm"
+"""How a table of another program is named, `lab.csv`."""
+LAB_H5 = "time=/t,fibres=/volts,places=/xy,begun=/on,lifted=/off"
+BAG = "fibres=/skin,places=/probe"
+
+
+class Workplace:
+    """The folder.
+
+    Args:
+        where: an empty folder, in which files are made once.
+    """
+
+    def __init__(self, where: Path) -> None:
+        self.master, self.folder = where / "master", where / "place" / "here"
+        self.temporary = Path(f"{self.folder}.tmp")
+        self.master.mkdir()
+        self.folder.parent.mkdir()
+        with chdir(self.master):
+            fill()
+            _fill_more()
+        shutil.copytree(self.master, self.folder, symlinks=True)
+        for name in SPECIAL:
+            os.mkfifo(self.folder / name)
+        self.temporary.mkdir()
+        self._untouched = contents(self.folder)
+
+    def files(self) -> list[str]:
+        """Names of the files that can be spoiled, relative to the folder."""
+        found = (path for path in self.master.rglob("*") if path.is_file() and not path.is_symlink())
+        return sorted(str(path.relative_to(self.master)) for path in found)
+
+    def now(self) -> dict[str, tuple[int, int, int]]:
+        """What is there, see `door.contents`."""
+        return contents(self.folder)
+
+    def changed(self, since: dict[str, tuple[int, int, int]]) -> list[Path]:
+        """What is there now and was not `since`, or is another file; or is no more."""
+        now = self.now()
+        return [Path(path) for path in sorted(now.keys() | since.keys()) if now.get(path) != since.get(path)]
+
+    def renew(self) -> None:
+        """Put back what has changed."""
+        for path in self.changed(self._untouched):
+            if _is_folder(path):
+                path.chmod(0o700)
+        for path in reversed(self.changed(self._untouched)):
+            if _is_folder(path):
+                shutil.rmtree(path)
+            elif os.path.lexists(path):
+                path.unlink()
+        for path in self.changed(self._untouched):
+            original = self.master / path.relative_to(self.folder)
+            if _is_folder(original):
+                path.mkdir()
+            elif os.path.lexists(original):
+                shutil.copy2(original, path, follow_symlinks=False)
+            else:
+                os.mkfifo(path)
+        for path in self.folder.parent.iterdir():  # what was told to go one folder up, too
+            if path != self.folder:
+                shutil.rmtree(path) if _is_folder(path) else path.unlink()
+        self.temporary.mkdir()
+        self._untouched = contents(self.folder)
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+def _made(*words: str) -> Ended:
+    ended = call(*words, limit_s=600)
+    assert ended.code in (0, 1), ended
+    return ended
+
+
+def _fill_more() -> None:
+    """Put files of all the kinds that commands read into the current folder, where `fill` has been at work."""
+    Path("pad.toml").write_text(CHEAP.replace("[rig]", '[rig]\nhost = "127.0.0.1"'))  # where no arm answers, at once
+    _made("run", "--out", "whole", "--formats", "stl,svg")
+    planned = ("--morphology", "pad/morphology.json")
+    Path("long.toml").write_text(CHEAP.replace("= 24", "= 420").replace("readings_per_press = 8", ""))
+    _made("sense", "record", *planned, "--spec", "long.toml", "--out", "long")
+    _made("sense", "identify", "long", *planned, "--out", "pad")
+    _made("sense", "fibre-loss", "pad/recording", "--model", "pad", "--lost", "1", "--out", "pad")
+    _made("sense", "calibrate", "long", "--out", "pad")
+    _made("sense", "learning-curve", "long", "--out", "pad")
+    _made("sense", "recalibrate", "--model", "pad", "pad/recording", "--out", "again")
+    _made("sense", "export", "pad/recording", "presses.mcap")
+    scipy.io.savemat("pad.mat", published(4))
+    with h5py.File("new.mat", "w", userblock_size=512) as file:
+        for name, values in published(4).items():
+            if not isinstance(values, dict):
+                file[name] = values.T
+    header, *rows = Path("presses.csv").read_text().splitlines()
+    columns = [name if name[-2:] in ("_s", "mm") else f"fibre{at}" for at, name in enumerate(header.split(","))]
+    Path("lab.csv").write_text("\n".join([",".join(columns), *rows]) + "\n")
+    rng = np.random.default_rng(0)
+    with h5py.File("lab.h5", "w") as file:
+        file["t"], file["volts"] = np.arange(200) / 13.3, rng.random((200, 4))
+        file["xy"], file["on"], file["off"] = rng.random((4, 2)), [10, 60, 110, 160], [30, 80, 130, 180]
+    said = [("/skin", 0.1 * at, array("Float64MultiArray", rng.random(3))) for at in range(60)]
+    said += [("/probe", 0.1 * at + 0.05, pose(0.01 * at, 0.02)) for at in range(60)]
+    for plugin in ("mcap", "sqlite3"):
+        write_bag(Path(f"bag_{plugin}"), said, plugin)
+    Path("plan.csv").write_text("x_mm,y_mm,depth_mm\n" + "".join(f"{x},{x / 2},2.5\n" for x in range(-4, 5)))
+    _leave_unfinished(["design", "--out", "resumed"], Path("resumed"), "start_0000.npz")
+
+
+def _leave_unfinished(words: Iterable[str], folder: Path, state: str) -> None:
+    """Kill a command that writes into `folder` when it has kept the state of that name."""
+    for number in count():
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        assert killed(lambda: call(*words, limit_s=600), number, folder), f"{words} keep no {state}"
+        if list(folder.rglob(state)):
+            return
