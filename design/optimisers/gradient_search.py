@@ -20,7 +20,7 @@ from design.criteria.ambiguity import full_scale, sharpness
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
-from design.evaluation.expected_error import SIDE, expected_error, over_losses, shifted_lattice
+from design.evaluation.expected_error import SEARCHED, expected_error, over_losses, shifted_lattice
 from design.pad.contact import boustrophedon, signals
 from design.pad.morphology import Morphology
 
@@ -183,7 +183,7 @@ class GradientSearch:
                 partial(press_signals, travel, cross, slope, contact=contact, ends=self.fibres.ends), noise
             )
             if search.sharpness > 0:
-                serpentine = boustrophedon(pad.sensed, SIDE)
+                serpentine = boustrophedon(pad.sensed, SEARCHED)
                 in_order = press_signals(travel, cross, slope, serpentine, contact, self.fibres.ends)
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
@@ -196,7 +196,7 @@ class GradientSearch:
         """
         search, pad = self.problem.search, self.problem.pad
         own = self.step / search.steps
-        places, step = shifted_lattice(pad.sensed, self.rng)
+        places, step = shifted_lattice(pad.sensed, SEARCHED, self.rng)
         shares = loss_shares(search.lost)
         kept, _ = draw_losses(pad.layout.fibres, shares, self.rng)
         there, apart, losses = (

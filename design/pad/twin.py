@@ -189,8 +189,7 @@ class Twin:
 
         0 for a fibre that no channel reads. Summed over elements of at most LONGEST, within some 1e-4 of the integral.
         """
-        pressed_mm = reals("places_mm", places_mm, MOST_MM)
-        if pressed_mm.ndim != 2 or pressed_mm.shape[1] != 2:
+        if (pressed_mm := reals("places_mm", places_mm, MOST_MM)).shape[1:] != (2,):
             raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
         places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
         reach = self.contact().reach
@@ -214,8 +213,7 @@ class Twin:
         Raises:
             InputError: the file is missing, torn, of another kind, or what it holds does not fit together.
         """
-        path = as_path("path", path)
-        document = read_json(path, FORMAT)
+        document = read_json(path := as_path("path", path), FORMAT)
         try:
             reach = document["reach"]
             return cls(

@@ -98,14 +98,11 @@ class Recorder:
         Raises:
             InputError: no run directory, damage elsewhere than at its end, links, or presses without any reading.
         """
-        path = as_path("path", path)
-        fibres = fibres_of(path)
-        if unborn(path):  # broken off before the first reading
-            with writing(path):
-                for name in (JOURNAL, READINGS):
-                    (path / name).touch()
+        fibres = fibres_of(path := as_path("path", path))
         self = cls.__new__(cls)
         with writing(path):
+            for name in (JOURNAL, READINGS) if unborn(path) else ():  # broken off before the first reading
+                (path / name).touch()
             self._journal = open_in_place(path / JOURNAL)
             try:
                 lock(self._journal, busy(path))

@@ -6,7 +6,8 @@ loses a random few fibres of every press and moves the press by a few millimetre
 are moved in depth as well: the lighter, and so the more blurred, the farther. The rate follows one cycle; what is kept
 is that running average of the weights which did best on presses held back for that, which also end the training where
 they have long gained nothing. Members are independent, each on a thread of its own. In a time budget, the cycle is one
-of time, and there are as many members as can be trained at their usual length, one for every core at least.
+of time, and there is a member for every core, and more of them only where each can be trained for three times its usual
+length: until then, longer training gains more than further members.
 """
 
 import math
@@ -36,8 +37,8 @@ MOST_STEPS, LONGER = 11_000, 2
 WEIGHT_DECAY = 1e-2
 INPUT_NOISE = 0.02
 """Noise on the scaled inputs while training, their spread being about 1."""
-MOVED = 0.13
-"""Standard deviation of the way a press is moved, in units of the span: 3 mm on a pad of 45 mm."""
+MOVED = 0.09
+"""Standard deviation of the way a press is moved, in units of the span: 2 mm on a pad of 45 mm."""
 BLURRED, DEEPENED = 0.26, 0.3
 """Of several depths, the same and what is added to the depth, in its spans, for one of the middle depth. Lighter ones
 are moved by as much more as noise blurs them more, or they would be known again by their noise."""
@@ -47,8 +48,8 @@ LOOKS = 40
 """How often in a training the presses held back are looked at."""
 PATIENCE = 12
 """Looks without gain that end it."""
-TRIED, MOST_MEMBERS = 12, 64
-"""Steps that tell the pace of a training, and members at most, where there is a time budget."""
+TRIED, LENGTHENED, MOST_MEMBERS = 12, 3, 64
+"""Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
 
 
 class StoppedError(Exception):
@@ -124,7 +125,7 @@ def train_members(
         table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
         options: size of the network and length of the training. rng: of the seeds of torch's own generators.
         progress: called with (steps done, steps in all), of all members together; in a time budget, with seconds.
-        time_budget: seconds of wall clock to train for, with as many members as these are good for; None for the
+        time_budget: seconds of wall clock to train for, with the members that these are good for; None for the
             members and the length of `options`.
 
     Returns:
@@ -137,7 +138,7 @@ def train_members(
         if time_budget is not None:
             pace = _Member(learn, check, table, options, 0).pace()
             cores = os.cpu_count() or 1
-            in_turn = max(1, min(round(time_budget / (pace * steps)), MOST_MEMBERS // cores))
+            in_turn = max(1, min(round(time_budget / (pace * LENGTHENED * steps)), MOST_MEMBERS // cores))
             members, seconds = cores * in_turn, max(0.0, time_budget - (time.monotonic() - begin)) / in_turn
     seeds = [int(seed) for seed in rng.integers(2**63, size=members)]
     joint = JointProgress([TrainingLength(steps, seconds).total] * members, progress)

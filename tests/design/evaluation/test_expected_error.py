@@ -17,7 +17,7 @@ from design.pad.morphology import Morphology
 from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, Contact, PadSettings
 
 SIDE, SIZE = 14, np.array([4.0, 4.0])
-PLACES, STEPS = shifted_lattice(((0.0, 0.0), (4.0, 4.0)), np.random.default_rng(0))
+PLACES, STEPS = shifted_lattice(((0.0, 0.0), (4.0, 4.0)), SIDE, np.random.default_rng(0))
 STEP = torch.tensor(STEPS)
 NONE_LOST = torch.ones(1, 2)
 SILENT = 1e-9
@@ -51,7 +51,7 @@ def taught_without_each(signals: np.ndarray) -> float:
 
 def test_a_shifted_lattice_lies_within_the_rectangle():
     for rectangle in (((1.0, 2.0), (4.0, 6.2)), ((0.5, 0.5), (40.5, 40.5))):
-        places, step = shifted_lattice(rectangle, np.random.default_rng(0))
+        places, step = shifted_lattice(rectangle, SIDE, np.random.default_rng(0))
         assert (places >= rectangle[0]).all()
         assert (places <= rectangle[1]).all()
         each = places.reshape(SIDE, SIDE, 2)

@@ -58,11 +58,11 @@ def test_steps_look_at_what_is_pressed_in_parts_of_it_that_are_not_too_large():
         size = np.minimum(high - low, expected_error.WINDOW)
         corners = []
         for _ in range(30):
-            places, _ = expected_error.shifted_lattice(rectangle, rng)
+            places, _ = expected_error.shifted_lattice(rectangle, 14, rng)
             assert (places >= low).all()
             assert (places <= high).all()
             corners.append(places.min(axis=0))
-            cells = np.floor((places - corners[-1]) / size * expected_error.SIDE + 0.5)
+            cells = np.floor((places - corners[-1]) / size * 14 + 0.5)
             assert len(np.unique(cells, axis=0)) == len(places)
             assert (np.ptp(places, axis=0) > 0.9 * size).all()
             assert (np.ptp(places, axis=0) <= size).all()
