@@ -99,11 +99,16 @@ def found_before(out: Path) -> SearchResult | None:
     with as_written(path):
         if document["morphology_sha256"] != sha256(out / "morphology.json"):
             return None
+        terms, straight = (
+            {name: float(value) for name, value in document[key].items()} for key in ("terms", "straight")
+        )
+        violations = [Violation(**each) for each in document["violations"]]
+        list(map(str, violations))  # which tells of values that are none
         return SearchResult(
             Morphology.load(out / "morphology.json"),
-            document["terms"],
-            [Violation(**each) for each in document["violations"]],
-            document["straight"],
+            terms,
+            violations,
+            straight,
             bool(document["provenance"]["settings"]["rules"]["enforce"]),
             document["history"],
             float(document["seconds"]),

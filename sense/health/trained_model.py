@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from design.common.errors import InputError
+from design.common.errors import InputError, instance, shown
 from design.common.errors import path as as_path
 from design.common.files import read_bytes, staged
 
@@ -70,8 +71,14 @@ class ModelFiles(NamedTuple):
 
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
-    """The files of the model `name` in a folder."""
+    """The files of the model `name` in a folder.
+
+    Raises:
+        InputError: `folder` is no path, or `name` no plain name.
+    """
     folder = as_path("folder", folder)
+    if not re.fullmatch(r"\w{1,100}", instance("name", name, str)):
+        raise InputError(f"name is {shown(name)}, expected letters, digits and underscores")
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 

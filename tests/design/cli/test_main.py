@@ -14,6 +14,7 @@ from design.common.settings import commented_toml
 from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 from design.evaluation.expected_error import error_terms, expected_errors
 from design.pad.twin import Frame, TwinChannel
+from design.report.files import found_before
 from design.report.twin_settings import settings_for_twin
 from design.settings import PadSettings, SearchSettings
 
@@ -154,3 +155,20 @@ def test_rules_that_cannot_be_are_told_before_an_import_writes_anything(tmp_path
     with pytest.raises(InputError, match=r"\[rules\] lost: no such key"):
         CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.json", "pad.toml", "plan.svg"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("terms", {"ambiguity": {}}), ("straight", {"ambiguity": "a"}), ("violations", [{"rule": 1}]), ("terms", [])],
+)
+def test_what_a_search_has_found_is_read_again_or_told_to_be_damaged(tmp_path, monkeypatch, key, value):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pad.toml").write_text(QUICK)
+    CliRunner().invoke(design, ["--out", "pad"], catch_exceptions=False)
+    document = json.loads(Path("pad/design.json").read_text())
+    found = found_before(tmp_path / "pad")
+    assert found is not None
+    assert (found.terms, found.straight) == (document["terms"], document["straight"])
+    Path("pad/design.json").write_text(json.dumps(document | {key: value}))
+    with pytest.raises(InputError, match="not as padforge writes it"):
+        found_before(tmp_path / "pad")

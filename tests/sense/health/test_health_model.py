@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -122,3 +123,10 @@ def test_health_that_is_damaged_or_endless_is_none(model: HealthModel, tmp_path:
         with pytest.raises(InputError, match=name):
             health_in(tmp_path)
         (tmp_path / name).unlink()
+
+
+@pytest.mark.parametrize("name", [None, 3, "", "a/b", "..", "x" * 300, "a\nb"])
+def test_a_name_that_is_none_is_refused_and_nothing_is_made(model: HealthModel, tmp_path: Path, name: Any) -> None:
+    with pytest.raises(InputError, match="name is"):
+        model.save(tmp_path / "new", name)
+    assert list(tmp_path.iterdir()) == []
