@@ -7,6 +7,7 @@ from design import Contact, Morphology
 from design.criteria.rules import check_rules
 from design.criteria.score import score
 from design.evaluation import expected_error
+from design.evaluation.expected_error import expected_errors
 from design.optimisers import gradient_search
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import search
@@ -46,7 +47,7 @@ def test_several_contacts_serve_both_better_than_one_alone():
     both = one.model_copy(update={"contacts": (large,)})
     for_one, for_both = (search(PadSettings(grid=2), PUBLISHED_CONTACT, settings) for settings in (one, both))
     alone, together = (
-        score(found.morphology, large, 0, one.noise)["ambiguity_lost_0"] for found in (for_one, for_both)
+        expected_errors(found.morphology, large, 0, one.noise, PadSettings(grid=2)) for found in (for_one, for_both)
     )
     assert together < alone
 
@@ -82,7 +83,7 @@ def test_rules_that_cannot_hold_are_named(monkeypatch):
     [
         ({"min_gap_mm": 30.0}, "min_gap_mm"),
         ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, "border_mm"),
-        ({"max_crossings": 3}, "max_crossings"),
+        ({"max_crossings": 4}, "max_crossings"),
         ({"border_mm": 500.0}, "border_mm"),
     ],
 )
@@ -100,13 +101,14 @@ def as_usual():
 
 
 def found_within(rules):
-    """By steps alone: with so few of them straight fibres are as good, and break no rule."""
+    """By steps alone, the better of two starts: with so few steps straight fibres are as good, and break no rule."""
     settings = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 60, "lost": 1, "knots": 6})
     problem = SearchProblem(PadSettings(grid=2, sensed_mm="fibres"), (PUBLISHED_CONTACT,), settings, rules)
-    start = gradient_search.GradientSearch(problem, 0)
-    start.advance(1000)
-    assert start.done
-    return start.morphology()
+    starts = [gradient_search.GradientSearch(problem, number) for number in (0, 1)]
+    for start in starts:
+        start.advance(1000)
+        assert start.done
+    return min((start.morphology() for start in starts), key=lambda pad: len(check_rules(pad, rules)))
 
 
 @pytest.mark.parametrize(
