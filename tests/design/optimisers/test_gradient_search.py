@@ -83,7 +83,7 @@ def test_rules_that_cannot_hold_are_named(monkeypatch):
     [
         ({"min_gap_mm": 30.0}, "min_gap_mm"),
         ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, "border_mm"),
-        ({"max_crossings": 4}, "max_crossings"),
+        ({"max_crossings": 3}, "max_crossings"),
         ({"border_mm": 500.0}, "border_mm"),
     ],
 )
