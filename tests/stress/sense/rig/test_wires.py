@@ -109,7 +109,7 @@ def test_frames_of_the_controller_are_cut_the_same_in_any_portions(seed: int) ->
 @given(seed=seeds)
 def test_what_the_child_of_the_arm_writes_is_read_up_to_where_it_is_damaged(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    row = ur5_wire.Row._make(rng.standard_normal(13).tolist())
+    row = ur5_wire.Row._make(rng.standard_normal(len(ur5_wire.Row._fields)).tolist())
     parts = [ur5_wire.pack_row(row), ur5_wire.pack_answer({"id": 1, "is": [1.5, "a"]})]
     stream = b"".join(parts[k] for k in rng.integers(2, size=6))
     stream = noisy(rng, stream) if rng.random() < 0.7 else stream
