@@ -75,7 +75,7 @@ def edited(rng: np.random.Generator, document: Any) -> Any:
     elif kind == 1 and isinstance(parent, list):
         parent *= 2
     elif kind == 2 and isinstance(node, int | float):
-        parent[key] = [-node, node * 1e300 if node == node else 0, node + 1, 10**30, -1e-300][rng.integers(5)]
+        parent[key] = [-node, node * 1e300 if abs(node) < 1e300 else 0, node + 1, 10**30, -1e-300][rng.integers(5)]
     else:
         parent[key] = VALUES[rng.integers(len(VALUES))]
     return document
