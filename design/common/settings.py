@@ -71,7 +71,10 @@ class Spec:
         sections: Collection[str] | None = None,
     ) -> None:
         mapping("tables", tables)
-        allowed = tables if sections is None else [*instance("sections", sections, Collection)]
+        try:
+            allowed = tables if sections is None else [*instance("sections", sections, Collection)]
+        except TypeError as error:  # an array of no dimension is a collection of nothing that could be gone through
+            raise InputError(f"sections are {shown(sections)}, expected names") from error
         if not all(isinstance(name, str) for name in allowed):
             raise InputError(f"sections are {shown(sections)}, expected names")
         unknown = [name for name in tables if name not in allowed]

@@ -291,3 +291,9 @@ def test_what_is_no_section_and_no_table_is_refused(other):
             Spec({"pad": {}}, sections=sections)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"unknown section \[pad\]"):
         Spec({"pad": {}}, sections=np.array([]))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("sections", [np.array(3.0), [3], 7, {None}])
+def test_names_of_sections_that_are_none_are_refused(sections):
+    with pytest.raises(InputError, match=r"sections (is|are) "):
+        Spec({}, "pad.toml", sections)
