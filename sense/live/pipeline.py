@@ -16,7 +16,7 @@ from design.common.errors import InputError, instance, real, shown, whole
 from sense.health.health_model import HealthModel
 from sense.health.monitor import FibreFault, Monitor
 from sense.health.trained_model import refuse_other_pad
-from sense.localizer.features import REST, bridged, press_inputs
+from sense.localizer.features import REST, SIZES, bridged, press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.locating import MEASURED
 from sense.localizer.normalization import Scaled
@@ -262,5 +262,6 @@ class Live:
 
 def _usual(localizer: Localizer) -> Array:
     """(C,) V, what a fibre's answer to a press goes up to."""
-    usual = (np.abs(localizer.normalization.centre) + 2 * localizer.normalization.spread).max(axis=1)
+    scaling, windows = localizer.normalization, SIZES[localizer.features]
+    usual = (np.abs(scaling.centre) + 2 * scaling.spread)[:, :windows].max(axis=1)
     return np.where(usual > 0, usual, 1.0)

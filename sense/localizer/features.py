@@ -42,6 +42,13 @@ FEATURES = ("full", "causal", "early", "published")
 """What inputs are made of: press and release, the press up to its end, its first readings, or the published values."""
 SIZES = {"full": len(DOWN) + len(UP), "causal": len(DOWN), "early": EARLY, "published": 3}
 """F, how many numbers of each fibre they are."""
+PHASES = {
+    "full": (slice(2, 5), slice(5, 9), slice(12, 17)),
+    "causal": (slice(2, 5), slice(5, 9)),
+    "early": (slice(2, 6),),
+    "published": (),
+}
+"""Windows in which a fibre answers more or less strongly together: while the probe sinks in, rests, and has gone."""
 PASTS = {"full": len(PAST) + len(SLOW), "causal": len(PAST) + len(SLOW), "early": len(PAST) + len(SLOW), "published": 0}
 """J, how many numbers of its history."""
 

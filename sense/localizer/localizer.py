@@ -17,7 +17,7 @@ from sense.health.trained_model import files_of, refuse_other_pad
 from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
 
-from .features import SIZES, Inputs, press_inputs
+from .features import Inputs, press_inputs
 from .network import Weights, forward, masked, pooled, refuse_unsound
 from .normalization import Normalization, Scaled, Target
 from .schema import FORMAT, read_document
@@ -78,7 +78,7 @@ class Localizer:
     Attributes:
         weights: of the network, see `network.Weights`.
         normalization: of its inputs and outputs.
-        table: (S, S, C, F) scaled inputs by place, see `ResponseModel`; what a recalibration moves presses by.
+        table: (S, S, C, F + G) scaled inputs by place, see `ResponseModel`; what a recalibration moves presses by.
         method: which network and training, of `settings.Method`.
         features: which inputs it takes, of `features.FEATURES`.
         factors: (K, 3 + T) by number of lost fibres, what makes of the expected error a standard deviation, the radii
@@ -227,7 +227,7 @@ class Localizer:
         normalization = Normalization(
             np.array(document.scaling.centre_v),
             np.array(document.scaling.spread_v),
-            np.array(document.scaling.memory).reshape(document.fibres, -1, SIZES[document.features]),
+            np.array(document.scaling.memory).reshape(document.fibres, -1, len(document.scaling.centre_v[0])),
             np.array(document.scaling.usual_v).reshape(document.fibres, -1),
             np.array(document.scaling.middle_mm),
             document.scaling.span_mm,

@@ -70,8 +70,9 @@ class Normalization:
     """Fitted on the presses of training.
 
     Attributes:
-        centre, spread: (C, F) V; an input enters as (input - centre) / spread.
-        memory: (C, J, F) V/V, what of a volt of history shows in the inputs; usual: (C, J) V, the usual history.
+        centre, spread: (C, F + G) V; an input enters as (input - centre) / spread. The G gains enter as they are.
+        memory: (C, J, F + G) V/V, what of a volt of history shows in the inputs, see `ResponseModel`.
+        usual: (C, J) V, the usual history.
         middle_mm: (2,) place that the network calls 0. span_mm: distance that it calls 1.
         measures: what the network gives beside the place; none, the depth, or depth and force, in this order.
         half_mm: (2,) half the width and height of what was pressed; None where nobody has kept it.
@@ -88,31 +89,39 @@ class Normalization:
 
     @classmethod
     def fit(
-        cls, inputs: Inputs, places_mm: Array, measures: Mapping[str, Array] | None = None
+        cls,
+        inputs: Inputs,
+        places_mm: Array,
+        measures: Mapping[str, Array] | None = None,
+        phases: Sequence[slice] = (),
     ) -> tuple["Normalization", Floats]:
         """From the inputs and the places (Q, 2) of the presses of training, and (Q,) of each measure to be learnt.
 
-        A window is scaled by the geometric mean of its own spread and its fibre's: the fine windows of a touch keep
-        some of their smallness, and so of their noise. What never varied is left as large as it is.
+        For each of `phases`, windows that are stronger together, what came before a press tells a gain. A window is
+        scaled by the geometric mean of its own spread and its fibre's: the fine windows of a touch keep some of their
+        smallness, and so of their noise. What never varied is left as large as it is.
 
         Returns:
-            The scaling, and the scaled inputs by place (S, S, C, F), see `ResponseModel.table`; of several depths, for
-            the one that the network calls 0.
+            The scaling, and the scaled inputs by place (S, S, C, F + G), see `ResponseModel.table`; of several depths,
+            for the one that the network calls 0.
         """
         targets = tuple(Target.of(name, values) for name, values in (measures or {}).items())
         low, high = places_mm.min(axis=0), places_mm.max(axis=0)
         middle, span = (low + high) / 2, float((high - low).max() / 2) or 1.0
         strengths = measures["depth_mm"] / targets[0].middle if measures else None
         response = ResponseModel.fit(
-            (places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive, strengths
+            (places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive, strengths, phases
         )
-        windows = settled(inputs.windows, inputs.history, response.memory, response.usual)
+        size = inputs.windows.shape[2]
+        windows = settled(inputs.windows, inputs.history, response.memory, response.usual)[:, :, :size]
         there = np.broadcast_to(inputs.alive[:, :, None], windows.shape)
         centre = _mean(windows, there)
         variance = _mean((windows - centre) ** 2, there)
         spread = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
         spread = np.where(spread >= LEAST_SPREAD_V, spread, 1.0)
         centre = np.zeros_like(centre) if targets else centre
+        gains = ((0, 0), (0, len(phases)))
+        centre, spread = np.pad(centre, gains), np.pad(spread, gains, constant_values=1.0)
         scaling = cls(centre, spread, response.memory, response.usual, middle, span, targets, (high - low) / 2)
         return scaling, scaling.scaled(response.table)
 
@@ -134,7 +143,7 @@ class Normalization:
         return Scaled(self.scaled(settled(inputs.windows, inputs.history, self.memory, self.usual)), inputs.alive)
 
     def scaled(self, windows: Array) -> Floats:
-        """(..., C, F) volts after the usual history to numbers of about 1."""
+        """(..., C, F + G) volts after the usual history, and gains, to numbers of about 1."""
         return np.clip((windows - self.centre) / self.spread, -MAX_INPUT, MAX_INPUT).astype(np.float32)
 
     @property

@@ -11,7 +11,7 @@ from design.common.settings import Settings
 from sense.recordings.processing.limits import LEAST_SPREAD_V, MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
 from sense.settings import Features, Method, Split
 
-from .features import PASTS, SIZES
+from .features import PASTS, PHASES, SIZES
 
 FORMAT = "padforge-localizer/2"
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -98,7 +98,9 @@ def read_document(document: Mapping[str, Any], where: str) -> LocalizerDocument:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise InputError(f"{where}: {key} is {shortened(first['input'])}: {first['msg'].lower()}") from error
-    size, past, table = SIZES[found.features], PASTS[found.features], found.scaling
+    past, table = PASTS[found.features], found.scaling
+    windows, gains = SIZES[found.features], len(PHASES[found.features])
+    size = windows + gains * any(len(row) > windows for row in table.centre_v)  # a localizer of before knows no gains
     shapes = {
         "centre_v": (_sizes(table.centre_v), (found.fibres, size)),
         "spread_v": (_sizes(table.spread_v), (found.fibres, size)),

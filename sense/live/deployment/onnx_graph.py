@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
+from sense.localizer.features import SIZES
 from sense.localizer.localizer import UNKNOWN, Localizer
 from sense.localizer.locating import MEASURED
 from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
@@ -114,6 +115,8 @@ def _entries(g: GraphNodes, localizer: Localizer, alive: str) -> str:
     if scaling.usual.size:
         history = g("Sub", features.history(), volts(scaling.usual, g))
         shown = g("MatMul", g("Transpose", history, perm=[1, 0, 2]), volts(scaling.memory, g))
+        gains = scaling.memory.shape[2] - SIZES[localizer.features]
+        windows = g("Pad", windows, g.constant([0, 0, 0, 0, 0, gains]), volts(np.array(0.0), g))
         windows = g("Sub", windows, g("Transpose", shown, perm=[1, 0, 2]))
     scaled = g("Div", g("Sub", windows, volts(scaling.centre, g)), volts(scaling.spread, g))
     limits = (volts(np.array(limit), g) for limit in (-MAX_INPUT, MAX_INPUT))

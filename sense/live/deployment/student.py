@@ -152,10 +152,7 @@ def teach(
     shown, rows = plain[taught] + found.inputs[also], np.concatenate([taught, press[also]])
     scaling, table = Normalization.fit(shown, lessons[rows].places_mm, lessons[rows].measures)
     size = {"members": 1, "hidden": hidden, "layers": LAYERS, "lost": levels - 1}
-    to_learn, to_check = (
-        _samples(scaling, inputs, lessons[which]) for inputs, which in ((shown, rows), (plain[checked], checked))
-    )
-    weights = _trained(to_learn, to_check, table, options.model_copy(update=size), rng, progress)
+    weights = _trained(_samples(scaling, shown, lessons[rows]), table, options.model_copy(update=size), rng, progress)
     localizer = Localizer(
         as_int8(weights) if budget.quantized else weights,
         scaling,
@@ -179,7 +176,6 @@ def _samples(scaling: Normalization, inputs: Inputs, lessons: Lessons) -> Traini
 
 def _trained(
     learn: TrainingPresses,
-    check: TrainingPresses,
     table: Floats,
     options: LocalizerSettings,
     rng: np.random.Generator,
@@ -188,7 +184,7 @@ def _trained(
     from sense.localizer.calibration.training import train_members  # torch, seconds to import, is needed here only
 
     with one_torch_thread():
-        weights = train_members(learn, check, table, options, rng, progress)
+        weights = train_members(learn, table, options, rng, progress)
     fibres, inputs = learn.inputs.shape[1:]
     try:
         refuse_unsound(weights, fibres * (inputs + 1), "masked", learn.targets.shape[1] - 2)

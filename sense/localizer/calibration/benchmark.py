@@ -139,14 +139,12 @@ def _adam(x: Array, y: Array, passes: int) -> Predict:
 
 def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
     from .networks.training_presses import TrainingPresses
-    from .training import train_members
+    from .training import LEAST_BATCHES, train_members
 
-    alive = np.ones(inputs.shape[:2], dtype=bool)
-    held = _held(len(inputs))
-    shown, check = (TrainingPresses(inputs[part], alive[part], targets[part]) for part in (~held, held))
-    batches = max(1, int((~held).sum()) // settings.LocalizerSettings().batch)
+    shown = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
+    batches = max(LEAST_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
     options = settings.LocalizerSettings(members=1, epochs=-(-steps // batches))
-    weights = train_members(shown, check, table, options, np.random.default_rng(0), lambda done, total: None)
+    weights = train_members(shown, table, options, np.random.default_rng(0), lambda done, total: None)
 
     return lambda x: _places(weights, x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)).astype(np.float64)
 

@@ -16,7 +16,7 @@ from design.common.settings import or_default, validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import settings
 from sense.localizer.evaluation import conformal, evaluate, held_back
-from sense.localizer.features import press_inputs
+from sense.localizer.features import PHASES, press_inputs
 from sense.localizer.localizer import Localizer
 from sense.localizer.network import refuse_unsound
 from sense.localizer.normalization import Normalization, Scaled
@@ -28,8 +28,8 @@ from .networks.training_presses import TrainingPresses
 LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
 CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
-"""Share of the presses of training that are not learnt from: half of them end it, the others find the radii. Of the
-published method, 15 % of all."""
+"""Share of the presses of training that are not learnt from but find the radii. Of the published method, 15 % of all,
+half of which end the training."""
 MOST_SECONDS = 1e9
 """Longest time budget: some thirty years."""
 LEAST_SPREAD_MM = 0.2
@@ -102,9 +102,9 @@ def learn(
 ) -> Localizer:
     """Train a localizer on the presses `training` of a recording, by index.
 
-    Of them, a share ends the training and another finds the radii: drawn at random, or the last ones, as the split is.
-    Were they the same, the weights would be those that suit them, and the radii too short. The others are shown as they
-    were commanded and, once more, as they would be found in the readings.
+    Of them, a share finds the radii: drawn at random, or the last ones, as the split is. The others are shown as they
+    were commanded and, once more, as they would be found in the readings. The published training ends by presses of
+    its own: were they those that find the radii, the weights would be those that suit them, and the radii too short.
 
     Raises:
         InputError: the training diverged.
@@ -121,16 +121,16 @@ def learn(
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         rows = np.concatenate([taught, taught])
     shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
-    scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more)
+    scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more, PHASES[options.features])
     shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
-    held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], _of(measures, ending))
     if masked:
         from .training import train_members  # torch, seconds to import, is needed here only
 
-        weights = train_members(shown, held, table, options, rng, progress, time_budget)
+        weights = train_members(shown, table, options, rng, progress, time_budget)
     else:
         from .networks.published_training import train_published
 
+        held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], {})
         weights = train_published(shown, held, rng)
     try:
         refuse_unsound(weights, scaling.entries(options.method), options.method, len(measures))
@@ -154,11 +154,11 @@ def learn(
 def _parts(
     training: Indices, options: settings.LocalizerSettings, rng: np.random.Generator
 ) -> tuple[Indices, Indices, Indices]:
-    """Presses to learn from, those that end the training and those that find the radii: of one alone, both do."""
+    """Presses to learn from, those that end a published training and those that find the radii."""
     taught, checked = (
         training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
     )
-    if len(checked) < 2:
+    if options.method == "masked" or len(checked) < 2:
         return taught, checked, checked
     ending, proving = (checked[part] for part in split_presses(len(checked), options.split, 0.5, rng, least=1))
     return taught, ending, proving

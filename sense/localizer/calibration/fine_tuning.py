@@ -19,12 +19,14 @@ from sense.recordings.processing.limits import Floats
 
 from .networks.masked_network import draw_alive, forward, inputs_at, masked, misses
 from .networks.training_presses import TrainingPresses
-from .training import INPUT_NOISE, MOVED
+from .training import INPUT_NOISE
 
 STEPS, BATCH, RATE = 200, 128, 1e-4
 """Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""
 OLD_PRESSES = 100
 """New presses that count as much as what was learnt before."""
+MOVED = 0.09
+"""Standard deviation of the way a press is moved, in units of the span: 2 mm on a pad of 45 mm."""
 FAR_NOISE = 0.1
 """Noise on the scaled inputs of presses moved anywhere, which is less sure than a move by millimetres."""
 SPREAD_KEPT = 0.02

@@ -4,13 +4,12 @@ The loss is the distance itself, not its square; beside it the network learns ho
 loses a random few fibres of every press and moves the press by a few millimetres, its readings following as the fitted
 `response_model` of the pad says. Of several depths, these are learnt too, with forces where they are known, and presses
 are moved in depth as well: the lighter, and so the more blurred, the farther. The rate follows one cycle; what is kept
-is that running average of the weights which did best on presses held back for that, which also end the training where
-they have long gained nothing. Members are independent, each on a thread of its own. In a time budget, the cycle is one
-of time, and there is a member for every core, and more of them only where each can be trained for three times its usual
-length: until then, longer training gains more than further members.
+is a running average of the weights. None of it is chosen by presses held back: so few as there are choose by chance.
+Members are independent, each on a thread of its own. In a time budget, the cycle is one of time, and there is a member
+for every core, and more of them only where each can be trained for three times its usual length: until then, longer
+training gains more than further members.
 """
 
-import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +21,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from design.common import profiling
 from design.common.computing import one_torch_thread, run_tasks
 from sense import settings
 from sense.health.trained_model import average_in, one_cycle
@@ -32,22 +30,22 @@ from sense.recordings.processing.limits import Floats
 from .networks.masked_network import draw_alive, forward, initial, inputs_at, masked, misses
 from .networks.training_presses import TrainingPresses
 
-MOST_STEPS, LONGER = 11_000, 2
-"""Steps of training at most, as presses are moved; of several depths, which are harder to learn, so many times more."""
+LEAST_BATCHES, MOST_STEPS, LONGER = 6, 11_000, 2
+"""Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths,
+which are harder to learn, so many times more."""
 WEIGHT_DECAY = 1e-2
 INPUT_NOISE = 0.02
 """Noise on the scaled inputs while training, their spread being about 1."""
-MOVED = 0.09
-"""Standard deviation of the way a press is moved, in units of the span: 2 mm on a pad of 45 mm."""
+MOVED = 2.2
+"""Standard deviation of the way a press is moved, in distances between neighbours: 2 mm among 3000 presses on a pad of
+45 mm, 7 mm among 240, which leave more to guess between them."""
 BLURRED, DEEPENED = 0.26, 0.3
 """Of several depths, the same and what is added to the depth, in its spans, for one of the middle depth. Lighter ones
 are moved by as much more as noise blurs them more, or they would be known again by their noise."""
 EXPECTING = 0.1
 """Weight of learning the expected error, beside the distance."""
-LOOKS = 40
-"""How often in a training the presses held back are looked at."""
-PATIENCE = 12
-"""Looks without gain that end it."""
+TOLD = 40
+"""How often a training tells how far it is."""
 TRIED, LENGTHENED, MOST_MEMBERS = 12, 3, 64
 """Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
 
@@ -111,7 +109,6 @@ class TrainingLength:
 
 def train_members(
     learn: TrainingPresses,
-    check: TrainingPresses,
     table: Floats,
     options: settings.LocalizerSettings,
     rng: np.random.Generator,
@@ -121,8 +118,8 @@ def train_members(
     """Fit the members of the localizer.
 
     Args:
-        learn, check: presses to learn from, and to tell by when to stop.
-        table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
+        learn: presses to learn from.
+        table: (S, S, C, F + G) scaled inputs by place, over [-1, 1] in x and y.
         options: size of the network and length of the training. rng: of the seeds of torch's own generators.
         progress: called with (steps done, steps in all), of all members together; in a time budget, with seconds.
         time_budget: seconds of wall clock to train for, with the members that these are good for; None for the
@@ -136,7 +133,7 @@ def train_members(
     with one_torch_thread():
         members, seconds = options.members, None
         if time_budget is not None:
-            pace = _Member(learn, check, table, options, 0).pace()
+            pace = _Member(learn, table, options, 0).pace()
             cores = os.cpu_count() or 1
             in_turn = max(1, min(round(time_budget / (pace * LENGTHENED * steps)), MOST_MEMBERS // cores))
             members, seconds = cores * in_turn, max(0.0, time_budget - (time.monotonic() - begin)) / in_turn
@@ -144,7 +141,7 @@ def train_members(
     joint = JointProgress([TrainingLength(steps, seconds).total] * members, progress)
 
     def train(number: int) -> Weights:
-        member = _Member(learn, check, table, options, seeds[number])
+        member = _Member(learn, table, options, seeds[number])
         return member.train(TrainingLength(steps, seconds), lambda done: joint.tell(number, done))
 
     with one_torch_thread(), joint:
@@ -160,8 +157,8 @@ def joined(members: Sequence[Weights]) -> Weights:
 
 
 def training_steps(presses: int, options: settings.LocalizerSettings) -> int:
-    """Steps that a member takes: `epochs` times through the presses, but no more than `MOST_STEPS`."""
-    return min(MOST_STEPS, options.epochs * max(1, presses // options.batch))
+    """Steps that a member takes: `epochs` times through the presses, within `LEAST_BATCHES` and `MOST_STEPS`."""
+    return min(MOST_STEPS, options.epochs * max(LEAST_BATCHES, presses // options.batch))
 
 
 class _Member:
@@ -170,7 +167,6 @@ class _Member:
     def __init__(
         self,
         learn: TrainingPresses,
-        check: TrainingPresses,
         table: Floats,
         options: settings.LocalizerSettings,
         seed: int,
@@ -178,14 +174,18 @@ class _Member:
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._generator = torch.Generator(self._device).manual_seed(seed)
         self._options = options
-        self._x, self._alive, self._y = self._on_device(learn)
-        self._check = self._on_device(check)
+        arrays = (learn.inputs, learn.alive, learn.targets)
+        self._x, self._alive, self._y = (torch.from_numpy(array).to(self._device) for array in arrays)
         self._fibres, size = self._x.shape[1:]
         self._lost = min(options.lost, self._fibres - 1)
         self._table = torch.from_numpy(table).to(self._device).flatten(2)
         self._bounds = self._y[:, :3].amin(dim=0), self._y[:, :3].amax(dim=0)
-        self._steps = torch.tensor(
-            [BLURRED, BLURRED, DEEPENED] if learn.stretch else [MOVED, MOVED], device=self._device
+        places = self._y[:, :2].unique(dim=0)
+        apart = ((self._bounds[1] - self._bounds[0])[:2].prod() / len(places)).sqrt()
+        self._steps = (
+            torch.tensor([BLURRED, BLURRED, DEEPENED], device=self._device)
+            if learn.stretch
+            else (MOVED * apart).expand(2)
         )
         off = (self._y - self._y.mean(dim=0))[:, 2:]
         self._harder = (off[:, :1] * off[:, 1:]).sum() / off[:, :1].square().sum()  # force by depth, in line
@@ -194,11 +194,6 @@ class _Member:
         self._rest = self._x - at_home.view_as(self._x)
         entries, outputs = self._fibres * (size + 1), OUTPUTS + 2 * (self._y.shape[1] - 2)
         self._weights = initial(entries, options, self._generator, outputs)
-
-    def _on_device(self, samples: TrainingPresses) -> tuple[Tensor, Tensor, Tensor]:
-        arrays = (samples.inputs, samples.alive, samples.targets)
-        x, alive, y = (torch.from_numpy(array).to(self._device) for array in arrays)
-        return x, alive, y
 
     def pace(self) -> float:
         """Seconds that a step takes."""
@@ -213,9 +208,8 @@ class _Member:
         weights, rate = self._weights, self._options.rate
         average = {name: w.detach().clone() for name, w in weights.items()}
         optimizer = torch.optim.AdamW(weights.values(), lr=rate, weight_decay=WEIGHT_DECAY, fused=True)
-        masks = self._check[1] & draw_alive(len(self._check[1]), self._fibres, self._lost, self._generator)
-        best, least, failures, looks, share, number = average, math.inf, 0, 0, 0.0, 0
-        while share < 1 and failures < PATIENCE:
+        told, share, number = 0, 0.0, 0
+        while share < 1:
             number += 1
             share = length.share(number)
             optimizer.param_groups[0]["lr"] = rate * one_cycle(share)
@@ -223,17 +217,10 @@ class _Member:
             self._loss().backward()
             optimizer.step()
             average_in(average.values(), weights.values(), number)
-            if share * LOOKS >= looks + 1:
-                looks = int(share * LOOKS)
-                error = self._error(average, masks)
-                if error < least:
-                    best, least, failures = {name: w.clone() for name, w in average.items()}, error, 0
-                else:
-                    failures += 1
+            if share * TOLD >= told + 1:
+                told = int(share * TOLD)
                 tell(round(share * length.total))
-        tell(length.total)
-        profiling.looked_at("training steps", number, round(number / share))
-        return {name: w.cpu().numpy() for name, w in best.items()}
+        return {name: w.cpu().numpy() for name, w in average.items()}
 
     def _loss(self) -> Tensor:
         batch = min(self._options.batch, len(self._x))
@@ -259,10 +246,3 @@ class _Member:
 
     def _normal(self, *shape: int) -> Tensor:
         return torch.randn(*shape, generator=self._generator, device=self._device)
-
-    def _error(self, weights: dict[str, Tensor], masks: Tensor) -> float:
-        """Mean distance of places on the presses held back, with the fibres in `masks`."""
-        x, _, y = self._check
-        with torch.no_grad():
-            found = forward(weights, masked(x, masks)[None])[0, :, :2]
-            return float((found - y[:, :2]).square().sum(dim=1).sqrt().mean())

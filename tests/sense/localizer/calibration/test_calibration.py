@@ -131,8 +131,9 @@ def test_options_out_of_range_are_refused(recording: Recording) -> None:
         calibrate(recording, SHORT.model_copy(update={"test_share": 1e-4}))
 
 
-@pytest.mark.parametrize(("features", "size"), [("causal", 9), ("early", 6), ("published", 3)])
+@pytest.mark.parametrize(("features", "size"), [("causal", 9 + 2), ("early", 6 + 1), ("published", 3)])
 def test_other_inputs_can_be_learnt_from_too(recording: Recording, features: str, size: int) -> None:
+    """Windows, and gains of the phases that they are of."""
     localizer, document = calibrate(recording, SHORT.model_copy(update={"features": features}))
     assert localizer.normalization.centre.shape == (4, size)
     assert np.isfinite(document["errors"][0]["mean_mm"])

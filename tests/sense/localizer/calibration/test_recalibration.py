@@ -18,10 +18,10 @@ from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fine_tuning
 from sense.localizer.calibration.affine_correction import _corrected, _parts, fit_correction
-from sense.localizer.calibration.fine_tuning import FAR_NOISE, _Presses, adapt
+from sense.localizer.calibration.fine_tuning import FAR_NOISE, MOVED, _Presses, adapt
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
 from sense.localizer.calibration.recalibration import _CrossValidation, recalibrate
-from sense.localizer.calibration.training import INPUT_NOISE, MOVED
+from sense.localizer.calibration.training import INPUT_NOISE
 from sense.localizer.evaluation import distances
 from sense.localizer.localizer import Found
 

@@ -34,7 +34,10 @@ def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float)
 
 
 def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of presses at the corners of the known places, half of a normal distribution remains on either axis."""
+    """Of presses at the corners of the known places, half of a normal distribution remains on either axis.
+
+    Four places have 1 x 1.2 to share, and so are sqrt(1.2 / 4) apart.
+    """
     corners = np.tile(np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32), (64, 1))
     samples = TrainingPresses(np.zeros((256, 1, 1), np.float32), np.ones((256, 1), bool), corners)
     seen: list[torch.Tensor] = []
@@ -45,9 +48,10 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
 
     monkeypatch.setattr(masked_network, "looked_up", spy)
     options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0, batch=256)
-    member = training._Member(samples, samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
+    monkeypatch.setattr(training, "MOVED", 0.1)
+    member = training._Member(samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
     for _ in range(8):
         member._loss()
     inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
     assert inwards.min() >= -1e-6
-    assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([training.MOVED] * 2, rel=0.06)
+    assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
