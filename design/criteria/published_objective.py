@@ -65,7 +65,7 @@ def published_terms(
     samples, levels = as_samples(samples, travel.shape[1]), whole("levels", levels, 1, MOST_LEVELS)
     if presses is None:
         layout = pads.layout if isinstance(pads, Morphology) else layout
-        places = published_presses(layout or ends.horizontals)
+        places = published_presses(layout or ends.horizontals).copy()  # not read-only: kernels would be compiled anew
     else:
         places = as_presses(presses)[0]
     shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT))

@@ -33,8 +33,8 @@ from design.settings import Contact, PadSettings, Rectangle
 
 SEARCHED, JUDGED, WINDOW = 12, 14, 5.0
 """Presses along a side of a lattice, in a search and where a pad is judged, and the longest side, grid units: presses
-further apart are seldom confused. With 10 in place of 12 a search errs more under a small contact; 14 take a third more
-time for nothing."""
+further apart are seldom confused. With 10 in place of 12 a search errs more under a small contact; 14 take a
+seventh to a third more time for 1 to 2 % with few knots."""
 LATTICES, MOST_LOSSES = 4, 32
 """Lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
 WIDTH, RIDGE = 0.5, 1e-2

@@ -37,7 +37,7 @@ def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: 
     p[4] = v2 * v2 + 2 * v1 * v3
     p[5] = 2 * v2 * v3
     p[6] = v3 * v3
-    end = roots_in_unit(p, 6, 16 * EPS * radius * radius, out, count, work)
+    end = roots_in_unit(p, np.int64(6), 16 * EPS * radius * radius, out, count, work)
     for i in range(count, end):
         out[i] = a + w * out[i]
     return end
@@ -53,7 +53,7 @@ def _line_roots(
     p[1] = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w - (at_b - at_a)
     p[2] = (span[4] + 3 * a * span[5]) * w * w
     p[3] = span[5] * w**3
-    end = roots_in_unit(p, 3, tolerance, out, count, work)
+    end = roots_in_unit(p, np.int64(3), tolerance, out, count, work)
     for i in range(count, end):
         out[i] = a + w * out[i]
     return end

@@ -11,6 +11,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense import Localizer, Recording
+from sense.localizer.features import SIZES
 from sense.localizer.localizer import joined
 from sense.localizer.normalization import Scaled
 from tests.helpers.kills import killed
@@ -264,3 +265,32 @@ def test_a_model_is_kept_in_a_folder_and_nothing_else(localizer: Localizer, fold
 def test_what_are_no_inputs_of_presses_is_refused(localizer: Localizer, recording: Recording) -> None:
     with pytest.raises(InputError, match=r"presses is .*, expected a Scaled"):
         localizer.locate(recording)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_localizer_that_knows_no_gains_is_read_and_finds_places(
+    localizer: Localizer, recording: Recording, tmp_path: Path
+) -> None:
+    """As all were that learnt before there were any."""
+    scaling, windows = localizer.normalization, SIZES[localizer.features]
+    assert scaling.centre.shape[1] > windows
+    plain = replace(
+        scaling,
+        centre=scaling.centre[:, :windows],
+        spread=scaling.spread[:, :windows],
+        memory=scaling.memory[:, :, :windows],
+    )
+    by_input = localizer.weights["first.w"][:, : scaling.centre.size]
+    by_fibre = by_input.reshape(len(by_input), *scaling.centre.shape, -1)[:, :, :windows]
+    alive = localizer.weights["first.w"][:, scaling.centre.size :]
+    first = np.concatenate([by_fibre.reshape(len(by_input), plain.centre.size, -1), alive], axis=1)
+    before = replace(
+        localizer,
+        normalization=plain,
+        table=np.ascontiguousarray(localizer.table[..., :windows]),
+        weights={**localizer.weights, "first.w": first},
+    )
+    before.save(tmp_path)
+    found = Localizer.load(tmp_path).locate(before.inputs(recording))
+    assert np.array_equal(found.places_mm, before.locate(before.inputs(recording)).places_mm)
+    off = np.hypot(*(found.places_mm - localizer.locate(localizer.inputs(recording)).places_mm).T)
+    assert 0 < np.median(off) < 0.1 * scaling.span_mm

@@ -86,7 +86,7 @@ def published_terms(
     """Entropy (sum of the families' joint entropies), sharpness and disorder of pads begin..end into out (P, 3)."""
     fibres = travel.shape[1]
     curves = np.empty((fibres, samples))
-    signals = np.empty((fibres, len(presses))).T
+    signals, answers = np.empty((len(presses), fibres)), np.empty(len(presses))
     scaled = np.empty((len(presses), fibres))
     for p in range(begin, end):
         for f in range(fibres):
@@ -94,7 +94,9 @@ def published_terms(
             t, v, own = travel[p, f], cross[p, f], in_frame(shape, family)
             step = t[-1] / (samples - 1)
             pchip_sample(t, v, step, curves[f])
-            fibre_quantized(t, v, curves[f], step, presses, family, own, signals[:, f])
+            fibre_quantized(t, v, curves[f], step, presses, family, own, answers)  # for a column, compiled anew
+            for q in range(len(presses)):  # an assignment to a slice takes two seconds to compile
+                signals[q, f] = answers[q]
         to_levels(signals, levels, scaled)
         out[p, 0] = row_entropy(scaled, np.int64(0), horizontals) + row_entropy(scaled, horizontals, fibres)
         out[p, 1] = second_differences(scaled)
@@ -124,7 +126,7 @@ def area_above(t: Any, v: Any, d: Any, other_t: Any, other_v: Any, other_d: Any)
             p[:] = 0.0
             _cubic_on(t, v, d, i, a, b - a, 1.0, p)
             _cubic_on(other_t, other_v, other_d, j, a, b - a, -1.0, p)
-            count = roots_in_unit(p, 3, 1e-15 * (abs(v[i]) + abs(v[i + 1])), roots, np.int64(0), work)
+            count = roots_in_unit(p, np.int64(3), 1e-15 * (abs(v[i]) + abs(v[i + 1])), roots, np.int64(0), work)
             roots[count] = 1.0
             start, before = 0.0, 0.0
             for r in range(count + 1):

@@ -158,7 +158,7 @@ def quantized_signals(
         How many samples were looked at.
     """
     fibres = travel.shape[1]
-    curve = np.empty(samples)
+    curve, answers = np.empty(samples), np.empty(len(presses))
     looked_at = 0
     for index in range(begin, end):
         p, f = index // fibres, index % fibres
@@ -166,5 +166,7 @@ def quantized_signals(
         t, v = travel[p, f], cross[p, f]
         step = t[-1] / (samples - 1)
         pchip_sample(t, v, step, curve)
-        looked_at += fibre_quantized(t, v, curve, step, presses, family, in_frame(shape, family), out[p, :, f])
+        looked_at += fibre_quantized(t, v, curve, step, presses, family, in_frame(shape, family), answers)
+        for q in range(len(presses)):
+            out[p, q, f] = answers[q]
     return looked_at
