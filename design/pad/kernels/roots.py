@@ -49,14 +49,14 @@ def _bracketed(p: Any, degree: int, low: float, high: float, rising: bool) -> fl
 
 
 @njit(cache=True, error_model="numpy")
-def roots_in_unit(p: Any, degree: int, tolerance: float, out: Any, count: Any, work: Any) -> int:
+def roots_in_unit(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
     """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
 
     Bernstein coefficients with no change of sign exclude a root, with one change hold exactly one; else the interval
     is halved. Where all coefficients are within `tolerance` of 0 the polynomial only touches zero: no sign change.
 
     Args:
-        p: (degree + 1,) power coefficients, degree <= MAX_DEGREE.
+        p: (degree + 1,) power coefficients, degree <= MAX_DEGREE; no literal, for each of which it would be compiled.
         work: (SCRATCH) floats, overwritten: a stack of [coefficients ..., low, high].
     """
     lo, hi = MAX_DEGREE + 1, MAX_DEGREE + 2

@@ -49,7 +49,7 @@ def test_settled_windows_depend_on_the_place_only() -> None:
 
 
 def test_gains_are_told_by_the_history() -> None:
-    """Of a fibre that answers by 0.3 more for a spread of its history while the probe rests, and by 0.1 when it left."""
+    """Of a fibre that answers by 0.3 more for a spread of its history while the probe rests, by 0.1 when it left."""
     rng = np.random.default_rng(0)
     places, history = rng.uniform(-1, 1, (PRESSES, 2)), rng.standard_normal((PRESSES, FIBRES, PASTS))
     stronger = np.zeros((FIBRES, PASTS, WINDOWS))
