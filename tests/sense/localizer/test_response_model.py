@@ -5,9 +5,8 @@ import pytest
 
 from sense.localizer.response_model import RIDGE_HISTORY, STEPS, ResponseModel, bumps, settled
 
-FIBRES, PASTS, WINDOWS, PRESSES = 2, 3, 4, 1500
-KEPT = PRESSES / (PRESSES + RIDGE_HISTORY)
-"""Share of a memory that the ridge leaves, where numbers of the history have nothing to do with each other."""
+FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 60_000
+"""Among so many presses the ridge takes next to nothing of a memory."""
 
 
 def made(seed: int, noise: float) -> tuple[np.ndarray, ...]:
@@ -15,7 +14,7 @@ def made(seed: int, noise: float) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(seed)
     places = rng.uniform(-1, 1, (PRESSES, 2))
     history = rng.standard_normal((PRESSES, FIBRES, PASTS)) * [1.0, 0.1, 10.0] + 2
-    memory = 0.1 * rng.standard_normal((FIBRES, PASTS, WINDOWS)) * np.array([1.0, 10.0, 0.1])[:, None]
+    memory = rng.standard_normal((FIBRES, PASTS, WINDOWS)) * np.array([1.0, 10.0, 0.1])[:, None]
     windows = answer(places) + np.einsum("qcj,cjf->qcf", history - history.mean(axis=0), memory)
     return places, windows + noise * rng.standard_normal(windows.shape), history, memory
 
@@ -31,7 +30,7 @@ def test_map_and_memory_are_found_again() -> None:
     alive = np.ones((PRESSES, FIBRES), dtype=bool)
     found = ResponseModel.fit(places, windows, history, alive)
     spread = history.std(axis=0)[:, :, None]
-    assert np.abs((found.memory - KEPT * memory) * spread).max() < 0.02
+    assert np.abs((found.memory - memory) * spread).max() < 0.02
     assert found.usual == pytest.approx(history.mean(axis=0))
     inner = slice(STEPS // 4, -STEPS // 4)
     grid = np.linspace(-1, 1, STEPS + 1)[inner]
@@ -41,29 +40,28 @@ def test_map_and_memory_are_found_again() -> None:
 
 
 def test_settled_windows_depend_on_the_place_only() -> None:
-    places, windows, history, memory = made(1, noise=0.0)
+    places, windows, history, _ = made(1, noise=0.0)
     found = ResponseModel.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
-    assert np.corrcoef(found.memory.ravel(), memory.ravel())[0, 1] > 0.999
-    left = settled(windows, history, memory, found.usual) - answer(places)
-    assert np.abs(left).max() < 1e-9
+    left = settled(windows, history, found.memory, found.usual) - answer(places)
+    assert np.abs(left).max() < 0.05 * np.abs(windows - answer(places)).max()
 
 
 def test_gains_are_told_by_the_history() -> None:
     """Of a fibre that answers by 0.3 more for a spread of its history while the probe rests, by 0.1 when it left."""
     rng = np.random.default_rng(0)
-    places, history = rng.uniform(-1, 1, (PRESSES, 2)), rng.standard_normal((PRESSES, FIBRES, PASTS))
+    places, history = rng.uniform(-1, 1, (FEW, 2)), rng.standard_normal((FEW, FIBRES, PASTS))
     stronger = np.zeros((FIBRES, PASTS, WINDOWS))
     stronger[0, 0], stronger[0, 1] = [0.3, 0.3, 0.0, 0.0], [0.0, 0.0, 0.1, 0.1]
     windows = answer(places) * (1 + np.einsum("qcj,cjf->qcf", history, stronger))
-    alive, phases = np.ones((PRESSES, FIBRES), dtype=bool), (slice(0, 2), slice(2, 4))
+    alive, phases = np.ones((FEW, FIBRES), dtype=bool), (slice(0, 2), slice(2, 4))
     found = ResponseModel.fit(places, windows, history, alive, phases=phases)
     assert found.table.shape[3] == WINDOWS + len(phases)
     assert not found.table[..., WINDOWS:].any()
     shown = settled(windows, history, found.memory, found.usual)
-    assert shown.shape == (PRESSES, FIBRES, WINDOWS + len(phases))
+    assert shown.shape == (FEW, FIBRES, WINDOWS + len(phases))
     rested, left = shown[:, 0, WINDOWS:].T
     assert np.corrcoef(rested, history[:, 0, 0])[0, 1] > 0.95
-    assert rested.std() == pytest.approx(KEPT * 0.3, rel=0.15)
+    assert rested.std() == pytest.approx(FEW / (FEW + RIDGE_HISTORY) * 0.3, rel=0.15)
     assert np.corrcoef(left, history[:, 0, 1])[0, 1] > 0.8
     assert np.abs(shown[:, 1, WINDOWS:]).max() < 0.1
 
@@ -78,6 +76,8 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived() -> None:
     assert np.array_equal(before.table, after.table)
     assert np.array_equal(before.memory, after.memory)
     lived = alive[:, 0]
+    left = settled(windows, history, after.memory, after.usual)[lived, 0] - answer(places)[lived, 0]
+    assert np.sqrt((left**2).mean()) < 0.15  # noise is 0.1, and what memory shows about 3
     assert after.usual[0] == pytest.approx(history[lived, 0].mean(axis=0))
     middle = answer(np.zeros((1, 2)))[0]
     np.testing.assert_allclose(after.table[STEPS // 2, STEPS // 2], middle, atol=0.1)
