@@ -83,9 +83,11 @@ class ResponseModel:
             own, both = _moments(places[there], past, answer, shown)
             weights = np.linalg.solve(own + penalty, both)
             by_place, by_past = weights[: BUMPS**2], weights[BUMPS**2 :]
-            expected = _answers(places[there], by_place, shown)
-            left = answer - expected - past @ by_past
-            gains = [_gain(expected[:, phase].mean(axis=1), left[:, phase].mean(axis=1), past) for phase in phases]
+            gains = []
+            if phases:
+                expected = _answers(places[there], by_place, shown)
+                left = answer - expected - past @ by_past
+                gains = [_gain(expected[:, phase].mean(axis=1), left[:, phase].mean(axis=1), past) for phase in phases]
             shares = np.column_stack([by_past, *(-gain for gain in gains)])
             memory[fibre] = np.divide(
                 shares, spread[:, None], out=np.zeros(shares.shape), where=spread[:, None] > LEAST_SPREAD_V
