@@ -18,14 +18,17 @@ from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
 
 from .features import Inputs, press_inputs
-from .network import Weights, forward, masked, pooled, refuse_unsound
+from .network import Weights, learnt, pooled, refuse_unsound
 from .normalization import Normalization, Scaled, Target
+from .response.observer import PREFIX as OBSERVER
+from .response.observer import TOLD, Observer
 from .schema import FORMAT, read_document
 
 NAME = "localizer"
 """Of its files, `localizer.json` and `localizer.safetensors`."""
 TABLE = "table"
-"""Name of the table among the weights."""
+CORRECTOR = "corrector."
+"""Names of the table, and of what corrects the observer, among the weights."""
 UNKNOWN = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and the radii of 50 and 90 % for a place anywhere in a square of half-width 1."""
 _CHUNK = 8192
@@ -88,6 +91,8 @@ class Localizer:
         recalibrated_by: digests of the recordings that it was recalibrated by, all of whose presses it has seen.
         errors: on those, one row per number of lost fibres.
         provenance: where the localizer came from; free JSON.
+        observer: what finds places by the fitted pad; None of several depths, and of what has not learnt by losing
+            fibres. corrector: weights of the network that corrects it, a member beside the others.
     """
 
     weights: Weights
@@ -103,6 +108,8 @@ class Localizer:
     recalibrated_by: tuple[str, ...] = ()
     errors: Sequence[Mapping[str, Any]] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    observer: Observer | None = None
+    corrector: Weights = field(default_factory=dict)
 
     @property
     def fibres(self) -> int:
@@ -137,8 +144,8 @@ class Localizer:
             raise InputError("fibres are lost: a published localizer knows none, train one of method masked")
         chunks = range(0, len(presses), _CHUNK)
         found = [self._pooled(presses.inputs[i : i + _CHUNK], alive[i : i + _CHUNK]) for i in chunks]
-        learnt = self.normalization.measures
-        nothing = np.empty((0, 2 + len(learnt)))
+        measured = self.normalization.measures
+        nothing = np.empty((0, 2 + len(measured)))
         numbers, spreads = (
             (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (nothing, nothing)
         )
@@ -152,15 +159,14 @@ class Localizer:
         places, sd = np.where(blind[:, None], 0.0, places), np.where(blind[:, None], anywhere[0], sd)
         r50, r90 = np.where(blind, anywhere[1], r50), np.where(blind, anywhere[2], r90)
         measures = {}
-        for column, target in enumerate(learnt):
+        for column, target in enumerate(measured):
             half = self.factors[level, 3 + column] * spreads[:, 2 + column]
             value = np.where(blind, 0.0, numbers[:, 2 + column])
             measures[target.name] = Measured(target.values(value), target.span * np.where(blind, 1.0, half))
         return Found(self.normalization.places_mm(places), sd, r50, r90, measures)
 
     def _pooled(self, inputs: Floats, alive: Mask) -> tuple[Floats, Floats]:
-        entries = inputs.reshape(len(inputs), -1) if self.method == "published" else masked(inputs, alive)
-        return pooled(forward(self.weights, entries))
+        return pooled(learnt(self.weights, inputs, alive, self.method, self.observer, self.corrector))
 
     def _alive(self, lost: ArrayLike) -> Mask:
         alive = np.ones(self.fibres, dtype=bool)
@@ -212,7 +218,10 @@ class Localizer:
             "recalibrated_by": list(self.recalibrated_by),
             "provenance": dict(self.provenance),
         }
-        files_of(folder, NAME).write(document, {**self.weights, TABLE: self.table}, "localizer")
+        arrays = {**self.weights, TABLE: self.table}
+        if self.observer is not None:
+            arrays |= self.observer.arrays() | {CORRECTOR + name: part for name, part in self.corrector.items()}
+        files_of(folder, NAME).write(document, arrays, "localizer")
 
     @classmethod
     def load(cls, folder: str | Path) -> "Localizer":
@@ -238,6 +247,7 @@ class Localizer:
             table = weights.pop(TABLE)
             normalization.refuse_unsound(table)
             entries = normalization.entries(document.method)
+            observer, corrector = _observing(weights, normalization, entries, document.method)
             refuse_unsound(weights, entries, document.method, len(normalization.measures))
         plain = ("method", "features", "rate_hz", "learnt_from", "split", "provenance")
         return cls(
@@ -248,5 +258,27 @@ class Localizer:
             test=tuple(document.test),
             recalibrated_by=tuple(document.recalibrated_by),
             errors=[row.model_dump(exclude_none=True) for row in document.errors],
+            observer=observer,
+            corrector=corrector,
             **{name: getattr(document, name) for name in plain},
         )
+
+
+def _observing(
+    arrays: dict[str, Any], normalization: Normalization, entries: int, method: str
+) -> tuple[Observer | None, Weights]:
+    """The observer and what corrects it, taken out of the `arrays` of a localizer; none in one of before, or without.
+
+    Raises:
+        InputError: they are none that belong to it. KeyError: one of them is missing.
+    """
+    parts = {name: arrays.pop(name) for name in list(arrays) if name.startswith((OBSERVER, CORRECTOR))}
+    if not parts:
+        return None, {}
+    corrector = {name.removeprefix(CORRECTOR): part for name, part in parts.items() if name.startswith(CORRECTOR)}
+    observer = Observer.of(parts)
+    observer.refuse_unsound(*normalization.centre.shape)
+    if method != "masked" or normalization.measures:
+        raise InputError("observer is there beside measures, or method published, expected none")
+    refuse_unsound(corrector, entries + TOLD, method)
+    return observer, corrector

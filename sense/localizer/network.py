@@ -6,17 +6,21 @@ else is learnt of a press, and to the logarithms of the expected errors of all t
 along the first axis of every array. Of the method "published": one layer of tanh neurons leads to two coordinates.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 
 from design.common.errors import InputError
-from sense.recordings.processing.limits import Floats, Mask
+from sense.recordings.processing.limits import Array, Floats, Mask
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
 `last.b` (E, 1, 2 N), for E members, D inputs, H hidden units, L residual layers and N numbers learnt, the first of them
 x and y; of the published network, E = 1, no `hidden`, and 2 in place of 2 N."""
+
+Observing = Callable[[Array, Mask], tuple[Array, Array]]
+"""From (Q, C, F) inputs and (Q, C) which count to (Q, 2) places, and (Q, T) what their corrector is told."""
 
 OUTPUTS = 4
 """x, y, and the logarithms of the mean absolute errors expected of them, all in units of the localizer's span. What
@@ -87,15 +91,43 @@ def forward(weights: Weights, x: Floats) -> Floats:
     return _gelu(_normalised(h)) @ weights["last.w"] + weights["last.b"]
 
 
+def learnt(
+    weights: Weights,
+    inputs: Floats,
+    alive: Mask,
+    method: str = "masked",
+    observer: Observing | None = None,
+    corrector: Weights = MappingProxyType({}),
+) -> Floats:
+    """(E, Q, 2 N) what the members give of Q presses, see `network.forward`, the corrected observer as the last.
+
+    Args:
+        inputs: (Q, C, F + G) scaled. alive: (Q, C).
+    """
+    entries = inputs.reshape(len(inputs), -1) if method == "published" else masked(inputs, alive)
+    outputs = forward(weights, entries)
+    if observer is None:
+        return outputs
+    place, told = observer(inputs.astype(np.float64), alive)
+    corrected = forward(corrector, np.concatenate([entries, told.astype(np.float32)], axis=1))
+    corrected[:, :, :2] += place
+    return np.concatenate([outputs, corrected])
+
+
 def pooled(outputs: Floats) -> tuple[Floats, Floats]:
     """(E, Q, 2 N) outputs of all members to (Q, N) numbers learnt and their standard deviations, in units of spans.
 
-    A member's error is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b; the spread of the
-    members adds to it (Lakshminarayanan et al. 2017, Simple and scalable predictive uncertainty).
+    A member's error is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b. A member counts
+    by the inverse of that, press by press, as much in x as in y; the spread of the members adds to it (Lakshminarayanan
+    et al. 2017, Simple and scalable predictive uncertainty).
     """
     learnt, logs = np.split(outputs, 2, axis=2)
-    variance = (2 * np.exp(2 * np.clip(logs, LEAST_LOG, MOST_LOG))).mean(axis=0) + learnt.var(axis=0)
-    return learnt.mean(axis=0), np.sqrt(variance)
+    variance = 2 * np.exp(2 * np.clip(logs, LEAST_LOG, MOST_LOG))
+    doubt = variance.copy()
+    doubt[:, :, :2] = variance[:, :, :2].mean(axis=2, keepdims=True)
+    share = 1 / doubt / (1 / doubt).sum(axis=0)
+    mean = (share * learnt).sum(axis=0)
+    return mean, np.sqrt((share * (variance + (learnt - mean) ** 2)).sum(axis=0))
 
 
 _ERF = (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)

@@ -13,7 +13,7 @@ from design.common.errors import InputError
 from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
 from .features import Inputs
-from .response_model import STEPS, ResponseModel, settled
+from .response.response_model import STEPS, ResponseModel, settled
 
 MAX_INPUT = 1e4
 """Greatest scaled input, in spreads: what lies further off is no press, and is held there."""

@@ -14,7 +14,7 @@ from design.benchmarking.harness import Bench, BenchTrial
 from design.pad.contact import signals
 from design.pad.twin import Frame, Twin, TwinChannel
 from design.settings import Contact, sensed_rectangle
-from sense.localizer.response_model import RIDGE_PLACE, bumps
+from sense.localizer.response.response_model import RIDGE_PLACE, bumps
 from sense.recordings.processing.limits import Array
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.published_protocol import simulate

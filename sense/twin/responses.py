@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from sense.localizer.features import DOWN, press_inputs
-from sense.localizer.response_model import STEPS, ResponseModel, settled
+from sense.localizer.response.response_model import STEPS, ResponseModel, settled
 from sense.recordings.processing.limits import Array, Indices, Mask
 from sense.recordings.recording import Recording
 

@@ -17,7 +17,7 @@ from sense.localizer.localizer import Localizer
 from sense.recordings.processing.limits import Array, Indices, Mask
 from sense.recordings.recording import Recording
 
-from .onnx_graph import INPUTS, MEASURES, OUTPUTS, onnx_model
+from .onnx_graph.localizer_graph import INPUTS, MEASURES, OUTPUTS, onnx_model
 
 FORMAT = "padforge-onnx/1"
 MOST_OFF_MM = 1e-4

@@ -26,6 +26,8 @@ from .streaming import Detector, Seen, commanded, owners, seen
 
 TRUSTED = 0.5
 """Share of what the teacher finds in what a press is taught as, beside what is known of it."""
+LONGER = 4
+"""How much longer than a localizer a student is trained, which has no observer beside it; its steps are short."""
 MOST_INT8 = 127
 
 
@@ -151,7 +153,7 @@ def teach(
     also = np.flatnonzero(np.isin(press, taught))
     shown, rows = plain[taught] + found.inputs[also], np.concatenate([taught, press[also]])
     scaling, table = Normalization.fit(shown, lessons[rows].places_mm, lessons[rows].measures)
-    size = {"members": 1, "hidden": hidden, "layers": LAYERS, "lost": levels - 1}
+    size = {"members": 1, "hidden": hidden, "layers": LAYERS, "lost": levels - 1, "epochs": LONGER * options.epochs}
     weights = _trained(_samples(scaling, shown, lessons[rows]), table, options.model_copy(update=size), rng, progress)
     localizer = Localizer(
         as_int8(weights) if budget.quantized else weights,
@@ -184,7 +186,7 @@ def _trained(
     from sense.localizer.calibration.training import train_members  # torch, seconds to import, is needed here only
 
     with one_torch_thread():
-        weights = train_members(learn, table, options, rng, progress)
+        weights = train_members(learn, table, options, rng, progress, observing=False).weights
     fibres, inputs = learn.inputs.shape[1:]
     try:
         refuse_unsound(weights, fibres * (inputs + 1), "masked", learn.targets.shape[1] - 2)

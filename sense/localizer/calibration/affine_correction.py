@@ -13,6 +13,7 @@ import numpy as np
 
 from sense.localizer.features import Inputs
 from sense.localizer.localizer import Localizer
+from sense.localizer.network import Weights
 from sense.recordings.processing.limits import Array, Floats
 
 GAIN, TURN, SHIFT = 0.2, 0.05, 0.1
@@ -64,18 +65,23 @@ def _parts(localizer: Localizer, numbers: Array) -> tuple[Array, Array, Array]:
 
 def _corrected(localizer: Localizer, numbers: Array) -> Localizer:
     gains, turn, shift = _parts(localizer, numbers)
-    before, weights = localizer.normalization, dict(localizer.weights)
-    gains = gains[:, None]
-    last, bias = weights["last.w"].copy(), weights["last.b"].copy()
-    last[..., :2] = last[..., :2] @ turn.T
-    bias[..., :2] = bias[..., :2] @ turn.T + shift
+    before, observer, gains = localizer.normalization, localizer.observer, gains[:, None]
     return replace(
         localizer,
-        weights=weights | {"last.w": last, "last.b": bias},
+        weights=_turned(localizer.weights, turn, shift),
+        observer=observer and observer.moved(turn, shift),
+        corrector=_turned(localizer.corrector, turn, np.zeros(2)) if observer else {},
         normalization=replace(
             before, centre=gains * before.centre, spread=gains * before.spread, usual=gains * before.usual
         ),
     )
+
+
+def _turned(weights: Weights, turn: Array, shift: Array) -> Weights:
+    last, bias = weights["last.w"].copy(), weights["last.b"].copy()
+    last[..., :2] = last[..., :2] @ turn.T
+    bias[..., :2] = bias[..., :2] @ turn.T + shift
+    return {**weights, "last.w": last, "last.b": bias}
 
 
 def _moved_table(localizer: Localizer, turn: Array, shift: Array) -> Floats:

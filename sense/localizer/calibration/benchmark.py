@@ -15,7 +15,7 @@ from design.benchmarking.harness import Bench, BenchTrial
 from design.common.computing import one_torch_thread
 from sense import settings
 from sense.localizer.features import press_inputs
-from sense.localizer.network import Weights, forward, masked, pooled
+from sense.localizer.network import Weights, forward, learnt, masked, pooled
 from sense.localizer.normalization import Normalization
 from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
@@ -144,9 +144,15 @@ def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predi
     shown = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
     batches = max(LEAST_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
     options = settings.LocalizerSettings(members=1, epochs=-(-steps // batches))
-    weights = train_members(shown, table, options, np.random.default_rng(0), lambda done, total: None)
+    trained = train_members(shown, table, options, np.random.default_rng(0), lambda done, total: None)
 
-    return lambda x: _places(weights, x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)).astype(np.float64)
+    def predict(x: Array) -> Array:
+        presses = x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)
+        every = np.ones(presses.shape[:2], dtype=bool)
+        found = learnt(trained.weights, presses, every, observer=trained.observer, corrector=trained.corrector)
+        return pooled(found)[0].astype(np.float64)
+
+    return predict
 
 
 def _predictions() -> Iterator[BenchTrial]:

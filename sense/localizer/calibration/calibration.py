@@ -18,8 +18,9 @@ from sense import settings
 from sense.localizer.evaluation import conformal, evaluate, held_back
 from sense.localizer.features import PHASES, press_inputs
 from sense.localizer.localizer import Localizer
-from sense.localizer.network import refuse_unsound
+from sense.localizer.network import Weights, refuse_unsound
 from sense.localizer.normalization import Normalization, Scaled
+from sense.localizer.response.observer import TOLD
 from sense.recordings.processing.limits import Array, Indices
 from sense.recordings.recording import Recording
 
@@ -123,23 +124,23 @@ def learn(
     shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
     scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more, PHASES[options.features])
     shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
+    observer, corrector = None, {}
     if masked:
         from .training import train_members  # torch, seconds to import, is needed here only
 
-        weights = train_members(shown, table, options, rng, progress, time_budget)
+        weights, observer, corrector = train_members(shown, table, options, rng, progress, time_budget)
     else:
         from .networks.published_training import train_published
 
         held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], {})
         weights = train_published(shown, held, rng)
-    try:
-        refuse_unsound(weights, scaling.entries(options.method), options.method, len(measures))
-    except InputError as error:
-        raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
+    _refuse_diverged(weights, corrector, scaling, options)
     localizer = Localizer(
         weights=weights,
         normalization=scaling,
         table=table,
+        observer=observer,
+        corrector=corrector,
         method=options.method,
         features=options.features,
         factors=np.ones((1, 3 + len(measures))),
@@ -149,6 +150,18 @@ def learn(
     levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
     proof = scaling.inputs(raw[proving]), recording.presses_mm[proving], levels, _of(measures, proving)
     return replace(localizer, factors=radii(localizer, *proof))
+
+
+def _refuse_diverged(
+    weights: Weights, corrector: Weights, scaling: Normalization, options: settings.LocalizerSettings
+) -> None:
+    entries = scaling.entries(options.method)
+    try:
+        refuse_unsound(weights, entries, options.method, len(scaling.measures))
+        if corrector:
+            refuse_unsound(corrector, entries + TOLD, options.method)
+    except InputError as error:
+        raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
 
 
 def _parts(

@@ -15,9 +15,10 @@ from torch import Tensor
 from design.common.computing import one_torch_thread
 from sense.health.trained_model import one_cycle
 from sense.localizer.network import Weights
+from sense.localizer.response.observer import Observer
 from sense.recordings.processing.limits import Floats
 
-from .networks.masked_network import draw_alive, forward, inputs_at, masked, misses
+from .networks.masked_network import draw_alive, entries, forward, inputs_at, misses
 from .networks.training_presses import TrainingPresses
 from .training import INPUT_NOISE
 
@@ -40,8 +41,9 @@ def adapt(
     lost: int,
     rng: np.random.Generator,
     progress: Callable[[int], None] = lambda steps: None,
+    observer: Observer | None = None,
 ) -> Weights:
-    """Adapt the members of a network of method "masked".
+    """Adapt the members of a network of method "masked", or the network that corrects an observer.
 
     Args:
         weights: as `network.forward` takes them.
@@ -50,6 +52,7 @@ def adapt(
         lost: fibres that are lost at once, at most, while adapting.
         rng: source of the seed of torch's generator, which draws all that is random here.
         progress: called with the steps done since it was last called.
+        observer: what they correct, if anything; it stays as it is.
 
     Returns:
         Weights of the same shapes.
@@ -57,7 +60,7 @@ def adapt(
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     before = {name: torch.from_numpy(weight) for name, weight in weights.items()}
     now = {name: weight.clone().requires_grad_() for name, weight in before.items()}
-    presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator)
+    presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator, observer)
     members = len(now["first.w"])
     trust = len(samples.inputs) / (len(samples.inputs) + OLD_PRESSES)
     optimizer = torch.optim.Adam(now.values(), lr=RATE)
@@ -65,13 +68,13 @@ def adapt(
         for number in range(1, STEPS + 1):
             optimizer.param_groups[0]["lr"] = RATE * one_cycle(number / STEPS)
             optimizer.zero_grad()
-            entries, targets = presses.nearby()
-            off = forward(now, entries.expand(members, -1, -1))[..., : targets.shape[1]] - targets
+            known, left = presses.nearby()
+            off = forward(now, known.expand(members, -1, -1))[..., : left.shape[1]] - left
             loss = trust * misses(off).mean(dim=1).sum()
-            entries = presses.anywhere().expand(members, -1, -1)
+            known = presses.anywhere().expand(members, -1, -1)
             with torch.no_grad():
-                found = forward(before, entries)
-            loss = loss + (1 - trust) * _change(forward(now, entries), found)
+                found = forward(before, known)
+            loss = loss + (1 - trust) * _change(forward(now, known), found)
             loss.backward()
             optimizer.step()
             progress(1)
@@ -81,23 +84,32 @@ def adapt(
 class _Presses:
     """Draws presses that resemble the known ones."""
 
-    def __init__(self, samples: TrainingPresses, table: Floats, lost: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        samples: TrainingPresses,
+        table: Floats,
+        lost: int,
+        generator: torch.Generator,
+        observer: Observer | None,
+    ) -> None:
         self._x, self._alive, self._y = (torch.from_numpy(a) for a in (samples.inputs, samples.alive, samples.targets))
         self._table, self._stretch = torch.from_numpy(table).flatten(2), samples.stretch
         self._at_home = inputs_at(self._table, self._y, self._stretch)
         self._lost, self._generator = lost, generator
+        self._observer = observer and observer.changed(torch.from_numpy)
 
     def nearby(self) -> tuple[Tensor, Tensor]:
-        """Entries (1, B, D) of the network and targets (B, 2 + T) of presses moved by a few millimetres."""
+        """Entries (1, B, D) and what is to be found of them (B, 2 + T), of presses moved by a few millimetres."""
         rows = self._rows()
         targets = self._at(rows, (self._y[rows, :2] + MOVED * self._normal(BATCH, 2)).clamp(-1, 1))
-        return self._entries(rows, targets, INPUT_NOISE), targets
+        known, found = self._entries(rows, targets, INPUT_NOISE)
+        return known, targets - found
 
     def anywhere(self) -> Tensor:
         """Entries (1, B, D) of presses moved to any place of the pad."""
         rows = self._rows()
         anywhere = 2 * torch.rand(BATCH, 2, generator=self._generator) - 1
-        return self._entries(rows, self._at(rows, anywhere), FAR_NOISE)
+        return self._entries(rows, self._at(rows, anywhere), FAR_NOISE)[0]
 
     def _rows(self) -> Tensor:
         return torch.randint(len(self._x), (BATCH,), generator=self._generator)
@@ -106,12 +118,13 @@ class _Presses:
         """(B, 2 + T) targets of presses at other places, as deep and forceful as they were."""
         return torch.cat([places, self._y[rows, 2:]], dim=1)
 
-    def _entries(self, rows: Tensor, targets: Tensor, noise: float) -> Tensor:
+    def _entries(self, rows: Tensor, targets: Tensor, noise: float) -> tuple[Tensor, Tensor]:
         moved = (inputs_at(self._table, targets, self._stretch) - self._at_home[rows]).view_as(self._x[rows])
         inputs = self._x[rows] + moved
         inputs = inputs + noise * self._normal(*inputs.shape)
         alive = self._alive[rows] & draw_alive(BATCH, self._x.shape[1], self._lost, self._generator)
-        return masked(inputs, alive)[None]
+        known, found = entries(inputs, alive, self._observer)
+        return known[None], found
 
     def _normal(self, *shape: int) -> Tensor:
         return torch.randn(*shape, generator=self._generator)

@@ -152,9 +152,11 @@ def _adapted(
     found = localizer.locate(scaled).measures  # where it is not known how deep a press was, it goes on being found so
     known = {name: np.where(np.isnan(values), found[name].values, values) for name, values in measures.items()}
     samples = TrainingPresses(scaled.inputs, scaled.alive, scaling.targets(places_mm, known), scaling.stretch)
-    return replace(
-        localizer, weights=adapt(localizer.weights, samples, localizer.table, len(localizer.factors) - 1, rng)
-    )
+    given, lost = (samples, localizer.table), len(localizer.factors) - 1
+    weights, observer, corrector = adapt(localizer.weights, *given, lost, rng), localizer.observer, localizer.corrector
+    if observer is not None:
+        corrector = adapt(corrector, *given, lost, rng, observer=observer)
+    return replace(localizer, weights=weights, corrector=corrector)
 
 
 class _CrossValidation:

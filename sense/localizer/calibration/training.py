@@ -5,17 +5,20 @@ loses a random few fibres of every press and moves the press by a few millimetre
 `response_model` of the pad says. Of several depths, these are learnt too, with forces where they are known, and presses
 are moved in depth as well: the lighter, and so the more blurred, the farther. The rate follows one cycle; what is kept
 is a running average of the weights. None of it is chosen by presses held back: so few as there are choose by chance.
-Members are independent, each on a thread of its own. In a time budget, the cycle is one of time, and there is a member
-for every core, and more of them only where each can be trained for three times its usual length: until then, longer
-training gains more than further members.
+Beside the members, which know nothing of it, a smaller network learns to correct what an `observer` finds: their
+errors are of different kinds, so together they err by a tenth less than two of either. All are independent, each on a
+thread of its own. In a time budget, the cycle is one of time, and there is a network for every core, and more of them
+only where each can be trained for three times its usual length: until then, longer training gains more.
 """
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from threading import Event, Lock
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,10 +28,11 @@ from design.common.computing import one_torch_thread, run_tasks
 from sense import settings
 from sense.health.trained_model import average_in, one_cycle
 from sense.localizer.network import LEAST_LOG, MOST_LOG, OUTPUTS, Weights
+from sense.localizer.response.observer import TOLD, Observer
 from sense.recordings.processing.limits import Floats
 
-from .networks.masked_network import draw_alive, forward, initial, inputs_at, masked, misses
-from .networks.training_presses import TrainingPresses
+from .networks.masked_network import draw_alive, entries, forward, initial, inputs_at, misses
+from .networks.training_presses import TrainingPresses, as_unseen
 
 LEAST_BATCHES, MOST_STEPS, LONGER = 6, 11_000, 2
 """Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths,
@@ -44,7 +48,9 @@ BLURRED, DEEPENED = 0.26, 0.3
 are moved by as much more as noise blurs them more, or they would be known again by their noise."""
 EXPECTING = 0.1
 """Weight of learning the expected error, beside the distance."""
-TOLD = 40
+CORRECTOR = {"hidden": 128, "layers": 3}
+"""Size of the network that corrects what the observer finds, at most: larger ones gain nothing."""
+REPORTS = 40
 """How often a training tells how far it is."""
 TRIED, LENGTHENED, MOST_MEMBERS = 12, 3, 64
 """Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
@@ -107,6 +113,14 @@ class TrainingLength:
         return min(spent / self.seconds, 1.0) if self.seconds > 0 else 1.0
 
 
+class Trained(NamedTuple):
+    """Weights as `network.forward` takes them, of the members and of the network that corrects the observer, if any."""
+
+    weights: Weights
+    observer: Observer | None
+    corrector: Weights
+
+
 def train_members(
     learn: TrainingPresses,
     table: Floats,
@@ -114,8 +128,9 @@ def train_members(
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
     time_budget: float | None = None,
-) -> Weights:
-    """Fit the members of the localizer.
+    observing: bool = True,
+) -> Trained:
+    """Fit the members of the localizer, an observer, and the network that corrects it.
 
     Args:
         learn: presses to learn from.
@@ -124,30 +139,35 @@ def train_members(
         progress: called with (steps done, steps in all), of all members together; in a time budget, with seconds.
         time_budget: seconds of wall clock to train for, with the members that these are good for; None for the
             members and the length of `options`.
-
-    Returns:
-        Weights as `network.forward` takes them.
+        observing: whether there is to be an observer; of presses of several depths there is none.
     """
     begin = time.monotonic()
+    learn = as_unseen(learn, table)
+    observing = observing and not learn.stretch
+    observer = Observer.fit(table, learn.inputs, learn.alive, learn.targets) if observing else None
     steps = training_steps(len(learn.inputs), options) * (LONGER if learn.stretch else 1)
+    beside, cores = int(observing), os.cpu_count() or 1
     with one_torch_thread():
         members, seconds = options.members, None
         if time_budget is not None:
-            pace = _Member(learn, table, options, 0).pace()
-            cores = os.cpu_count() or 1
+            pace = _Training(learn, table, options, 0).pace()
             in_turn = max(1, min(round(time_budget / (pace * LENGTHENED * steps)), MOST_MEMBERS // cores))
-            members, seconds = cores * in_turn, max(0.0, time_budget - (time.monotonic() - begin)) / in_turn
-    seeds = [int(seed) for seed in rng.integers(2**63, size=members)]
-    joint = JointProgress([TrainingLength(steps, seconds).total] * members, progress)
+            members = max(1, cores * in_turn - beside)
+            seconds = max(0.0, time_budget - (time.monotonic() - begin)) / math.ceil((members + beside) / cores)
+    seeds = [int(seed) for seed in rng.integers(2**63, size=members + beside)]
+    joint = JointProgress([TrainingLength(steps, seconds).total] * len(seeds), progress)
+    small = options.model_copy(update={name: min(most, getattr(options, name)) for name, most in CORRECTOR.items()})
 
     def train(number: int) -> Weights:
-        member = _Member(learn, table, options, seeds[number])
-        return member.train(TrainingLength(steps, seconds), lambda done: joint.tell(number, done))
+        corrects = number == members
+        training = _Training(
+            learn, table, small if corrects else options, seeds[number], observer if corrects else None
+        )
+        return training.run(TrainingLength(steps, seconds), lambda done: joint.tell(number, done))
 
     with one_torch_thread(), joint:
         weights = dict(run_tasks((number, partial(train, number)) for number in range(len(seeds))))
-    found = [weights[number] for number in range(len(seeds))]
-    return joined(found)
+    return Trained(joined([weights[number] for number in range(members)]), observer, weights.get(members, {}))
 
 
 def joined(members: Sequence[Weights]) -> Weights:
@@ -161,8 +181,8 @@ def training_steps(presses: int, options: settings.LocalizerSettings) -> int:
     return min(MOST_STEPS, options.epochs * max(LEAST_BATCHES, presses // options.batch))
 
 
-class _Member:
-    """One network in training, on the GPU where there is one."""
+class _Training:
+    """One network in training, on the GPU where there is one: on its own, or to correct an observer."""
 
     def __init__(
         self,
@@ -170,6 +190,7 @@ class _Member:
         table: Floats,
         options: settings.LocalizerSettings,
         seed: int,
+        observer: Observer | None = None,
     ) -> None:
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._generator = torch.Generator(self._device).manual_seed(seed)
@@ -192,8 +213,9 @@ class _Member:
         self._stretch = learn.stretch
         at_home = inputs_at(self._table, self._y, self._stretch)
         self._rest = self._x - at_home.view_as(self._x)
-        entries, outputs = self._fibres * (size + 1), OUTPUTS + 2 * (self._y.shape[1] - 2)
-        self._weights = initial(entries, options, self._generator, outputs)
+        self._observer = observer and observer.changed(lambda part: torch.from_numpy(part).to(self._device))
+        width = self._fibres * (size + 1) + (0 if observer is None else TOLD)
+        self._weights = initial(width, options, self._generator, OUTPUTS + 2 * (self._y.shape[1] - 2))
 
     def pace(self) -> float:
         """Seconds that a step takes."""
@@ -204,7 +226,7 @@ class _Member:
             took.append(time.monotonic() - begin)
         return float(np.median(took))
 
-    def train(self, length: TrainingLength, tell: Callable[[int], None]) -> Weights:
+    def run(self, length: TrainingLength, tell: Callable[[int], None]) -> Weights:
         weights, rate = self._weights, self._options.rate
         average = {name: w.detach().clone() for name, w in weights.items()}
         optimizer = torch.optim.AdamW(weights.values(), lr=rate, weight_decay=WEIGHT_DECAY, fused=True)
@@ -217,8 +239,8 @@ class _Member:
             self._loss().backward()
             optimizer.step()
             average_in(average.values(), weights.values(), number)
-            if share * TOLD >= told + 1:
-                told = int(share * TOLD)
+            if share * REPORTS >= told + 1:
+                told = int(share * REPORTS)
                 tell(round(share * length.total))
         return {name: w.cpu().numpy() for name, w in average.items()}
 
@@ -230,8 +252,9 @@ class _Member:
         inputs = inputs_at(self._table, targets, self._stretch).view_as(rest) + rest
         inputs += INPUT_NOISE * self._normal(*rest.shape)
         alive = self._alive[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
-        learnt, logs = forward(self._weights, masked(inputs, alive)[None])[0].chunk(2, dim=1)
-        off, logs = learnt - targets, logs.clamp(LEAST_LOG, MOST_LOG)
+        known, found = entries(inputs, alive, self._observer)
+        learnt, logs = forward(self._weights, known[None])[0].chunk(2, dim=1)
+        off, logs = learnt + found - targets, logs.clamp(LEAST_LOG, MOST_LOG)
         return (misses(off) + EXPECTING * (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)).mean()
 
     def _moved(self, targets: Tensor) -> Tensor:

@@ -85,6 +85,7 @@ def untrained(recording: Recording, localizer: Localizer) -> Callable[..., Local
         rng = np.random.default_rng(3)
         weights = {name: 0.3 * rng.standard_normal(shape).astype(np.float32) for name, shape in shapes.items()}
         made = {"weights": weights, "normalization": scaling, "table": table, "method": method, "features": features}
+        made |= {"observer": None, "corrector": {}}
         return replace(localizer, **made, factors=np.ones((1, 3)), rate_hz=part.rate_hz)
 
     return make

@@ -288,6 +288,8 @@ def test_a_localizer_that_knows_no_gains_is_read_and_finds_places(
         normalization=plain,
         table=np.ascontiguousarray(localizer.table[..., :windows]),
         weights={**localizer.weights, "first.w": first},
+        observer=None,
+        corrector={},
     )
     before.save(tmp_path)
     found = Localizer.load(tmp_path).locate(before.inputs(recording))

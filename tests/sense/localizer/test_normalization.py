@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sense.localizer.features import Inputs
 from sense.localizer.normalization import MAX_INPUT, Normalization
-from sense.localizer.response_model import BUMPS, WIDTH, bumps
+from sense.localizer.response.response_model import BUMPS, WIDTH, bumps
 from tests.helpers.effort import few
 
 PRESSES, FIBRES, WINDOWS = 300, 3, 4

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sense.localizer.response_model import RIDGE_HISTORY, STEPS, ResponseModel, bumps, settled
+from sense.localizer.response.response_model import RIDGE_HISTORY, STEPS, ResponseModel, bumps, settled
 
 FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 60_000
 """Among so many presses the ridge takes next to nothing of a memory."""

@@ -6,6 +6,8 @@ from torch.nn import functional
 
 from sense import settings
 from sense.localizer.network import EPSILON, OUTPUTS
+from sense.localizer.response.observer import Observer
+from sense.localizer.response.response_model import looked_up
 
 WHOLE = 0.25
 """Share of training presses that keep all fibres; the others lose 1 .. `lost`, each as often."""
@@ -21,20 +23,8 @@ def misses(off: Tensor) -> Tensor:
 
 def inputs_at(table: Tensor, targets: Tensor, stretch: float) -> Tensor:
     """(B, D) scaled inputs of presses with (B, 2 + T) targets, by `looked_up`; in proportion to their depth."""
-    found = looked_up(table, targets[:, :2])
+    found = looked_up(table, targets[:, :2], torch)
     return found if targets.shape[1] == 2 else (1 + stretch * targets[:, 2:3]) * found
-
-
-def looked_up(table: Tensor, places: Tensor) -> Tensor:
-    """(S, S, D) table over [-1, 1]^2 and (B, 2) places to (B, D), linear between entries."""
-    side = table.shape[0]
-    at = ((places + 1) * ((side - 1) / 2)).clamp(0, side - 1 - 1e-3)
-    whole = at.floor()
-    x, y = (at - whole).T
-    corner = (whole[:, 0] * side + whole[:, 1]).long()
-    corners = torch.stack([corner, corner + 1, corner + side, corner + side + 1], dim=1)
-    shares = torch.stack([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y], dim=1)
-    return functional.embedding_bag(corners, table.flatten(0, 1), per_sample_weights=shares, mode="sum")
 
 
 def initial(
@@ -73,6 +63,16 @@ def masked(inputs: Tensor, alive: Tensor) -> Tensor:
     """(B, C, F) inputs and (B, C) masks to (B, C F + C) entries, as `network.masked`."""
     kept = torch.where(alive[..., None], inputs, 0.0)
     return torch.cat([kept.flatten(1), alive.to(inputs.dtype)], dim=1)
+
+
+def entries(inputs: Tensor, alive: Tensor, observer: Observer | None) -> tuple[Tensor, Tensor]:
+    """(B, D) what enters a network for (B, C, F) inputs, and the place that it is to correct: (B, 2), or 0 for none."""
+    known = masked(inputs, alive)
+    if observer is None:
+        return known, known.new_zeros(())
+    with torch.no_grad():
+        place, told = observer(inputs, alive, torch)
+    return torch.cat([known, told], dim=1), place
 
 
 def forward(weights: dict[str, Tensor], x: Tensor) -> Tensor:

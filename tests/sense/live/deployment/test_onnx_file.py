@@ -90,7 +90,7 @@ def test_the_file_says_what_it_is(localizer: Localizer, tmp_path: Path) -> None:
     assert list(json.loads(about["inputs"])) == [each.name for each in model.graph.input]
     assert list(json.loads(about["outputs"])) == [each.name for each in model.graph.output]
     assert [each.dim_param for each in model.graph.input[1].type.tensor_type.shape.dim] == ["presses"]
-    assert onnx_line(found).startswith("0.1 MB, tried on 64 presses with up to 3 fibres lost: places within ")
+    assert onnx_line(found).startswith("1.9 MB, tried on 64 presses with up to 3 fibres lost: places within ")
 
 
 def test_a_graph_that_is_off_is_not_written(localizer, recording, tmp_path, monkeypatch) -> None:

@@ -192,7 +192,8 @@ def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkey
     train = sense.localizer.calibration.training.train_members
 
     def diverged(*arguments: Any) -> Any:
-        return {name: weight * np.float32(np.nan) for name, weight in train(*arguments).items()}
+        trained = train(*arguments)
+        return trained._replace(weights={name: w * np.float32(np.nan) for name, w in trained.weights.items()})
 
     monkeypatch.setattr(sense.localizer.calibration.training, "train_members", diverged)
     with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate 0.004, try a lower one"):

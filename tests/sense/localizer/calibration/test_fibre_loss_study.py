@@ -22,7 +22,7 @@ from sense.settings import LocalizerSettings as Options
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published network of three neurons, and a coarse map of the answers, which is not what is tested."""
     monkeypatch.setattr("sense.localizer.calibration.networks.published_training.HIDDEN", 3)
-    monkeypatch.setattr("sense.localizer.response_model.BUMPS", 7)
+    monkeypatch.setattr("sense.localizer.response.response_model.BUMPS", 7)
 
 
 def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:

@@ -44,7 +44,7 @@ def quick() -> Iterator[None]:
     """Few resamplings, and a coarse map of the answers."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("sense.localizer.calibration.learning_curve.DRAWS", 40)
-        patched.setattr("sense.localizer.response_model.BUMPS", 7)
+        patched.setattr("sense.localizer.response.response_model.BUMPS", 7)
         yield
 
 

@@ -249,7 +249,7 @@ def test_presses_are_moved_nearby_or_to_anywhere_on_the_pad() -> None:
     table = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)[:, :, None]
     at = np.tile(np.array([0.25, -0.5], dtype=np.float32), (5, 1))
     presses = _Presses(
-        TrainingPresses(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0)
+        TrainingPresses(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0), None
     )
     entries, places = presses.nearby()
     assert (entries[0, :, :2] - places).std().item() == pytest.approx(INPUT_NOISE, rel=0.2)

@@ -1,5 +1,7 @@
 """Training: masks lose no more than they may, and presses are moved as the fitted table says."""
 
+from types import ModuleType
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,9 @@ from hypothesis import strategies as st
 from sense import settings as sense_settings
 from sense.localizer.calibration import training
 from sense.localizer.calibration.networks import masked_network
-from sense.localizer.calibration.networks.masked_network import draw_alive, looked_up
+from sense.localizer.calibration.networks.masked_network import draw_alive
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
+from sense.localizer.response.response_model import looked_up
 
 
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
@@ -29,7 +32,7 @@ def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float)
     grid = np.linspace(-1, 1, 9)
     u, v = np.meshgrid(grid, grid, indexing="ij")
     table = torch.from_numpy((a + b * u + c * v + d * u * v)[:, :, None])
-    found = looked_up(table, torch.tensor([[x, y]], dtype=torch.float64))
+    found = looked_up(table, torch.tensor([[x, y]], dtype=torch.float64), torch)
     assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
 
 
@@ -42,14 +45,14 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
     samples = TrainingPresses(np.zeros((256, 1, 1), np.float32), np.ones((256, 1), bool), corners)
     seen: list[torch.Tensor] = []
 
-    def spy(table: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    def spy(table: torch.Tensor, places: torch.Tensor, xp: ModuleType) -> torch.Tensor:
         seen.append(places)
-        return looked_up(table, places)
+        return looked_up(table, places, xp)
 
     monkeypatch.setattr(masked_network, "looked_up", spy)
     options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0, batch=256)
     monkeypatch.setattr(training, "MOVED", 0.1)
-    member = training._Member(samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
+    member = training._Training(samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
     for _ in range(8):
         member._loss()
     inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()

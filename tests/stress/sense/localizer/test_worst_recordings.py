@@ -12,7 +12,7 @@ import sense
 from design.common.errors import InputError
 from sense.localizer.features import FEATURES, press_inputs
 from sense.localizer.normalization import Normalization
-from sense.localizer.response_model import ResponseModel
+from sense.localizer.response.response_model import ResponseModel
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.sense.cases import RATE_HZ, TINY, learnt, made, recorded, right_or_refused, seeds, watched

@@ -130,6 +130,33 @@ def settled(windows: Array, history: Array, memory: Array, usual: Array) -> Arra
     return np.pad(windows, ((0, 0), (0, 0), (0, gains))) - np.einsum("qcj,cjf->qcf", history - usual, memory)
 
 
+def looked_up(table: Any, places: Any, xp: Any = np) -> Any:
+    """(S, S, D) table over [-1, 1] in x and y, and (B, 2) places, to (B, D), linear between entries.
+
+    Args:
+        xp: the module whose arrays these are, numpy or torch.
+    """
+    side = table.shape[0]
+    at = xp.clip((places + 1) * ((side - 1) / 2), 0, side - 1 - 1e-3)
+    whole = xp.floor(at)
+    x, y = (at - whole).T[:, :, None]
+    corner = xp.asarray(whole[:, 0] * side + whole[:, 1], dtype=xp.int64)
+    flat = table.reshape(side * side, -1)
+    near = (1 - y) * flat[corner] + y * flat[corner + 1]
+    return (1 - x) * near + x * ((1 - y) * flat[corner + side] + y * flat[corner + side + 1])
+
+
+def leverages(places: Array, strengths: Array | None = None) -> Array:
+    """(Q,) by how much a press decides what is expected of it, 0 to 1: those of one place together, (Q, 2)."""
+    parts = [slice(first, first + _PART) for first in range(0, len(places), _PART)]
+    weak = np.ones(len(places)) if strengths is None else strengths
+    shown = [weak[part, None] * bumps(places[part]) for part in parts]
+    own = sum((known.T @ known for known in shown), RIDGE_PLACE * np.eye(BUMPS**2))
+    alone = np.concatenate([(known * np.linalg.solve(own, known.T).T).sum(axis=1) for known in shown])
+    _, place = np.unique(places, axis=0, return_inverse=True)
+    return np.bincount(place.ravel(), alone).astype(np.float64)[place.ravel()]
+
+
 def bumps(places: Array) -> Array:
     """(Q, 2) places in units of the span to (Q, BUMPS^2) values of the bumps."""
     apart = 2 / (BUMPS - 1)

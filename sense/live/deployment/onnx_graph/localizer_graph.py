@@ -9,10 +9,11 @@ from onnx import TensorProto, helper
 from sense.localizer.features import SIZES
 from sense.localizer.localizer import UNKNOWN, Localizer
 from sense.localizer.locating import MEASURED
-from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
+from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
 from sense.localizer.normalization import MAX_INPUT
 
-from .onnx_features import END, GraphNodes, PressFeatures, volts
+from .features_graph import END, GraphNodes, PressFeatures, volts
+from .observer_graph import observed
 
 OPSET = 18
 """Of the operators: that of ONNX 1.13, from 2022 on."""
@@ -77,7 +78,15 @@ def onnx_model(localizer: Localizer, metadata: Mapping[str, str]) -> onnx.ModelP
 def _located(g: GraphNodes, localizer: Localizer) -> dict[str, str]:
     """What computes each output, by its name, as `Localizer.locate`."""
     scaling, alive = localizer.normalization, g("Cast", "alive", to=TensorProto.FLOAT)
-    numbers, spreads = _pooled(g, _network(g, localizer, _entries(g, localizer, alive)), localizer)
+    kept = _inputs(g, localizer)
+    entries = g("Concat", g("Reshape", kept, g.constant([0, scaling.centre.size])), alive, axis=1)
+    outputs = _network(g, localizer.weights, entries)
+    if localizer.observer is not None:
+        place, told = observed(g, localizer.observer, kept, alive)
+        corrected = _network(g, localizer.corrector, g("Concat", entries, told, axis=1))
+        more = g("Pad", place, g.constant([0, 0, 0, 2]), g.constant(0, np.float32))
+        outputs = g("Concat", outputs, g("Add", corrected, more), axis=0)
+    numbers, spreads = _pooled(g, outputs, localizer)
     left = g("ReduceSum", alive, g.constant([1]), keepdims=0)
     blind = g("Less", left, g.constant(0.5, np.float32))
     lost = g("Cast", g("Sub", g.constant(localizer.fibres, np.float32), left), to=TensorProto.INT64)
@@ -108,8 +117,8 @@ def _located(g: GraphNodes, localizer: Localizer) -> dict[str, str]:
     return out
 
 
-def _entries(g: GraphNodes, localizer: Localizer, alive: str) -> str:
-    """(Q, D) what enters the network."""
+def _inputs(g: GraphNodes, localizer: Localizer) -> str:
+    """(Q, C, F + G) scaled inputs, 0 for lost fibres."""
     scaling, features = localizer.normalization, PressFeatures(g, localizer.fibres)
     windows = features.windows(localizer.features)
     if scaling.usual.size:
@@ -121,13 +130,11 @@ def _entries(g: GraphNodes, localizer: Localizer, alive: str) -> str:
     scaled = g("Div", g("Sub", windows, volts(scaling.centre, g)), volts(scaling.spread, g))
     limits = (volts(np.array(limit), g) for limit in (-MAX_INPUT, MAX_INPUT))
     inputs = g("Cast", g("Clip", scaled, *limits), to=TensorProto.FLOAT)
-    kept = g("Where", g("Unsqueeze", "alive", g.constant([2])), inputs, g.constant(0, np.float32))
-    return g("Concat", g("Reshape", kept, g.constant([0, scaling.centre.size])), alive, axis=1)
+    return g("Where", g("Unsqueeze", "alive", g.constant([2])), inputs, g.constant(0, np.float32))
 
 
-def _network(g: GraphNodes, localizer: Localizer, entries: str) -> str:
+def _network(g: GraphNodes, weights: Weights, entries: str) -> str:
     """(E, Q, 2 N), as `network.forward`."""
-    weights = {name: np.asarray(weight) for name, weight in localizer.weights.items()}
 
     def layer(x: str, w: np.ndarray, b: np.ndarray) -> str:
         return g("Add", g("MatMul", x, g.constant(w, np.float32)), g.constant(b, np.float32))
@@ -148,11 +155,14 @@ def _pooled(g: GraphNodes, outputs: str, localizer: Localizer) -> tuple[str, str
     """(Q, N) numbers learnt and their standard deviations, as `network.pooled`."""
     numbers = 2 + len(localizer.normalization.measures)
     learnt = g.part(outputs, 0, numbers, axis=2)
-    mean = g.mean(learnt, 0, keep=True)
-    off = g("Sub", learnt, mean)
-    variance = g.mean(g("Mul", off, off), 0)
     limits = (g.constant(limit, np.float32) for limit in (LEAST_LOG, MOST_LOG))
     logs = g("Clip", g.part(outputs, numbers, END, axis=2), *limits)
-    two = g.constant(2, np.float32)
-    expected = g.mean(g("Mul", two, g("Exp", g("Mul", two, logs))), 0)
-    return g("Squeeze", mean, g.constant([0])), g("Sqrt", g("Add", variance, expected))
+    two, members = g.constant(2, np.float32), g.constant([0])
+    variance = g("Mul", two, g("Exp", g("Mul", two, logs)))
+    doubt = g.mean(g.part(variance, 0, 2, axis=2), 2, keep=True)
+    sure = g("Reciprocal", g("Concat", doubt, doubt, g.part(variance, 2, END, axis=2), axis=2))
+    share = g("Div", sure, g("ReduceSum", sure, members, keepdims=1))
+    mean = g("ReduceSum", g("Mul", share, learnt), members, keepdims=1)
+    off = g("Sub", learnt, mean)
+    whole = g("Mul", share, g("Add", variance, g("Mul", off, off)))
+    return g("Squeeze", mean, members), g("Sqrt", g("ReduceSum", whole, members, keepdims=0))

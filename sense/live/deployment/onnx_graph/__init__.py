@@ -1,0 +1,1 @@
+"""The localizer as nodes of an ONNX graph."""
