@@ -151,7 +151,12 @@ class LocalizerSettings(Settings):
     )
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")
     lost: int = Field(default=3, ge=0, le=8, description="train and test for up to this many lost fibres")
-    members: int = Field(default=2, ge=1, le=64, description="networks whose places are averaged")
+    members: int = Field(
+        default=2,
+        ge=1,
+        le=64,
+        description="networks whose places are joined, the last of several on the observer",
+    )
     hidden: int = Field(default=256, ge=1, le=4096, description="width of the hidden layers")
     layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")
     epochs: int = Field(default=600, ge=1, le=100_000, description="times the presses are shown, up to 11 000 steps")

@@ -186,7 +186,7 @@ def _trained(
     from sense.localizer.calibration.training import train_members  # torch, seconds to import, is needed here only
 
     with one_torch_thread():
-        weights = train_members(learn, table, options, rng, progress, observing=False).weights
+        weights = train_members(learn, table, options, rng, progress).weights
     fibres, inputs = learn.inputs.shape[1:]
     try:
         refuse_unsound(weights, fibres * (inputs + 1), "masked", learn.targets.shape[1] - 2)

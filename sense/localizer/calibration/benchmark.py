@@ -143,7 +143,7 @@ def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predi
 
     shown = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
     batches = max(LEAST_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
-    options = settings.LocalizerSettings(members=1, epochs=-(-steps // batches))
+    options = settings.LocalizerSettings(epochs=-(-steps // batches))
     trained = train_members(shown, table, options, np.random.default_rng(0), lambda done, total: None)
 
     def predict(x: Array) -> Array:

@@ -128,9 +128,10 @@ def train_members(
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
     time_budget: float | None = None,
-    observing: bool = True,
 ) -> Trained:
-    """Fit the members of the localizer, an observer, and the network that corrects it.
+    """Fit the members of the localizer, an observer, and the network that corrects it, the last of several members.
+
+    Of presses of several depths there is no observer.
 
     Args:
         learn: presses to learn from.
@@ -139,24 +140,23 @@ def train_members(
         progress: called with (steps done, steps in all), of all members together; in a time budget, with seconds.
         time_budget: seconds of wall clock to train for, with the members that these are good for; None for the
             members and the length of `options`.
-        observing: whether there is to be an observer; of presses of several depths there is none.
     """
     begin = time.monotonic()
     learn = as_unseen(learn, table)
-    observing = observing and not learn.stretch
-    observer = Observer.fit(table, learn.inputs, learn.alive, learn.targets) if observing else None
     steps = training_steps(len(learn.inputs), options) * (LONGER if learn.stretch else 1)
-    beside, cores = int(observing), os.cpu_count() or 1
+    networks, seconds = options.members, None
     with one_torch_thread():
-        members, seconds = options.members, None
         if time_budget is not None:
-            pace = _Training(learn, table, options, 0).pace()
+            pace, cores = _Training(learn, table, options, 0).pace(), os.cpu_count() or 1
             in_turn = max(1, min(round(time_budget / (pace * LENGTHENED * steps)), MOST_MEMBERS // cores))
-            members = max(1, cores * in_turn - beside)
-            seconds = max(0.0, time_budget - (time.monotonic() - begin)) / math.ceil((members + beside) / cores)
-    seeds = [int(seed) for seed in rng.integers(2**63, size=members + beside)]
-    joint = JointProgress([TrainingLength(steps, seconds).total] * len(seeds), progress)
+            networks = max(2, cores * in_turn)
+            seconds = max(0.0, time_budget - (time.monotonic() - begin)) / math.ceil(networks / cores)
+    observing = networks > 1 and not learn.stretch
+    observer = Observer.fit(table, learn.inputs, learn.alive, learn.targets) if observing else None
+    seeds = [int(seed) for seed in rng.integers(2**63, size=networks)]
+    joint = JointProgress([TrainingLength(steps, seconds).total] * networks, progress)
     small = options.model_copy(update={name: min(most, getattr(options, name)) for name, most in CORRECTOR.items()})
+    members = networks - observing
 
     def train(number: int) -> Weights:
         corrects = number == members

@@ -29,8 +29,8 @@ LEAST_VARIANCE = 1e-4
 """Of scaled inputs, which are about 1."""
 BEFOREHAND = 0.05
 """Weight of what the grid says in the steps after it, which look at the same answers: a little, lest they run away."""
-LOOKS, FARTHEST, LEAST_SPREAD = 2, 0.2, 3e-3
-"""Steps, how far one leads, and the least spread on the grid; both in spans of the pad."""
+LOOKS, FARTHEST, LEAST_SPREAD = 2, 0.2, 1e-2
+"""Steps, how far one leads, and the least spread on the grid, a seventh of a cell; both in spans of the pad."""
 TOLD = 9
 """Numbers told of a press: place, mean place on the grid, logarithms of the spreads of both, and how x goes with y."""
 MAX_TERM = 1e12
@@ -86,6 +86,8 @@ class Observer:
         terms, answers, slopes, curvatures = [], [], [], []
         for fibre in range(fibres):
             expected, own = table[:, :, fibre] @ projection[fibre], scatter[:, :, fibre]
+            nothing = np.flatnonzero(~projection[fibre].any(axis=0))
+            own[:, :, nothing, nothing] = 1.0  # as sure of it everywhere, or it would tell where presses are dense
             slope = np.stack(np.gradient(expected, axis[1] - axis[0], axis=(0, 1)), axis=2)
             weighted = slope @ np.linalg.inv(own)
             curved = weighted @ slope.swapaxes(2, 3)

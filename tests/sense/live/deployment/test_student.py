@@ -93,7 +93,7 @@ def test_a_training_that_diverges_is_one_line(brief, localizer, monkeypatch) -> 
     from sense.localizer.calibration import training
 
     wild = {name: np.full((1, 1, 1), np.nan, np.float32) for name in ("first.w", "hidden.w")}
-    monkeypatch.setattr(training, "train_members", lambda *_, **__: training.Trained(wild, None, {}))
+    monkeypatch.setattr(training, "train_members", lambda *_: training.Trained(wild, None, {}))
     with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate"):
         teach(brief, localizer, np.arange(30), Budget(20_000, 4_000), QUICK)
 

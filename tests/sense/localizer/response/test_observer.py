@@ -1,0 +1,168 @@
+"""The observer: of linear answers it finds what least squares find, of others what a fine grid finds."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from design.common.errors import InputError
+from sense.localizer.response.observer import BEFOREHAND, TOLD, Observer
+
+SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 4000, 0.05
+Answer = Callable[[np.ndarray], np.ndarray]
+
+
+def linear(places: np.ndarray) -> np.ndarray:
+    """(Q, 2) to (Q, C, F), by slopes of about 1."""
+    slopes = np.random.default_rng(5).standard_normal((2, FIBRES * WINDOWS))
+    return (places @ slopes).reshape(len(places), FIBRES, WINDOWS)
+
+
+def waves(places: np.ndarray) -> np.ndarray:
+    x, y = places.T
+    parts = [np.sin((1 + 0.3 * k) * x + k) + np.cos((2 - 0.1 * k) * y + 2 * k) for k in range(FIBRES * WINDOWS)]
+    return np.stack(parts, axis=1).reshape(len(places), FIBRES, WINDOWS)
+
+
+def fitted(answer: Answer, noise: float = NOISE, seed: int = 0) -> tuple[Observer, np.ndarray, np.ndarray]:
+    """An observer of a pad that answers so, with new presses: inputs and places."""
+    rng = np.random.default_rng(seed)
+    grid = np.linspace(-1, 1, SIDE)
+    at = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    table = answer(at).reshape(SIDE, SIDE, FIBRES, WINDOWS).astype(np.float32)
+    places = rng.uniform(-1, 1, (2 * PRESSES, 2))
+    inputs = answer(places) + noise * rng.standard_normal((2 * PRESSES, FIBRES, WINDOWS))
+    alive = np.ones((PRESSES, FIBRES), dtype=bool)
+    observer = Observer.fit(table, inputs[:PRESSES], alive, places[:PRESSES])
+    return observer, inputs[PRESSES:], places[PRESSES:]
+
+
+@pytest.mark.parametrize("lost", [(), (0,), (1, 3), (0, 1, 2)])
+def test_linear_answers_are_solved_as_by_least_squares(lost: tuple[int, ...]) -> None:
+    observer, inputs, places = fitted(linear)
+    inner = (np.abs(places) < 0.7).all(axis=1)
+    inputs, places = inputs[inner], places[inner]
+    alive = np.ones((len(inputs), FIBRES), dtype=bool)
+    alive[:, list(lost)] = False
+    found, told = observer(inputs, alive)
+    kept = [fibre for fibre in range(FIBRES) if fibre not in lost]
+    slopes = linear(np.eye(2))[:, kept].reshape(2, -1)
+    solved = np.linalg.solve(slopes @ slopes.T, slopes @ inputs[:, kept].reshape(len(inputs), -1).T).T
+    bound = NOISE**2 * np.diag(np.linalg.inv(slopes @ slopes.T))
+    # What the grid tells counts a little besides, and the scatter is that of some hundred presses nearby.
+    assert np.abs(found - solved).mean() < 0.2 * np.sqrt(bound.mean())
+    assert np.sqrt(((found - places) ** 2).mean()) < 1.05 * np.sqrt(bound.mean())
+    variance = np.exp(4 * (told[:, 2:4] - 1)).mean(axis=0)
+    np.testing.assert_allclose(variance, bound / (1 + BEFOREHAND), rtol=0.15)
+
+
+def test_other_answers_are_found_as_on_a_fine_grid() -> None:
+    observer, inputs, places = fitted(waves)
+    inputs, places = inputs[:40], places[:40]
+    found, _ = observer(inputs, np.ones((40, FIBRES), dtype=bool))
+    fine = np.linspace(-1, 1, 401)
+    at = np.stack(np.meshgrid(fine, fine, indexing="ij"), axis=-1).reshape(-1, 2)
+    answers = waves(at).reshape(len(at), -1)
+    likeliest = np.stack([at[((answers - press.ravel()) ** 2).sum(axis=1).argmin()] for press in inputs])
+    off = np.hypot(*(found - likeliest).T)
+    assert off.max() < 0.03
+    assert off.mean() < 0.2 * np.hypot(*(likeliest - places).T).mean() + 0.5 * (fine[1] - fine[0])
+
+
+def test_two_places_that_answer_alike_are_both_thought_of() -> None:
+    """Of fibres that tell how far a press is from the middle, but not on which side."""
+
+    def even(places: np.ndarray) -> np.ndarray:
+        return linear(np.stack([np.square(places[:, 0]), places[:, 1]], axis=1))
+
+    observer, _, _ = fitted(even)
+    press = even(np.array([[0.6, 0.1]]))
+    found, told = observer(press, np.ones((1, FIBRES), dtype=bool))
+    on_grid = np.exp(2 * (told[0, 6:8] - 1))  # standard deviations
+    assert abs(told[0, 4]) / 2 < 0.1
+    assert on_grid[0] == pytest.approx(0.6, rel=0.1)
+    assert on_grid[1] < 0.1
+    assert found[0, 1] == pytest.approx(0.1, abs=0.05)
+
+
+@given(seed=st.integers(0, 999))
+def test_what_lost_fibres_give_is_not_looked_at(seed: int) -> None:
+    observer, inputs, _ = OBSERVED
+    rng = np.random.default_rng(seed)
+    alive = rng.random((20, FIBRES)) < 0.6
+    press = inputs[rng.integers(len(inputs), size=20)]
+    spoilt = np.where(alive[:, :, None], press, rng.choice([np.nan, np.inf, 1e4]))
+    for one, other in zip(observer(press, alive), observer(spoilt, alive), strict=True):
+        assert np.isfinite(one).all()
+        assert np.array_equal(one, other)
+
+
+@given(seed=st.integers(0, 999), size=st.sampled_from([0.1, 1.0, 1e4]))
+def test_torch_finds_what_numpy_finds(seed: int, size: float) -> None:
+    """Of presses of the pad; others, however large, are put somewhere on it by both."""
+    observer, inputs, _ = OBSERVED
+    rng = np.random.default_rng(seed)
+    alive = rng.random((20, FIBRES)) < 0.7
+    press = inputs[rng.integers(len(inputs), size=20)].astype(np.float32)
+    in_torch = observer.changed(torch.from_numpy)
+    found, told = in_torch(torch.from_numpy(press), torch.from_numpy(alive), torch)
+    expected = observer(press.astype(np.float64), alive)
+    np.testing.assert_allclose(found.numpy(), expected[0], atol=2e-3)
+    np.testing.assert_allclose(told.numpy(), expected[1], atol=1e-2)
+    assert told.shape == (20, TOLD)
+    wild = (size * rng.standard_normal(press.shape)).astype(np.float32)
+    for xp, one, values in ((np, observer, wild.astype(np.float64)), (torch, in_torch, torch.from_numpy(wild))):
+        place, about = one(values, alive if xp is np else torch.from_numpy(alive), xp)
+        assert np.abs(np.asarray(place)).max() <= 1 + 1e-6
+        assert np.isfinite(np.asarray(about)).all()
+
+
+def test_a_fibre_that_never_answered_says_nothing() -> None:
+    rng = np.random.default_rng(0)
+    table = np.zeros((SIDE, SIDE, 2, WINDOWS), np.float32)
+    places = rng.uniform(-1, 1, (50, 2))
+    alive = np.tile([True, False], (50, 1))
+    observer = Observer.fit(table, np.zeros((50, 2, WINDOWS)), alive, places)
+    found, told = observer(rng.standard_normal((5, 2, WINDOWS)), np.ones((5, 2), dtype=bool))
+    np.testing.assert_allclose(found, np.tile(observer.grid.mean(axis=0), (5, 1)), atol=1e-6)
+    assert np.isfinite(told).all()
+
+
+@pytest.mark.parametrize("places", [np.zeros((9, 2)), np.linspace([-1, 0], [1, 0], 9)], ids=["one place", "a line"])
+def test_presses_at_one_place_or_on_a_line_will_do(places: np.ndarray) -> None:
+    grid = np.linspace(-1, 1, SIDE)
+    table = linear(np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2))
+    table = table.reshape(SIDE, SIDE, FIBRES, WINDOWS)
+    observer = Observer.fit(table, linear(places), np.ones((9, FIBRES), dtype=bool), places)
+    found, told = observer(linear(places), np.ones((9, FIBRES), dtype=bool))
+    np.testing.assert_allclose(found, places, atol=0.02)
+    assert np.isfinite(told).all()
+
+
+def test_places_may_be_called_otherwise() -> None:
+    observer, inputs, _ = OBSERVED
+    turn, shift, alive = np.array([[0.9, -0.2], [0.3, 1.1]]), np.array([0.1, -0.4]), np.ones((30, FIBRES), dtype=bool)
+    place, told = observer(inputs[:30], alive)
+    moved, as_before = observer.moved(turn, shift).moved(turn, shift)(inputs[:30], alive)
+    np.testing.assert_allclose(moved, (place @ turn.T + shift) @ turn.T + shift, atol=1e-6)
+    assert np.array_equal(told, as_before)
+
+
+def test_it_is_kept_to_the_last_bit_and_refused_where_it_is_another() -> None:
+    observer, inputs, _ = OBSERVED
+    arrays, alive = observer.arrays(), np.ones((9, FIBRES), dtype=bool)
+    again = Observer.of(arrays)
+    again.refuse_unsound(FIBRES, WINDOWS)
+    assert np.array_equal(again(inputs[:9], alive)[0], observer(inputs[:9], alive)[0])
+    with pytest.raises(InputError, match="observer has shapes"):
+        again.refuse_unsound(FIBRES, WINDOWS + 1)
+    for value in (np.nan, np.inf, 1e13):
+        spoilt = arrays | {"observer.terms": np.full_like(arrays["observer.terms"], value)}
+        with pytest.raises(InputError, match=r"observer\.terms is up to .*, allowed is up to 1e\+12"):
+            Observer.of(spoilt).refuse_unsound(FIBRES, WINDOWS)
+
+
+OBSERVED = fitted(waves)
