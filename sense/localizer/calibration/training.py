@@ -34,7 +34,7 @@ from sense.recordings.processing.limits import Floats
 from .networks.masked_network import draw_alive, entries, forward, initial, inputs_at, misses
 from .networks.training_presses import TrainingPresses, as_unseen
 
-LEAST_BATCHES, MOST_STEPS, LONGER = 6, 11_000, 2
+LEAST_BATCHES, MOST_STEPS, LONGER = 5, 11_000, 2
 """Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths,
 which are harder to learn, so many times more."""
 WEIGHT_DECAY = 1e-2

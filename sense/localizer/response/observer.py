@@ -93,7 +93,8 @@ class Observer:
             curved = weighted @ slope.swapaxes(2, 3)
             answers.append(expected)
             slopes.append(weighted.reshape(side, side, -1))
-            curvatures.append(np.stack([curved[..., 0, 0], curved[..., 1, 1], curved[..., 0, 1]], axis=2))
+            along = (np.maximum(curved[..., k, k], 0) for k in (0, 1))  # rounding may leave less than none
+            curvatures.append(np.stack([*along, curved[..., 0, 1]], axis=2))
             at = slope[::FINE, ::FINE][inside]
             whole = own[::FINE, ::FINE][inside] + cell**2 / 12 * at.swapaxes(1, 2) @ at
             terms.append(_terms(expected[::FINE, ::FINE][inside], np.linalg.inv(whole)))
@@ -155,6 +156,9 @@ class Observer:
             greatest = np.abs(part).max(initial=0)
             if not greatest <= MAX_TERM:
                 raise InputError(f"{name} is up to {greatest:g}, allowed is up to {MAX_TERM:g}")
+        curved = self.answers[:, :, 3 * fibres * COMPONENTS :].reshape(side, side, fibres, 3)[..., :2]
+        if curved.min() < 0:
+            raise InputError(f"observer.answers has curvatures of {curved.min():g}, expected 0 or more")
 
     def arrays(self) -> dict[str, Any]:
         """All of it, by the names under which it is kept, in single precision, which takes nothing off it."""

@@ -163,6 +163,8 @@ def test_it_is_kept_to_the_last_bit_and_refused_where_it_is_another() -> None:
         spoilt = arrays | {"observer.terms": np.full_like(arrays["observer.terms"], value)}
         with pytest.raises(InputError, match=r"observer\.terms is up to .*, allowed is up to 1e\+12"):
             Observer.of(spoilt).refuse_unsound(FIBRES, WINDOWS)
+    with pytest.raises(InputError, match="curvatures of -"):
+        Observer.of(arrays | {"observer.answers": -arrays["observer.answers"]}).refuse_unsound(FIBRES, WINDOWS)
 
 
 OBSERVED = fitted(waves)
