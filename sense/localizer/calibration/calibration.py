@@ -18,7 +18,7 @@ from sense import settings
 from sense.localizer.evaluation import conformal, evaluate, held_back
 from sense.localizer.features import PHASES, press_inputs
 from sense.localizer.localizer import Localizer
-from sense.localizer.network import Weights, refuse_unsound
+from sense.localizer.network import LEAST_LOG, MOST_LOG, Weights, learnt, refuse_unsound
 from sense.localizer.normalization import Normalization, Scaled
 from sense.localizer.response.observer import TOLD
 from sense.recordings.processing.limits import Array, Indices
@@ -35,6 +35,8 @@ MOST_SECONDS = 1e9
 """Longest time budget: some thirty years."""
 LEAST_SPREAD_MM = 0.2
 """Depths of which nine tenths lie within so much are one."""
+TRUSTED, PROVEN = 2, 6
+"""Presses that count for what a member expects of itself; sets of lost fibres of a size that it is proven on."""
 SUBSETS = 32
 """Sets of lost fibres of a size that the radii are found on, at most."""
 
@@ -148,8 +150,35 @@ def learn(
         learnt_from=recording.digest,
     )
     levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
-    proof = scaling.inputs(raw[proving]), recording.presses_mm[proving], levels, _of(measures, proving)
-    return replace(localizer, factors=radii(localizer, *proof))
+    presses, places_mm = scaling.inputs(raw[proving]), recording.presses_mm[proving]
+    if observer is not None:
+        localizer = _proven(localizer, presses, places_mm, levels)
+    return replace(localizer, factors=radii(localizer, presses, places_mm, levels, _of(measures, proving)))
+
+
+def _proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Localizer:
+    """One whose members expect the errors that they make of presses never learnt from, and so count as they deserve.
+
+    Of few presses, or badly placed ones, an observer is far surer than it may be: it finds the presses of training,
+    moved as the response says, by that same response.
+    """
+    targets = localizer.normalization.targets(places_mm)
+    ratios = []
+    for lost in (lost for level in range(levels) for lost in lost_subsets(localizer.fibres, level, PROVEN)):
+        alive = presses.alive & ~np.isin(np.arange(localizer.fibres), lost)
+        outputs = learnt(localizer.weights, presses.inputs, alive, "masked", localizer.observer, localizer.corrector)
+        found, logs = np.split(outputs, 2, axis=2)
+        ratios.append(np.abs(found - targets).mean(axis=2) / np.exp(np.clip(logs, LEAST_LOG, MOST_LOG)).mean(axis=2))
+    whole = np.mean(ratios, axis=0)
+    logs = np.log((TRUSTED + whole.sum(axis=1)) / (TRUSTED + whole.shape[1]))
+
+    def honest(weights: Weights, more: Array) -> Weights:
+        bias = weights["last.b"].copy()
+        bias[:, :, 2:] += np.clip(more, LEAST_LOG, MOST_LOG)[:, None, None]
+        return {**weights, "last.b": bias}
+
+    weights, corrector = honest(localizer.weights, logs[:-1]), honest(localizer.corrector, logs[-1:])
+    return replace(localizer, weights=weights, corrector=corrector)
 
 
 def _refuse_diverged(
