@@ -31,7 +31,7 @@ CORRECTOR = "corrector."
 """Names of the table, and of what corrects the observer, among the weights."""
 UNKNOWN = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and the radii of 50 and 90 % for a place anywhere in a square of half-width 1."""
-_CHUNK = 8192
+_VALUES = 2**16
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,9 @@ class Localizer:
         alive: Mask = np.logical_and(presses.alive, self._alive(lost))
         if self.method == "published" and np.size(lost):
             raise InputError("fibres are lost: a published localizer knows none, train one of method masked")
-        chunks = range(0, len(presses), _CHUNK)
-        found = [self._pooled(presses.inputs[i : i + _CHUNK], alive[i : i + _CHUNK]) for i in chunks]
+        step = max(1, _VALUES // self.fibres)
+        chunks = range(0, len(presses), step)
+        found = [self._pooled(presses.inputs[i : i + step], alive[i : i + step]) for i in chunks]
         measured = self.normalization.measures
         nothing = np.empty((0, 2 + len(measured)))
         numbers, spreads = (

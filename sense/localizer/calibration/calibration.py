@@ -174,7 +174,7 @@ def _proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int
 
     def honest(weights: Weights, more: Array) -> Weights:
         bias = weights["last.b"].copy()
-        bias[:, :, 2:] += np.clip(more, LEAST_LOG, MOST_LOG)[:, None, None]
+        bias[:, :, 2:] += more[:, None, None]
         return {**weights, "last.b": bias}
 
     weights, corrector = honest(localizer.weights, logs[:-1]), honest(localizer.corrector, logs[-1:])

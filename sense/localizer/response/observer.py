@@ -34,7 +34,7 @@ LOOKS, FARTHEST, LEAST_SPREAD = 2, 0.2, 1e-2
 TOLD = 9
 """Numbers told of a press: place, mean place on the grid, logarithms of the spreads of both, and how x goes with y."""
 MAX_TERM = 1e12
-_PART = 4096
+_VALUES = 2**15
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,12 @@ class Observer:
             projection[fibre, told] = found
         rest = np.einsum("qcf,cfd->qcd", rest, projection) * alive[:, :, None]
         scatter = _scatter(coarse.reshape(-1, 2), places, rest, alive, max(cell, NEAR * _apart(places)))
-        scatter = looked_up(scatter.reshape(*coarse.shape[:2], -1), everywhere.reshape(-1, 2))
-        scatter = scatter.reshape(side, side, fibres, COMPONENTS, COMPONENTS)
+        scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
         terms, answers, slopes, curvatures = [], [], [], []
         for fibre in range(fibres):
-            expected, own = table[:, :, fibre] @ projection[fibre], scatter[:, :, fibre]
+            expected = table[:, :, fibre] @ projection[fibre]
+            own = looked_up(scatter[:, :, fibre], everywhere.reshape(-1, 2))
+            own = own.reshape(side, side, COMPONENTS, COMPONENTS)
             nothing = np.flatnonzero(~projection[fibre].any(axis=0))
             own[:, :, nothing, nothing] = 1.0  # as sure of it everywhere, or it would tell where presses are dense
             slope = np.stack(np.gradient(expected, axis[1] - axis[0], axis=(0, 1)), axis=2)
@@ -191,8 +192,9 @@ def _scatter(around: Array, places: Array, rest: Array, alive: Mask, width: floa
     """(P, C, D, D) mean products of what is left (Q, C, D) of components, which are about 1, near places (P, 2)."""
     fibres, size = rest.shape[1:]
     sums, weights = np.zeros((len(around), fibres * size * size)), np.zeros((len(around), fibres))
-    for first in range(0, len(rest), _PART):
-        part = slice(first, first + _PART)
+    step = max(1, _VALUES // fibres)
+    for first in range(0, len(rest), step):
+        part = slice(first, first + step)
         apart = ((around[:, None] - places[part]) ** 2).sum(axis=2)
         near = np.exp(-0.5 * apart / width**2)
         sums += near @ (rest[part, :, :, None] * rest[part, :, None, :]).reshape(near.shape[1], -1)
