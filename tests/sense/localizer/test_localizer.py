@@ -155,24 +155,6 @@ def test_weights_that_do_not_fit_the_document_are_refused(localizer: Localizer, 
         Localizer.load(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda of: {"corrector": {}},
-        lambda of: {"corrector": of.weights},
-        lambda of: {"corrector": {name: weight * np.nan for name, weight in of.corrector.items()}},
-        lambda of: {"observer": replace(of.observer, grid=of.observer.grid[1:])},
-        lambda of: {"observer": replace(of.observer, terms=of.observer.terms * np.inf)},
-    ],
-    ids=["no corrector", "another's", "not finite", "a smaller grid", "infinite"],
-)
-def test_an_observer_that_does_not_fit_is_refused(localizer: Localizer, tmp_path: Path, change) -> None:
-    assert localizer.observer is not None
-    replace(localizer, **change(localizer)).save(tmp_path)
-    with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
-        Localizer.load(tmp_path)
-
-
 @pytest.mark.parametrize("value", [np.nan, object()])
 def test_a_save_that_fails_leaves_the_model_that_was_there(localizer: Localizer, tmp_path: Path, value: object) -> None:
     localizer.save(tmp_path)

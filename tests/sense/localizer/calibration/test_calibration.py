@@ -14,8 +14,7 @@ from design.common.settings import validated
 from design.criteria.fibre_loss import lost_subsets
 from sense import Localizer, Recording, RigSettings, calibrate, evaluate, import_mat, locate
 from sense.health.monitor import FibreFault
-from sense.localizer.calibration.calibration import _proven, learnable, left_out, split_presses
-from sense.localizer.network import learnt
+from sense.localizer.calibration.calibration import learnable, left_out, split_presses
 from sense.settings import LocalizerSettings as Options
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
@@ -289,21 +288,3 @@ def test_what_is_known_of_one_depth_changes_nothing_that_is_learnt(recording: Re
     again, _ = calibrate(unknown, SHORT)
     assert all(np.array_equal(again.weights[name], weight) for name, weight in short.weights.items())
     assert short.normalization.measures == ()
-
-
-def test_members_expect_the_errors_that_they_make_of_presses_never_learnt_from(
-    recording: Recording, localizer: Localizer
-) -> None:
-    """A member that has far too high an opinion of itself is put right by them, and counts for what it is worth."""
-    bias = localizer.corrector["last.b"].copy()
-    bias[:, :, 2:] -= np.log(50)
-    proud = replace(localizer, corrector={**localizer.corrector, "last.b": bias})
-    presses, test = proud.inputs(recording), np.array(proud.test)
-    put_right = _proven(proud, presses[test], recording.presses_mm[test], 2)
-    shift = put_right.corrector["last.b"] - bias
-    assert not shift[:, :, :2].any()
-    assert shift[0, 0, 2] == shift[0, 0, 3] == pytest.approx(np.log(50), abs=0.7)
-
-    alone = (proud.observer, proud.corrector), (put_right.observer, put_right.corrector)
-    before, after = (learnt(proud.weights, presses.inputs, presses.alive, "masked", *each)[-1, :, 2:] for each in alone)
-    np.testing.assert_allclose(after - before, np.full_like(before, shift[0, 0, 2]), atol=1e-4)

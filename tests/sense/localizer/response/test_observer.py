@@ -1,6 +1,8 @@
 """The observer: of linear answers it finds what least squares find, of others what a fine grid finds."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
+from sense import Localizer
 from sense.localizer.response.observer import BEFOREHAND, TOLD, Observer
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 4000, 0.05
@@ -165,6 +168,24 @@ def test_it_is_kept_to_the_last_bit_and_refused_where_it_is_another() -> None:
             Observer.of(spoilt).refuse_unsound(FIBRES, WINDOWS)
     with pytest.raises(InputError, match="curvatures of -"):
         Observer.of(arrays | {"observer.answers": -arrays["observer.answers"]}).refuse_unsound(FIBRES, WINDOWS)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda of: {"corrector": {}},
+        lambda of: {"corrector": of.weights},
+        lambda of: {"corrector": {name: weight * np.nan for name, weight in of.corrector.items()}},
+        lambda of: {"observer": replace(of.observer, grid=of.observer.grid[1:])},
+        lambda of: {"observer": replace(of.observer, terms=of.observer.terms * np.inf)},
+    ],
+    ids=["no corrector", "another's", "not finite", "a smaller grid", "infinite"],
+)
+def test_an_observer_that_does_not_fit_is_refused(localizer: Localizer, tmp_path: Path, change) -> None:
+    assert localizer.observer is not None
+    replace(localizer, **change(localizer)).save(tmp_path)
+    with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
+        Localizer.load(tmp_path)
 
 
 OBSERVED = fitted(waves)
