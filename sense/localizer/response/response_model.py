@@ -118,10 +118,14 @@ def _moments(places: Array, past: Array, answer: Array, strengths: Array | None)
     own = both = np.zeros(())
     for first in range(0, len(places), _PART):
         part = slice(first, first + _PART)
-        shown = bumps(places[part]) if strengths is None else strengths[part, None] * bumps(places[part])
+        shown = _shown(places[part], None if strengths is None else strengths[part])
         known = np.hstack([shown, past[part]])
         own, both = own + known.T @ known, both + known.T @ answer[part]
     return own, both
+
+
+def _shown(places: Array, strengths: Array | None) -> Array:
+    return bumps(places) if strengths is None else strengths[:, None] * bumps(places)
 
 
 def settled(windows: Array, history: Array, memory: Array, usual: Array) -> Array:
@@ -148,11 +152,13 @@ def looked_up(table: Any, places: Any, xp: Any = np) -> Any:
 
 def leverages(places: Array, strengths: Array | None = None) -> Array:
     """(Q,) by how much a press decides what is expected of it, 0 to 1: those of one place together, (Q, 2)."""
-    parts = [slice(first, first + _PART) for first in range(0, len(places), _PART)]
-    weak = np.ones(len(places)) if strengths is None else strengths
-    shown = [weak[part, None] * bumps(places[part]) for part in parts]
-    own = sum((known.T @ known for known in shown), RIDGE_PLACE * np.eye(BUMPS**2))
-    alone = np.concatenate([(known * np.linalg.solve(own, known.T).T).sum(axis=1) for known in shown])
+    nothing = np.empty((len(places), 0))
+    own = _moments(places, nothing, nothing, strengths)[0] + RIDGE_PLACE * np.eye(BUMPS**2)
+    alone = np.empty(len(places))
+    for first in range(0, len(places), _PART):
+        part = slice(first, first + _PART)
+        known = _shown(places[part], None if strengths is None else strengths[part])
+        alone[part] = (known * np.linalg.solve(own, known.T).T).sum(axis=1)
     _, place = np.unique(places, axis=0, return_inverse=True)
     return np.bincount(place.ravel(), alone).astype(np.float64)[place.ravel()]
 
