@@ -45,7 +45,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "members": 2,
         "hidden": 256,
         "layers": 5,
-        "epochs": 400,  # the observer leaves networks less to learn
+        "epochs": 200,  # the observer leaves networks less to learn
         "batch": 256,
         "rate": 0.004,
         "seed": 0,

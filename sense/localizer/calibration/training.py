@@ -8,7 +8,7 @@ is a running average of the weights. None of it is chosen by presses held back: 
 Beside the members, which know nothing of it, a smaller network learns to correct what an `observer` finds: their
 errors are of different kinds, so together they err by a tenth less than two of either. All are independent, each on a
 thread of its own. In a time budget, the cycle is one of time, and there is a network for every core, and more of them
-only where each can be trained for three times its usual length: until then, longer training gains more.
+only where each can be trained for six times its usual length: until then, longer training gains more.
 """
 
 import math
@@ -34,7 +34,7 @@ from sense.recordings.processing.limits import Floats
 from .networks.masked_network import draw_alive, entries, forward, initial, inputs_at, misses
 from .networks.training_presses import TrainingPresses, as_unseen
 
-LEAST_BATCHES, MOST_STEPS, LONGER = 5, 11_000, 2
+LEAST_BATCHES, MOST_STEPS, LONGER = 10, 11_000, 2
 """Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths,
 which are harder to learn, so many times more."""
 WEIGHT_DECAY = 1e-2
@@ -52,7 +52,7 @@ CORRECTOR = {"hidden": 128, "layers": 3}
 """Size of the network that corrects what the observer finds, at most: larger ones gain nothing."""
 REPORTS = 40
 """How often a training tells how far it is."""
-TRIED, LENGTHENED, MOST_MEMBERS = 12, 3, 64
+TRIED, LENGTHENED, MOST_MEMBERS = 12, 6, 64
 """Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
 
 
