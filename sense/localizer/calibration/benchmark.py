@@ -15,7 +15,7 @@ from design.benchmarking.harness import Bench, BenchTrial
 from design.common.computing import one_torch_thread
 from sense import settings
 from sense.localizer.features import press_inputs
-from sense.localizer.network import Weights, forward, learnt, masked, pooled
+from sense.localizer.network import learnt, pooled
 from sense.localizer.normalization import Normalization
 from sense.recordings.processing.limits import Array, Floats, Mask
 from sense.recordings.recording import Recording
@@ -31,7 +31,7 @@ ITERATIONS = (30, 100, 300)
 PASSES = (30, 100, 300)
 """Of Adam, through batches of BATCH presses."""
 STEPS = (50, 200, 800, 3200)
-"""Of the masked network, one member of its usual size."""
+"""Of the masked network of its usual size and, beside it, of the one that corrects the observer."""
 FEATURES = ("published", "full")
 MARQUARDT = ("published",)
 """Inputs that Levenberg-Marquardt is tried on: with F times as many, each of its steps takes F^2 to F^3 as long."""
@@ -54,22 +54,20 @@ def _recording() -> Recording:
 
 
 def _trainings(features: str) -> Iterator[BenchTrial]:
-    recording = _recording()
-    raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-    scaling, table = Normalization.fit(raw[:-TEST], recording.presses_mm[:-TEST])
-    scaled, targets = scaling.inputs(raw), scaling.targets(recording.presses_mm)
-    flat = scaled.inputs.reshape(len(scaled), -1).astype(np.float64)
+    scaling, table, inputs, targets = _scaled(features)
+    places_mm = _recording().presses_mm[-TEST:]
+    flat = inputs.reshape(len(inputs), -1).astype(np.float64)
     x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
 
     def judge(predict: Predict) -> Mapping[str, float]:
-        off = scaling.places_mm(predict(flat[-TEST:]).astype(np.float32)) - recording.presses_mm[-TEST:]
+        off = scaling.places_mm(predict(flat[-TEST:]).astype(np.float32)) - places_mm
         return {"error": float(np.hypot(*off.T).mean())}
 
     ways: dict[str, tuple[tuple[int, ...], Callable[[int], Predict]]] = {
         "LM": (EPOCHS if features in MARQUARDT else (), partial(_marquardt, x, y)),
         "L-BFGS": (ITERATIONS, partial(_bfgs, x, y)),
         "Adam": (PASSES, partial(_adam, x, y)),
-        "masked": (STEPS, partial(_masked, scaled.inputs[:-TEST], targets[:-TEST], table)),
+        "masked": (STEPS, partial(_masked, inputs[:-TEST], targets[:-TEST], table)),
     }
     for way, (sizes, train) in ways.items():
         for size in sizes:
@@ -156,36 +154,25 @@ def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predi
 
 
 def _predictions() -> Iterator[BenchTrial]:
-    """Finding one press with networks of the usual size; what they were taught does not matter for it."""
-    rng = np.random.default_rng(0)
-    one = _scaled("published")[:1].reshape(1, -1).astype(np.float64)
-    published = _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
-    yield BenchTrial("one press", "published", 0, partial(published, one))
-    inputs = _scaled("full")[:1]
-    weights = _untrained(inputs.size + inputs.shape[1])
-    yield BenchTrial("one press", "masked", 0, partial(_places, weights, inputs))
+    """Finding one press after one step of training: what was learnt does not matter for the time it takes."""
+    for features, way in (("published", "published"), ("full", "masked")):
+        _, table, inputs, targets = _scaled(features)
+        one = inputs[:1].reshape(1, -1).astype(np.float64)
+        rng = np.random.default_rng(0)
+        predict = (
+            _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
+            if way == "published"
+            else _masked(inputs, targets, table, 1)
+        )
+        yield BenchTrial("one press", way, 0, partial(predict, one))
 
 
-def _scaled(features: str) -> Floats:
+def _scaled(features: str) -> tuple[Normalization, Floats, Floats, Floats]:
+    """Scaling and table of the presses to learn from, and inputs and targets of all."""
     recording = _recording()
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-    return Normalization.fit(raw, recording.presses_mm)[0].inputs(raw).inputs
-
-
-def _places(weights: Weights, inputs: Floats) -> Floats:
-    return pooled(forward(weights, masked(inputs, np.array(True))))[0]
-
-
-def _untrained(entries: int) -> Weights:
-    """A masked network of the usual size as training begins."""
-    import torch
-
-    from .networks.masked_network import initial
-
-    options, generator = settings.LocalizerSettings(), torch.Generator().manual_seed(0)
-    members = [initial(entries, options, generator) for _ in range(options.members)]
-    axis = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
-    return {name: torch.cat([each[name] for each in members], dim=axis[name]).detach().numpy() for name in axis}
+    scaling, table = Normalization.fit(raw[:-TEST], recording.presses_mm[:-TEST])
+    return scaling, table, scaling.inputs(raw).inputs, scaling.targets(recording.presses_mm)
 
 
 BENCH = Bench(
