@@ -8,7 +8,7 @@ is a running average of the weights. None of it is chosen by presses held back: 
 Beside the members, which know nothing of it, a smaller network learns to correct what an `observer` finds: their
 errors are of different kinds, so together they err by a tenth less than two of either. All are independent, each on a
 thread of its own. In a time budget, the cycle is one of time, and there is a network for every core, and more of them
-only where each can be trained for six times its usual length: until then, longer training gains more.
+only where each can be trained for five times its usual length: until then, longer training gains more.
 """
 
 import math
@@ -52,7 +52,7 @@ CORRECTOR = {"hidden": 128, "layers": 3}
 """Size of the network that corrects what the observer finds, at most: larger ones gain nothing."""
 REPORTS = 40
 """How often a training tells how far it is."""
-TRIED, LENGTHENED, MOST_MEMBERS = 12, 6, 64
+TRIED, LENGTHENED, MOST_MEMBERS = 12, 5, 64
 """Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
 
 
