@@ -154,17 +154,14 @@ def _masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predi
 
 
 def _predictions() -> Iterator[BenchTrial]:
-    """Finding one press after one step of training: what was learnt does not matter for the time it takes."""
-    for features, way in (("published", "published"), ("full", "masked")):
-        _, table, inputs, targets = _scaled(features)
-        one = inputs[:1].reshape(1, -1).astype(np.float64)
-        rng = np.random.default_rng(0)
-        predict = (
-            _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
-            if way == "published"
-            else _masked(inputs, targets, table, 1)
-        )
-        yield BenchTrial("one press", way, 0, partial(predict, one))
+    """Finding one press after hardly any training: what was learnt does not matter for the time it takes."""
+    one = _scaled("published")[2][:1].reshape(1, -1).astype(np.float64)
+    rng = np.random.default_rng(0)
+    published = _Published(rng.standard_normal((10, one.size)), rng.standard_normal((10, 2)))
+    yield BenchTrial("one press", "published", 0, partial(published, one))
+    _, table, inputs, targets = _scaled("full")
+    masked = _masked(inputs[:-TEST], targets[:-TEST], table, 1)
+    yield BenchTrial("one press", "masked", 0, partial(masked, inputs[:1].reshape(1, -1).astype(np.float64)))
 
 
 def _scaled(features: str) -> tuple[Normalization, Floats, Floats, Floats]:

@@ -31,7 +31,7 @@ from sense.localizer.network import LEAST_LOG, MOST_LOG, OUTPUTS, Weights
 from sense.localizer.response.observer import TOLD, Observer
 from sense.recordings.processing.limits import Floats
 
-from .networks.masked_network import draw_alive, entries, forward, initial, inputs_at, misses
+from .networks.masked_network import draw_alive, entries, forward_fast, initial, inputs_at, misses
 from .networks.training_presses import TrainingPresses, as_unseen
 
 LEAST_BATCHES, MOST_STEPS, LONGER = 10, 11_000, 2
@@ -253,7 +253,7 @@ class _Training:
         inputs += INPUT_NOISE * self._normal(*rest.shape)
         alive = self._alive[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
         known, found = entries(inputs, alive, self._observer)
-        learnt, logs = forward(self._weights, known[None])[0].chunk(2, dim=1)
+        learnt, logs = forward_fast(self._weights, known[None])[0].chunk(2, dim=1)
         off, logs = learnt + found - targets, logs.clamp(LEAST_LOG, MOST_LOG)
         return (misses(off) + EXPECTING * (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)).mean()
 

@@ -33,6 +33,8 @@ LOOKS, FARTHEST, LEAST_SPREAD = 2, 0.2, 1e-2
 """Steps, how far one leads, and the least spread on the grid, a seventh of a cell; both in spans of the pad."""
 TOLD = 9
 """Numbers told of a press: place, mean place on the grid, logarithms of the spreads of both, and how x goes with y."""
+LEAST_EXPONENT = -60.0
+"""Less counts for nothing, and its exponential takes ten times as long."""
 MAX_TERM = 1e12
 _VALUES = 2**15
 
@@ -134,9 +136,10 @@ class Observer:
         first, second = (each.tolist() for each in np.triu_indices(seen.shape[2]))
         known = xp.concat([seen[:, :, first] * seen[:, :, second], seen, xp.ones_like(seen[:, :, :1])], axis=2)
         likely = (known * there[:, :, None]).reshape(len(seen), -1) @ self.terms
-        share = xp.exp(likely - xp.amax(likely, axis=1)[:, None])
-        share = share / share.sum(axis=1)[:, None]
+        likely -= xp.amax(likely, axis=1)[:, None]  # in place, as to fetch memory takes as long as to fill it
+        share = xp.exp(xp.clip(likely, LEAST_EXPONENT, 0.0, out=likely), out=likely)
         moments = share @ xp.concat([self.grid, self.grid**2, self.grid[:, :1] * self.grid[:, 1:]], axis=1)
+        moments = moments / share.sum(axis=1)[:, None]
         mean = moments[:, :2]
         variance = xp.clip(moments[:, 2:4] - mean**2, LEAST_SPREAD**2, 4.0)
         both = (moments[:, 4] - mean[:, 0] * mean[:, 1]) / xp.sqrt(variance[:, 0] * variance[:, 1])

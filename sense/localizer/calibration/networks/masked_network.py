@@ -83,5 +83,16 @@ def forward(weights: dict[str, Tensor], x: Tensor) -> Tensor:
     return torch.baddbmm(weights["last.b"], _ready(h), weights["last.w"])
 
 
+def forward_fast(weights: dict[str, Tensor], x: Tensor) -> Tensor:
+    """What `forward` gives to about 1 %, for training, which errs no more for it.
+
+    A processor that has instructions for it multiplies matrices in bfloat16, with sums in single precision, four times
+    as fast; on others, and in a torch that does not say so, this is `forward` itself.
+    """
+    able = getattr(torch.cpu, "get_capabilities", dict)().get("avx512_bf16", False)
+    with torch.autocast("cpu", torch.bfloat16, enabled=able):
+        return forward(weights, x).float()
+
+
 def _ready(h: Tensor) -> Tensor:
     return functional.gelu(functional.layer_norm(h, h.shape[-1:], eps=EPSILON))
