@@ -141,8 +141,9 @@ def _near(place: Tensor, other: SampledCurves, distances: Tensor, gap: float) ->
     They are measured to the piece of tangent the nearest sample stands for, which reaches up to half a step beyond it.
     """
     reach = other.share.max().item()
-    fibre, sample = (distances.amin(dim=2) < gap + reach).nonzero(as_tuple=True)
-    nearest = distances[fibre, sample].argmin(dim=1)
+    least, at = distances.min(dim=2)
+    fibre, sample = (least < gap + reach).nonzero(as_tuple=True)
+    nearest = at[fibre, sample]
     slope = other.slope.detach()[fibre, nearest]
     tangent = torch.nn.functional.normalize(torch.stack([torch.ones_like(slope), slope], dim=-1), dim=-1)
     away = place[fibre, sample] - other.place[fibre, nearest]

@@ -1,5 +1,6 @@
 """Training: masks lose no more than they may, and presses are moved as the fitted table says."""
 
+from collections.abc import Callable
 from types import ModuleType
 
 import numpy as np
@@ -58,3 +59,26 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
     inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
     assert inwards.min() >= -1e-6
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "off"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0), ({}, 0.0)]
+)
+def test_training_computes_as_finely_as_the_processor_is_fast(
+    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], off: float
+) -> None:
+    """Outputs and slopes are single, and up to a few per cent those of single precision, or exactly these."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    generator = torch.Generator().manual_seed(0)
+    weights = masked_network.initial(30, sense_settings.LocalizerSettings(), generator)
+    x = torch.randn(1, 64, 30, generator=generator)
+
+    def outputs_and_slopes(forward: Callable[..., torch.Tensor]) -> list[torch.Tensor]:
+        found = forward(weights, x)
+        return [found, *torch.autograd.grad(found.square().sum(), list(weights.values()))]
+
+    exact, fast = map(outputs_and_slopes, (masked_network.forward, masked_network.forward_fast))
+    for one, other in zip(exact, fast, strict=True):
+        assert other.dtype == torch.float32
+        assert torch.linalg.vector_norm(one - other) <= off * torch.linalg.vector_norm(one)
+    assert all(torch.equal(one, other) for one, other in zip(exact, fast, strict=True)) == (not off)
