@@ -1,135 +1,273 @@
-"""Expected localisation error: how far off a regression is that learns places from signals, and what noise adds to it.
+"""Expected localisation error: how far off a regression is that learns positions from responses, and what scatter adds.
 
-For presses a with signals s_a, in full scales, noise of standard deviation sigma on each and the set K of fibres that
-still work, two terms are added:
+The response x of a fibre is its relative stretch (signal over length, as a divider shows it), in full scales of straight
+fibres. A press scatters by a floor and by a share of the response, of whose variance all fibres have a part in common:
 
-    E_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|s_a - s_b|^2_K / 2 w^2),
-    B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' J_a / sigma^2 + 12 / size^2,    J_a = ds / dp there.
+    x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
+
+z = asinh(b x / floor) / b with b = share sqrt(1 - common) stabilises the variance of what fibres have for themselves
+(M. S. Bartlett, The use of transformations, Biometrics 3, 1947): z scatters by 1 wherever a press lies. For presses a
+and the set K of fibres that still work, two terms are added:
+
+    E_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|z_a - z_b|^2_K / 2 w^2),
+    B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' (1 + u_a u_a')^-1 J_a + 12 / size^2,    J_a = dz / dp there.
 
 E_K is how far off kernel ridge regression finds each press when it has learnt from all the others, which is known
 without learning anew (C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, 2006, chapter 2 and
-section 5.4.2; w is the width of the kernel, r the ridge, c_aa C's diagonal, p the places from their middle). So it
-counts confusions by how far off they lead, as the ambiguity does, but without a noise level; and besides, what a
-localizer has to learn between presses: signals that fold the pad too often are far apart for neighbours. It goes with
-the error of a trained network. B_K is the Cramer-Rao bound (van Trees 1968, section 2.4) with what is known beforehand,
-that the place is one of the pad: what no localizer falls below, however many presses it has learnt from. It grows with
-the noise, and where noise is small, E_K is all there is.
+section 5.4.2; w is the width of the kernel, r the ridge, c_aa C's diagonal, p the positions from their middle). So it
+counts confusions by how far off they lead, as the ambiguity does; and besides, what a localizer has to learn between
+presses: responses that fold the pad too often are far apart for neighbours. B_K is the Cramer-Rao bound (van Trees
+1968, section 2.4) with what is known beforehand, that the position is one of the pad: what no localizer falls below,
+however many presses it has learnt from. u = sqrt(common) share x / sqrt(floor^2 + b^2 x^2) is how the gain in common
+shows in z. That the covariance itself depends on the position, which tells a few per cent more, is left out.
+
+Presses are compared on a fine lattice over a window of the pad; where the pad is larger, presses of a coarse lattice
+over the rest of it that answer like some press of the window are learnt from as well, so that places far apart may not
+look alike. The cost of a window grows with the pad's area, by which there are more presses to look at.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from design.criteria.ambiguity import full_scale
 from design.criteria.fibre_loss import loss_masks, loss_shares
-from design.pad.contact import signals as exact_signals
+from design.pad.contact import lattice, relative_stretch
+from design.pad.courses.keep_out import outside
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, Rectangle
+from design.settings import Contact, Layout, PadSettings, Rectangle, Scatter, SearchSettings, sensed_rectangle
 
 SEARCHED, JUDGED, WINDOW = 12, 14, 5.0
-"""Presses along a side of a lattice, in a search and where a pad is judged, and the longest side, grid units: presses
-further apart are seldom confused. With 10 in place of 12 a search errs more under a small contact; 14 take a
-seventh to a third more time for 1 to 2 % with few knots."""
-LATTICES, MOST_LOSSES = 4, 32
-"""Lattices, and sets of lost fibres of a size, by which a finished pad is judged."""
-WIDTH, RIDGE = 0.5, 1e-2
-"""Width of the kernel, full scales of a signal, and the ridge: such errors go best with those of trained networks."""
-LEAST = 1e-12
+"""Presses along a side of a window's lattice, in a search and where a pad is judged, and its longest side, grid units.
+With 10 in place of 12 a search errs more under a small contact; 14 take a seventh to a third more time for 1 to 2 %."""
+COARSE, BESIDE = 0.7, 1.0
+"""Step of the lattice over the rest of the pad, and how far beside the window it begins, grid units."""
+MAX_PARTNERS, ALIKE = 36, 2.0
+"""Most presses of it that are learnt from besides, and the distance in widths of the kernel within which they are."""
+LATTICES, MAX_SETS = 4, 32
+"""Lattices, and sets of failed fibres of a size, by which a finished pad is judged."""
+WIDTH, RIDGE = 0.75, 1e-2
+"""Width of the kernel, of a straight fibre's full scale in z, and the ridge: such errors go best with those of trained
+networks, over straight, gently and strongly curved pads."""
+EPSILON = 1e-12
 """Squared length, so that its root has a gradient at 0."""
+FULL_SCALE_SIDE = 24
+"""Presses along a side by which the full scale of straight fibres is known."""
 
 
-def expected_errors(
-    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, size: PadSettings
-) -> list[float]:
-    """Expected error (formula of this module) with 0, 1, ... fibres lost, grid units, always by the same presses.
+class Presses(NamedTuple):
+    """Presses of a window of the pad.
+
+    Attributes:
+        positions: (Q, 2), grid units, of a square lattice, row by row.
+        step: (2,) between its neighbours, grid units.
+        free: (Q,) which lie in no keep-out.
+        far: (P, 2) presses over the rest of the pad, none where the window is all that is pressed.
+    """
+
+    positions: Array
+    step: Array
+    free: NDArray[np.bool_]
+    far: Array
+
+    def joined(self, partners: Tensor) -> Tensor:
+        """Return (Q + P, 2) positions of the window and of some of the presses beyond it."""
+        return torch.tensor(np.concatenate([self.positions, self.far[partners.cpu().numpy()]]))
+
+
+def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
+    """Return the expected error with 0, 1, ... fibres failed, by the formula of this module, always on the same presses.
 
     Args:
-        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
+        pad: the fibres.
+        contact: what a press does to them.
+        search: how many fibres may fail, and how responses scatter.
         size: says what is pressed.
+
+    Returns:
+        Means over sets of failed fibres, grid units.
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
-    levels = range(min(len(loss_shares(lost)), fibres))
-    masks = [torch.tensor(loss_masks(fibres, k, MOST_LOSSES)) for k in levels]
-    errors = np.zeros((LATTICES, len(masks)))
-    for lattice in errors:
-        places, step = shifted_lattice(size.sensed, JUDGED, rng)
-        found = torch.tensor(exact_signals(pad, places, contact).T)
-        touched = found.any(dim=1)  # on a large pad most fibres are touched by none of the presses
-        given = found[touched] / full_scale(found), torch.tensor(places), torch.tensor(step)
-        for k, kept in enumerate(masks):
-            lattice[k] = expected_error(*given, kept[:, touched], noise).mean().item()
-    return errors.mean(axis=0).tolist()
+    levels = range(min(len(loss_shares(search.lost)), fibres))
+    masks = [torch.tensor(loss_masks(fibres, k, MAX_SETS)) for k in levels]
+    scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
+    errors = []
+    for window in judged_windows(size.sensed):
+        presses = window_presses(size, window, JUDGED, rng)
+        near, far = (
+            torch.tensor(relative_stretch(pad, positions, contact).T / scale)
+            for positions in (presses.positions, presses.far)
+        )
+        touched = torch.cat([near, far], dim=1).any(dim=1)  # on a large pad most fibres are far from all the presses
+        # and most sets of failed fibres are alike to what is left
+        sets = [mask[:, touched].unique(dim=0, return_inverse=True) for mask in masks]
+        partners = confusable(near[touched], far[touched], torch.cat([few for few, _ in sets]), search.response_scatter)
+        responses = torch.cat([near, far[:, partners]], dim=1)[touched]
+        given = responses, presses.joined(partners), torch.tensor(presses.step), torch.tensor(presses.free)
+        errors.append([expected_error(*given, few, search.response_scatter)[rows].mean().item() for few, rows in sets])
+    return np.mean(errors, axis=0).tolist()
 
 
 def error_terms(errors: Sequence[float]) -> dict[str, float]:
-    """`expected_errors` by name."""
+    """Return `expected_errors` by name."""
     return {f"expected_error_lost_{lost}": value for lost, value in enumerate(errors)}
 
 
-def shifted_lattice(rectangle: Rectangle, side: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Presses (side^2, 2) on a lattice that is shifted by up to a cell, and its step (2,), grid units.
+@lru_cache(maxsize=64)
+def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Any) -> float:
+    """Return the mean over straight fibres of their largest relative stretch, to which responses are scaled."""
+    presses = lattice(sensed_rectangle(layout, sensed_mm), FULL_SCALE_SIDE)
+    largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
+    return float(largest[largest > 0].mean()) if largest.any() else 1.0
 
-    It lies over a part of what is pressed, all of it unless it is large.
-    """
+
+def judged_windows(rectangle: Rectangle) -> Iterator[Rectangle]:
+    """Yield the windows by which a pad is judged: they tile what is pressed, and LATTICES at least are taken in all."""
+    low, high = np.array(rectangle)
+    counts = np.ceil((high - low) / WINDOW - 1e-9).astype(int).clip(1)
+    size = (high - low) / counts
+    for _ in range(math.ceil(LATTICES / counts.prod())):
+        for tile in np.ndindex(*counts.tolist()):
+            corner = low + size * tile
+            yield tuple(corner.tolist()), tuple((corner + size).tolist())
+
+
+def drawn_window(rectangle: Rectangle, rng: np.random.Generator) -> Rectangle:
+    """Draw a window anywhere in what is pressed: all of it unless it is large."""
     low, high = np.array(rectangle)
     size = np.minimum(high - low, WINDOW)
     corner = low + rng.random(2) * (high - low - size)
+    return tuple(corner.tolist()), tuple((corner + size).tolist())
+
+
+def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> Presses:
+    """Return presses on a lattice over a window that is shifted by up to a cell, and those over the rest of the pad."""
+    low, high = np.array(window)
     cells = np.stack(np.meshgrid(*2 * [np.arange(side, dtype=float)]), axis=-1).reshape(-1, 2)
-    return corner + size * (cells + rng.random(2)) / side, size / side
+    positions = low + (high - low) * (cells + rng.random(2)) / side
+    least, most = np.array(size.sensed)
+    counts = np.ceil((most - least) / COARSE).astype(int)
+    far = np.empty((0, 2))
+    if ((high - low) < (most - least) - 2 * BESIDE).any():
+        grid = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
+        far = least + (most - least) * (grid + rng.random(2)) / counts
+        far = far[((far < low - BESIDE) | (far > high + BESIDE)).any(axis=1) & outside(far, size)]
+    return Presses(positions, (high - low) / side, outside(positions, size), far)
 
 
-def expected_error(signals: Tensor, places: Tensor, step: Tensor, kept: Tensor, sigma: float) -> Tensor:
-    """(L,) E + B of the module's formula for each of some losses, grid units, with gradient by the signals.
+def stabilised(responses: Tensor, scatter: Scatter) -> Tensor:
+    """Return z of the module's formula for responses of any shape, in full scales of straight fibres."""
+    own = scatter.share * math.sqrt(1 - scatter.common)
+    scaled = responses / scatter.floor
+    return torch.asinh(own * scaled) / own if own > 0 else scaled
+
+
+def kernel_width(scatter: Scatter) -> float:
+    """Return w of the module's formula."""
+    return WIDTH * stabilised(torch.ones((), dtype=torch.float64), scatter).item()
+
+
+def confusable(near: Tensor, far: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
+    """Return which presses (P,) of `far` answer most like some press of a window, under any of some losses.
 
     Args:
-        signals: (F, Q) in full scales, for the presses of a lattice of Q = side^2; single precision is enough.
-        places: (Q, 2), grid units. step: (2,) between neighbours of the lattice, grid units.
-        kept: (L, F), 1 for a fibre that works, 0 for a lost one.
-        sigma: of the noise, in full scales, > 0.
+        near: (F, Q) responses of the window.
+        far: (F, N) responses over the rest of the pad.
+        masks: (L, F), 1 for a fibre that works.
+        scatter: of responses.
+
+    Returns:
+        At most MAX_PARTNERS indices, ascending; none that is ALIKE widths of the kernel or more away.
     """
-    there, apart, masks = (given.to(signals.dtype) for given in (places, step, kept))
-    bound = _bound(_rates(signals.T, apart) / sigma, masks, apart * math.isqrt(len(there)))
-    learnt = _LeaveOneOut.apply(signals / WIDTH, there - there.mean(dim=0), masks)
-    return learnt + bound
+    if not far.shape[1]:
+        return torch.empty(0, dtype=torch.int64)
+    z, other = (stabilised(x.detach(), scatter).float() / kernel_width(scatter) for x in (near, far))
+    least = torch.full((far.shape[1],), torch.inf, device=far.device)
+    for mask in masks.float().unique(dim=0):
+        least = torch.minimum(least, torch.cdist(other.T * mask, z.T * mask).amin(dim=1))
+    best = least.topk(min(MAX_PARTNERS, len(least)), largest=False)
+    return best.indices[best.values < ALIKE].sort().values
 
 
-def over_losses(errors: Tensor, kept: Tensor, shares: tuple[float, ...]) -> Tensor:
-    """Geometric mean of errors over numbers of lost fibres: a gain of a tenth counts alike, however many are lost.
+def expected_error(
+    responses: Tensor, positions: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter
+) -> Tensor:
+    """Return E + B of the module's formula for each of some losses, with gradient by the responses.
 
     Args:
-        errors: (L,). kept: (L, F) the losses they are of.
-        shares: P(k) of k = 0, 1, ... lost; what is not in `kept` is left out.
+        responses: (F, Q + P) in full scales of straight fibres, for the presses of a lattice of Q = side^2, row by row,
+            and P others that are learnt from; single precision is enough.
+        positions: (Q + P, 2), grid units.
+        step: (2,) between neighbours of the lattice, grid units.
+        free: (Q,) which presses of the lattice count; others lie in a keep-out.
+        masks: (L, F), 1 for a fibre that works, 0 for a failed one.
+        scatter: of responses; its floor is above 0.
+
+    Returns:
+        (L,) grid units.
     """
-    lost = (kept == 0).sum(dim=1)
+    where, apart, masks = (given.to(responses.dtype) for given in (positions, step, masks))
+    z, count = stabilised(responses, scatter), len(free)
+    bound = _bound(z[:, :count], responses[:, :count], apart, free, masks, scatter)
+    learnt = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(where))])
+    middle = where[:count].mean(dim=0)
+    found = _LeaveOneOut.apply(z[:, learnt] / kernel_width(scatter), where[learnt] - middle, masks, int(free.sum()))
+    return found + bound
+
+
+def over_losses(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
+    """Return the geometric mean of errors over numbers of failed fibres: a gain of a tenth counts alike at each.
+
+    Args:
+        errors: (L,).
+        masks: (L, F) the losses they are of.
+        shares: P(k) of k = 0, 1, ... failed; what is not in `masks` is left out.
+    """
+    lost = (masks == 0).sum(dim=1)
     levels = [k for k in range(len(shares)) if (lost == k).any()]
     logs = torch.stack([errors[lost == k].mean().log() for k in levels])
     weights = torch.tensor([shares[k] for k in levels], dtype=logs.dtype, device=logs.device)
     return (logs @ weights / weights.sum()).exp()
 
 
-def _rates(signals: Tensor, step: Tensor) -> Tensor:
-    """(P, F, 2) by how much signals (Q, F) on a lattice change by x and y, by differences over each of its cells."""
-    fibres, side = signals.shape[1], math.isqrt(len(signals))
-    a, b, c, d = (
-        signals.reshape(side, side, fibres)[rows, columns]
-        for rows in (slice(None, -1), slice(1, None))
-        for columns in (slice(None, -1), slice(1, None))
+def _corners(values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Values (Q, ...) of a lattice at the corners of each of its cells: below left, below right, above left and right."""
+    side = math.isqrt(len(values))
+    grid = values.reshape(side, side, *values.shape[1:])
+    return grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
+
+
+def _rates(values: Tensor, step: Tensor) -> Tensor:
+    """(P, F, 2) by how much values (F, Q) on a lattice change by x and y, by differences over each of its cells."""
+    a, b, c, d = (corner.flatten(0, 1) for corner in _corners(values.T))
+    return torch.stack([(b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])], dim=-1)
+
+
+def _bound(z: Tensor, responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
+    """(L,) B, over the cells of the lattice that are free."""
+    cells = torch.stack([corner.flatten() for corner in _corners(free)]).all(dim=0)
+    if not cells.any():  # no more than slits between keep-outs
+        return masks.new_zeros(len(masks))
+    rates = _rates(z, step)[cells]
+    own = scatter.share**2 * (1 - scatter.common)
+    middle = torch.stack([corner.flatten(0, 1) for corner in _corners(responses.T)]).mean(dim=0)[cells]
+    gain = math.sqrt(scatter.common) * scatter.share * middle / (scatter.floor**2 + own * middle**2).sqrt()
+    information = torch.einsum("lk,qki,qkj->lqij", masks, rates, rates)
+    shared = torch.einsum("lk,qk,qki->lqi", masks, gain, rates)
+    total = 1 + torch.einsum("lk,qk->lq", masks, gain**2)
+    # (1 + u u')^-1 = 1 - u u' / (1 + u'u)
+    xx, yy, xy = (
+        information[..., i, j] - shared[..., i] * shared[..., j] / total for i, j in ((0, 0), (1, 1), (0, 1))
     )
-    by_x, by_y = (b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])
-    return torch.stack([by_x, by_y], dim=-1).reshape((side - 1) ** 2, fibres, 2)
-
-
-def _bound(rates: Tensor, kept: Tensor, size: Tensor) -> Tensor:
-    """(L,) B for rates (P, F, 2) in units of the noise."""
-    told = torch.einsum("lk,qki,qkj->lqij", kept, rates, rates)
-    xx, yy, (prior_x, prior_y) = told[..., 0, 0], told[..., 1, 1], 12 / size**2
-    # at a faint noise the first difference cancels where one direction alone is told, and the prior must not with it
-    volume = (xx * yy - told[..., 0, 1] ** 2).clamp(min=0) + prior_x * yy + prior_y * xx + prior_x * prior_y
+    prior_x, prior_y = 12 / (step * math.isqrt(z.shape[1])) ** 2
+    # at a faint scatter the first difference cancels where one direction alone is told, and the prior must not with it
+    volume = (xx * yy - xy**2).clamp(min=0) + prior_x * yy + prior_y * xx + prior_x * prior_y
     return ((xx + yy + prior_x + prior_y) / volume).sqrt().mean(dim=1)
 
 
@@ -137,29 +275,30 @@ class _LeaveOneOut(torch.autograd.Function):
     """E with its gradient in closed form, since both come from the same inverse."""
 
     @staticmethod
-    def forward(ctx: Any, signals: Tensor, presses: Tensor, kept: Tensor) -> Tensor:
-        """(L,) E for signals (F, Q) in widths of the kernel."""
-        (fibres, count), losses = signals.shape, len(kept)
+    def forward(ctx: Any, z: Tensor, positions: Tensor, masks: Tensor, count: int) -> Tensor:
+        """(L,) E over the first `count` presses, for z (F, Q) in widths of the kernel."""
+        (fibres, presses), losses = z.shape, len(masks)
         # differences, unlike products, do not cancel: single precision serves
-        apart = signals[:, :, None] - signals[:, None, :]
-        kernel = torch.exp(torch.mm(kept / -2, apart.square().view(fibres, count**2)).view(losses, count, count))
+        apart = z[:, :, None] - z[:, None, :]
+        kernel = torch.exp(torch.mm(masks / -2, apart.square().view(fibres, presses**2)).view(losses, presses, presses))
         ridged = kernel.clone()
         ridged.diagonal(dim1=1, dim2=2).add_(RIDGE)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(ridged))
-        alpha = inverse @ presses
-        length = (alpha.square().sum(dim=-1) + LEAST).sqrt()
-        ctx.save_for_backward(apart, kernel, inverse, alpha, length, kept)
-        return (length / inverse.diagonal(dim1=1, dim2=2)).mean(dim=1)
+        alpha = inverse @ positions
+        length = (alpha.square().sum(dim=-1) + EPSILON).sqrt()
+        ctx.save_for_backward(apart, kernel, inverse, alpha, length, masks)
+        ctx.count = count
+        return (length / inverse.diagonal(dim1=1, dim2=2))[:, :count].mean(dim=1)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient by the signals."""
-        apart, kernel, inverse, alpha, length, kept = ctx.saved_tensors
+        """Gradient by z."""
+        apart, kernel, inverse, alpha, length, masks = ctx.saved_tensors
         diagonal = inverse.diagonal(dim1=1, dim2=2)
-        share = upstream[0][:, None] / diagonal.shape[1]
+        share = upstream[0][:, None] / ctx.count * (torch.arange(diagonal.shape[1]) < ctx.count).to(diagonal)
         by_alpha, by_diagonal = alpha * (share / (length * diagonal))[..., None], -share * length / diagonal**2
         # dC = -C dk C, whence how E changes with every entry of k, but for the sign
         by_kernel = torch.bmm(inverse * by_diagonal[:, None, :], inverse)
         by_kernel += torch.bmm(inverse @ by_alpha, alpha.mT)
-        pull = torch.mm(kept.T, (by_kernel * kernel).flatten(1)).view(apart.shape) * apart
-        return pull.sum(dim=2) - pull.sum(dim=1), None, None
+        pull = torch.mm(masks.T, (by_kernel * kernel).flatten(1)).view(apart.shape) * apart
+        return pull.sum(dim=2) - pull.sum(dim=1), None, None, None

@@ -6,29 +6,35 @@ them to the same bits, so that it can run in slices on any thread or machine and
 
 import json
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from design.common.checkpoints import State
-from design.criteria.ambiguity import full_scale, sharpness
-from design.criteria.differentiable import pchip_slopes, press_signals
+from design.criteria.ambiguity import sharpness
+from design.criteria.differentiable import arc_lengths, pchip_slopes, press_signals
 from design.criteria.fibre_loss import draw_losses, loss_shares
 from design.criteria.penalties import penalties
-from design.evaluation.expected_error import SEARCHED, expected_error, over_losses, shifted_lattice
-from design.pad.contact import boustrophedon, signals
+from design.evaluation.expected_error import (
+    SEARCHED,
+    confusable,
+    drawn_window,
+    expected_error,
+    over_losses,
+    straight_full_scale,
+    window_presses,
+)
+from design.pad.contact import boustrophedon
+from design.pad.knots import Array
 from design.pad.morphology import Morphology
+from design.settings import Contact
 
 from .parametrization import Fibres, border_of, first_course
 from .problem import SearchProblem
 
-SCALE_SIDE = 24  # presses per row and column by which full scale is known
-LOUDER = 2.0  # noise of the first step as a multiple of the last one's
+LOUDER = 2.0  # scatter of the first step as a multiple of the last one's
 RATE = 0.02
 PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
 MARGIN = 1.05  # on the limits of the rules
@@ -36,10 +42,6 @@ NOTED_STEPS = 10  # between entries of the history
 REPAIR_STEPS, REPAIR_CHECKS = 600, 20  # after the last step, until the exact check passes; steps between checks
 REPAIR_MARGIN = 0.01  # added to the margin at each check that does not pass
 REPAIR_RATE, REPAIR_FASTER, REPAIR_FASTEST = 0.002, 1.15, 0.01  # gentle at first, and faster with each such check
-
-SignalsAt = Callable[[NDArray[np.float64]], Tensor]
-Measure = Callable[[SignalsAt, float], Tensor]
-"""What a step minimises, by the signals (F, Q) at presses (Q, 2) and the noise, share of full scale."""
 
 
 class GradientSearch:
@@ -50,7 +52,7 @@ class GradientSearch:
     Attributes:
         step: steps done. objective: what is minimised, but for the rules, at the last step. done: whether nothing is
             left to do.
-        scale: full scale of the signals of the first pad, grid units.
+        scales: full scale of straight fibres under each contact.
     """
 
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
@@ -59,12 +61,10 @@ class GradientSearch:
         self.step, self.objective, self.done = 0, math.inf, False
         self._history: list[tuple[int, float]] = []
         pad, search, rules = problem.pad, problem.search, problem.rules
+        self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
         if state is None:
             course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
             self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
-            # of the pad it starts from: if noise grew with the signals, longer fibres would be worth nothing
-            presses = boustrophedon(pad.sensed, SCALE_SIDE)
-            self.scale = full_scale(torch.tensor(signals(self.morphology(), presses, problem.contacts[0]).T))
             self._optimiser = self._adam()
         else:
             self._restore(state)
@@ -95,7 +95,7 @@ class GradientSearch:
         state = {
             "spans": self.fibres.spans.detach().numpy().copy(),
             "cross": self.fibres.cross.detach().numpy().copy(),
-            "fixed": np.array([self.fibres.floor, self.fibres.border, self.scale]),
+            "fixed": np.array([self.fibres.floor, self.fibres.border]),
             "progress": np.array([self.step, self.objective]),
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
@@ -106,7 +106,7 @@ class GradientSearch:
         return state
 
     def _restore(self, state: State) -> None:
-        floor, border, self.scale = state["fixed"].tolist()
+        floor, border = state["fixed"].tolist()
         self.fibres = Fibres(
             self.problem.pad.layout, torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border
         )
@@ -128,7 +128,7 @@ class GradientSearch:
         progress = self.step / max(1, search.steps - 1)
         rate = RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
         travel, cross = self.fibres.axes()
-        total = self._spread(travel, cross, search.noise * LOUDER ** (1 - progress))
+        total = self._expected_error(travel, cross, LOUDER ** (1 - progress))
         self.objective = total.item()
         if rules.enforce:
             total = total + PENALTY[0] * (PENALTY[1] / PENALTY[0]) ** progress * self._penalty(travel, cross, MARGIN)
@@ -172,44 +172,31 @@ class GradientSearch:
     def _adam(self) -> torch.optim.Adam:
         return torch.optim.Adam([self.fibres.spans, self.fibres.cross], lr=RATE)
 
-    def _spread(self, travel: Tensor, cross: Tensor, noise: float) -> Tensor:
+    def _expected_error(self, travel: Tensor, cross: Tensor, louder: float) -> Tensor:
         """What is minimised, and sharpness where it is asked for, averaged over the contacts."""
         search, pad = self.problem.search, self.problem.pad
         slope = pchip_slopes(travel, cross)
-        measure = self._expected_error()
-        total = torch.zeros((), device=search.device)
-        for contact in self.problem.contacts:
-            total = total + measure(
-                partial(press_signals, travel, cross, slope, contact=contact, ends=self.fibres.ends), noise
-            )
-            if search.sharpness > 0:
-                serpentine = boustrophedon(pad.sensed, SEARCHED)
-                in_order = press_signals(travel, cross, slope, serpentine, contact, self.fibres.ends)
-                total = total + search.sharpness * sharpness(in_order.float().to(search.device))
-        return total.cpu() / len(self.problem.contacts)
-
-    def _expected_error(self) -> Measure:
-        """The expected error on presses and losses drawn once for all contacts of a step.
-
-        Signals and noise are shares of full scale, which passes from that of the first pad to that of the pad itself:
-        with its own from the beginning fibres hardly leave their course, and with the first to the end length counts.
-        """
-        search, pad = self.problem.search, self.problem.pad
-        own = self.step / search.steps
-        places, step = shifted_lattice(pad.sensed, SEARCHED, self.rng)
+        length = arc_lengths(travel, cross, slope)[:, None]
+        presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
         shares = loss_shares(search.lost)
-        kept, _ = draw_losses(pad.layout.fibres, shares, self.rng)
-        there, apart, losses = (
-            torch.tensor(x, dtype=torch.float32, device=search.device) for x in (places, step, kept)
-        )
+        masks, _ = draw_losses(pad.layout.fibres, shares, self.rng)
+        step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
+        masks, scatter = masks.float(), search.response_scatter.scaled(louder)
+        total = torch.zeros((), device=search.device)
+        for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
 
-        def measure(signals_at: SignalsAt, noise: float) -> Tensor:
-            found = signals_at(places).float().to(search.device)
-            largest = found.amax(dim=1).mean()
-            scale = self.scale ** (1 - own) * largest**own if largest > 0 else self.scale
-            return over_losses(expected_error(found / scale, there, apart, losses, noise), losses, shares)
+            def responses(positions: Array, contact: Contact = contact, scale: float = scale) -> Tensor:
+                stretch = press_signals(travel, cross, slope, positions, contact, self.fibres.ends) / length
+                return (stretch / scale).float().to(search.device)
 
-        return measure
+            with torch.no_grad():
+                partners = confusable(responses(presses.positions), responses(presses.far), masks, scatter)
+            positions = presses.joined(partners)
+            given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
+            total = total + over_losses(expected_error(*given), masks, shares)
+            if search.sharpness > 0:
+                total = total + search.sharpness * sharpness(responses(boustrophedon(pad.sensed, SEARCHED)))
+        return total.cpu() / len(self.problem.contacts)
 
     def _broken(self) -> bool:
         return bool(self.problem.broken(self.morphology()))

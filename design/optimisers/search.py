@@ -184,8 +184,7 @@ class _Judged:
     def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
         self._problem, self.pad = problem, pad
         self.broken: list[Violation] = problem.broken(pad)
-        asked = problem.search.lost, problem.search.noise, problem.pad
-        self._errors = [expected_errors(pad, contact, *asked) for contact in problem.contacts]
+        self._errors = [expected_errors(pad, contact, problem.search, problem.pad) for contact in problem.contacts]
 
     @property
     def rank(self) -> tuple[int, float]:

@@ -18,6 +18,7 @@ from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.published.sampled_signals import quantized_signals
 from design.settings import PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
+from .courses.curves import lengths
 from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes, kernel_ends, layout_of
 from .morphology import Morphology
 
@@ -49,6 +50,23 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
         InputError: presses of the wrong shape or not finite.
     """
     return signals_and_spans(pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT))[0]
+
+
+def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
+    """Return what a voltage divider shows of a press: `signals` as shares of the length of each fibre.
+
+    A fibre is a strain gauge: its resistance grows by its relative stretch, so that the same stretch shows less on a
+    longer fibre.
+
+    Args:
+        pad: the fibres.
+        presses: (Q, 2) centres in grid units.
+        contact: what a press does to a fibre.
+
+    Returns:
+        (Q, F), without unit.
+    """
+    return signals(pad, presses, contact) / lengths(pad)
 
 
 def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:

@@ -8,9 +8,9 @@ from .contact import MEASURED_REACH, PUBLISHED_CONTACT, Contact
 from .layout import MOST_FIBRES, Counts, Layout, Pitch
 from .pad import PadSettings, Polygon, Rectangle, Sensed, between_fibres, sensed_rectangle
 from .rules import RulesSettings
-from .search import Lost, SearchSettings
+from .search import Lost, Scatter, SearchSettings
 
-PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005)
+PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
 PUBLISHED: Mapping[str, Settings] = {
     "pad": PUBLISHED_PAD,
     "contact": PUBLISHED_CONTACT,
@@ -34,6 +34,7 @@ __all__ = [
     "Polygon",
     "Rectangle",
     "RulesSettings",
+    "Scatter",
     "SearchSettings",
     "Sensed",
     "between_fibres",

@@ -1,6 +1,6 @@
 """`[search]`: how the fibres are found."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, field_validator
 
@@ -25,11 +25,29 @@ LEVELS = 4096
 MOST_LEVELS = 2**24
 
 
+class Scatter(NamedTuple):
+    """How the response of a fibre scatters from press to press at the same position.
+
+    Attributes:
+        floor: standard deviation of what does not depend on the response, of a straight fibre's full scale, > 0.
+        share: standard deviation of what is proportional to the response, share of it.
+        common: share of the latter's variance that all fibres have in common.
+    """
+
+    floor: float
+    share: float = 0.0
+    common: float = 0.0
+
+    def scaled(self, factor: float) -> "Scatter":
+        """Return the same scatter, louder by a factor."""
+        return Scatter(self.floor * factor, self.share * factor, self.common)
+
+
 class SearchSettings(Settings):
     """`[search]`: how the fibres are found.
 
     Attributes:
-        noise: the default is what the responses of a built pad scatter by.
+        noise, scatter, scatter_common: the defaults are what the responses of a built pad scatter by.
         lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
         weights, presses, levels: of the published objective, alpha, beta and gamma; the side of its square of presses;
             and the levels that signals are rounded up to.
@@ -52,7 +70,16 @@ class SearchSettings(Settings):
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
     lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
     noise: float = Field(
-        default=0.02, ge=1e-9, le=10, description="standard deviation of a signal's noise, of full scale"
+        default=0.02,
+        ge=1e-9,
+        le=10,
+        description="standard deviation of a response's noise, of the full scale of straight fibres",
+    )
+    scatter: float = Field(
+        default=0.18, ge=0, le=1, description="scatter of a response from press to press, share of the response"
+    )
+    scatter_common: float = Field(
+        default=0.36, ge=0, le=0.99, description="share of that scatter's variance that all fibres have in common"
     )
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
     contacts: Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)] = Field(
@@ -64,6 +91,11 @@ class SearchSettings(Settings):
     def usual_contact(self) -> Contact:
         """What is designed for where nothing else is asked: the measured contact, by the published method its own."""
         return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
+
+    @property
+    def response_scatter(self) -> Scatter:
+        """How responses scatter that are designed for."""
+        return Scatter(self.noise, self.scatter, self.scatter_common)
 
     @field_validator("lost", "weights")
     @classmethod

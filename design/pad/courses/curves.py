@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from design.common.errors import InputError, instance, real
@@ -109,6 +108,8 @@ def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> 
     one family are looked at.
     """
     instance("across", across, bool)
+    import shapely  # takes a while, and lengths are asked for without it
+
     lines = np.array([shapely.LineString(points) for points in flatten(pad, tolerance)])
     first, second = shapely.STRtree(lines).query(lines)
     horizontals = pad.layout.horizontals
