@@ -175,16 +175,17 @@ class GradientSearch:
     def _spread(self, travel: Tensor, cross: Tensor, noise: float) -> Tensor:
         """What is minimised, and sharpness where it is asked for, averaged over the contacts."""
         search, pad = self.problem.search, self.problem.pad
-        slope = pchip_slopes(travel, cross)
+        slope, unit_mm = pchip_slopes(travel, cross), pad.layout.unit_mm
         measure = self._expected_error()
         total = torch.zeros((), device=search.device)
         for contact in self.problem.contacts:
             total = total + measure(
-                partial(press_signals, travel, cross, slope, contact=contact, ends=self.fibres.ends), noise
+                partial(press_signals, travel, cross, slope, contact=contact, ends=self.fibres.ends, unit_mm=unit_mm),
+                noise,
             )
             if search.sharpness > 0:
                 serpentine = boustrophedon(pad.sensed, SEARCHED)
-                in_order = press_signals(travel, cross, slope, serpentine, contact, self.fibres.ends)
+                in_order = press_signals(travel, cross, slope, serpentine, contact, self.fibres.ends, unit_mm)
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
 
