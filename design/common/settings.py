@@ -1,11 +1,12 @@
 """`pad.toml`: reading, validating and writing settings. Which sections there are is for those who own them to say."""
 
+import sys
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
 from .errors import InputError, instance, mapping, shown
 from .errors import path as as_path
@@ -15,6 +16,8 @@ MOST_BYTES = 2**18
 """Longer settings are none that anybody wrote, and would take long to be refused."""
 MOST_DOTS = 200
 """In a line: keys of very many parts take the reader of TOML time that grows with their square."""
+MAX_DEPTH = 6
+"""Of lists and tables in a table; no setting has more, and a list may hold itself."""
 
 
 class Settings(BaseModel):
@@ -31,6 +34,11 @@ class Settings(BaseModel):
         except ValidationError as error:
             raise _finding(error, type(self), f"[{self.section()}]") from error
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_numpy(cls, given: object) -> object:
+        return as_python(given)
+
     @classmethod
     def section(cls) -> str:
         """The name of its table: the model's, without `Settings`."""
@@ -40,6 +48,24 @@ class Settings(BaseModel):
 
 
 AnySettings = TypeVar("AnySettings", bound=Settings)
+
+
+def as_python(value: Any, depth: int = MAX_DEPTH) -> object:
+    """Return a value with Python's numbers and lists in place of NumPy's scalars and arrays.
+
+    Args:
+        value: that of a key, or a whole table.
+        depth: levels of lists and tables within which they are replaced.
+    """
+    numpy = sys.modules.get("numpy")  # whoever has such values has loaded it, and nobody else waits for it
+    if numpy and isinstance(value, numpy.generic | numpy.ndarray):
+        return value.tolist()
+    if depth and isinstance(value, list | tuple):
+        items = [as_python(item, depth - 1) for item in value]
+        return items if isinstance(value, list) else tuple(items)
+    if depth and isinstance(value, Mapping):
+        return {key: as_python(item, depth - 1) for key, item in value.items()}
+    return value
 
 
 def as_tuple(value: object) -> object:

@@ -37,7 +37,7 @@ def trials() -> Iterator[BenchTrial]:
 
 def exact_objective(pad: Morphology) -> float:
     """The published objective from exact signals and the exact area of disorder."""
-    levels = quantize(signals(pad, published_presses(pad.grid)))
+    levels = quantize(signals(pad, published_presses(pad.grid), PUBLISHED_CONTACT))
     entropy = joint_entropy(levels[:, : pad.grid]) + joint_entropy(levels[:, pad.grid :])
     disorder = disorder_area(pad) * (PUBLISHED - 1) / (pad.grid + 1)
     return 1 / (1 + entropy) + 1e-7 * published_sharpness(levels) + 5e-6 * disorder

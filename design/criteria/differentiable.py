@@ -90,18 +90,21 @@ def arc_lengths(travel: Tensor, cross: Tensor, slope: Tensor) -> Tensor:
     return (h * (1 + along**2).sqrt() @ (weights / 2)).sum(dim=-1)
 
 
-def press_signals(travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends) -> Tensor:
+def press_signals(
+    travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends, unit_mm: float
+) -> Tensor:
     """Signals of one pad with their analytic gradient: exact, but for a measured reach within the kernel's PRECISION.
 
     Args:
         travel, cross, slope: (F, n) float64 knots and slopes, held independent. presses: (Q, 2) in grid units.
         ends: where the fibres end.
+        unit_mm: the pad's grid unit, mm.
 
     Returns:
         (F, Q), with the default weight and length in grid units.
     """
     kind = MeasuredSignals if contact.reach else ExactSignals
-    return kind.apply(travel, cross, slope, presses, contact, ends)  # pyright: ignore[reportReturnType]
+    return kind.apply(travel, cross, slope, presses, contact, ends, unit_mm)  # pyright: ignore[reportReturnType]
 
 
 class ExactSignals(torch.autograd.Function):
@@ -109,11 +112,18 @@ class ExactSignals(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends
+        ctx: Any,
+        travel: Tensor,
+        cross: Tensor,
+        slope: Tensor,
+        presses: Array,
+        contact: Contact,
+        ends: Ends,
+        unit_mm: float,
     ) -> Tensor:
         """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        shape = press_shape(contact)
+        shape = press_shape(contact, unit_mm)
         strays, none = family_strays(v[None], ends), np.empty(0, np.int64)
         ctx.inputs = (t, v, d, strays[0], ends, presses, shape)
         out = np.zeros(len(presses) * len(t))
@@ -128,7 +138,7 @@ class ExactSignals(torch.autograd.Function):
         """Gradient by travel, cross and slope."""
         t, v, d, strays, ends, presses, shape = ctx.inputs
         found = signals_gradient(t, v, d, strays, ends, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
-        return (*torch.from_numpy(found), None, None, None)
+        return (*torch.from_numpy(found), None, None, None, None)
 
 
 class MeasuredSignals(torch.autograd.Function):
@@ -136,12 +146,20 @@ class MeasuredSignals(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends
+        ctx: Any,
+        travel: Tensor,
+        cross: Tensor,
+        slope: Tensor,
+        presses: Array,
+        contact: Contact,
+        ends: Ends,
+        unit_mm: float,
     ) -> Tensor:
         """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        _, extents, law = press_shape(contact)
-        elements = fibre_elements(t, v, d, ends.horizontals, presses, law.radius, spacing_of(contact.reach), law.length)
+        _, extents, law = press_shape(contact, unit_mm)
+        spacing = spacing_of(contact.profile_points(unit_mm))
+        elements = fibre_elements(t, v, d, ends.horizontals, presses, law.radius, spacing, law.length)
         ctx.inputs = (t, v, d, elements, presses, law)
         out = np.empty((len(presses), len(t)))
         looked_at = element_signals(t, v, elements, presses, law.radius, law.profile, out)
@@ -155,4 +173,4 @@ class MeasuredSignals(torch.autograd.Function):
         t, v, d, elements, presses, law = ctx.inputs
         up = np.ascontiguousarray(upstream[0].numpy().T)
         found = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
-        return (*torch.from_numpy(found), None, None, None)
+        return (*torch.from_numpy(found), None, None, None, None)

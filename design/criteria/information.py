@@ -90,7 +90,8 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     Two cells the pad cannot tell apart cost the same in both.
 
     Args:
-        noise: converter counts, > 0. side: cells a side, at least 2.
+        contact: what a press does to a fibre; the measured one if None. noise: converter counts, > 0.
+        side: cells a side, at least 2.
     """
     low, high = (np.array(corner) for corner in between_fibres(pad.layout))
     x, y = ((np.arange(side) + 0.5) / side * (high - low)[axis] + low[axis] for axis in (0, 1))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from design.common.computing import in_chunks
 from design.common.errors import InputError, instance, reals, whole
 from design.common.settings import or_default
-from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, press_shape
+from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, grid_unit_mm, press_shape
 from design.pad.kernels.published.information import published_terms as terms_kernel
 from design.pad.morphology import Morphology
 from design.settings import PUBLISHED_CONTACT, Contact, Counts, Layout, between_fibres
@@ -57,7 +57,7 @@ def published_terms(
         presses: (Q, 2) in an order of neighbours; the 49 published ones if None.
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
-        layout: of a population's fibres; as many horizontals as verticals, a unit apart, if None.
+        layout: of a population's fibres; as many horizontals as verticals, the default pitch apart, if None.
         levels: what signals are rounded up to whole ones of, 1 to 2^24.
     """
     alpha, beta, gamma = _weights(weights)
@@ -68,7 +68,8 @@ def published_terms(
         places = published_presses(layout or ends.horizontals).copy()  # not read-only: kernels would be compiled anew
     else:
         places = as_presses(presses)[0]
-    shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT))
+    contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
+    shape = press_shape(contact, grid_unit_mm(pads, layout))
     found = np.zeros((len(travel), 3))
 
     def work(begin: int, end: int) -> None:

@@ -45,8 +45,8 @@ def _signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
         return signals(pad, presses, contact)
     travel, cross, ends, _ = fibre_axes(pad)
     slope = population_slopes(travel, cross)[0]
-    law = press_shape(contact)[2]
-    spacing = spacing_of(contact.reach)
+    law = press_shape(contact, pad.unit_mm)[2]
+    spacing = spacing_of(contact.profile_points(pad.unit_mm))
     elements = fibre_elements(travel[0], cross[0], slope, ends.horizontals, presses, law.radius, spacing, law.length)
     out = np.empty((len(presses), len(slope)))
     element_signals(travel[0], cross[0], elements, presses, law.radius, law.profile, out)

@@ -12,6 +12,7 @@ from design.criteria.fibre_loss import lost_subsets
 from design.pad.contact import signals
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
+from design.settings import PUBLISHED_CONTACT
 
 from .levenberg_marquardt import LEARN, VALIDATE, ColumnScale, Network, first_weights
 from .localisation_error import Loss, PressSets
@@ -31,7 +32,7 @@ def trials() -> Iterator[harness.BenchTrial]:
     """
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
-            trial = PressSets.of(pad, 32, 2000, 0, partial(signals, pad))
+            trial = PressSets.of(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
             losses = lost_subsets(len(pad.knots), LOST, SETS)
             judge = partial(_judge, trial, losses)
             yield harness.BenchTrial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)

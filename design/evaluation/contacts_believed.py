@@ -14,8 +14,8 @@ from design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, Sensed
 
 from .localisation_error import LossError, PressSets
 
-WIDTHS = (0.45, 0.55, 0.7)
-"""Standard deviations of the reaches, about Gaussian, that a press may have, grid units."""
+WIDTHS = (5.0, 6.2, 7.9)
+"""Standard deviations of the reaches, about Gaussian, that a press may have, mm; that of MEASURED_REACH second."""
 NOISE = 0.02
 """Of a signal, share of full scale: what all readings of a press leave of the scatter of a built pad's responses."""
 SIDE, TEST, HIDDEN = 24, 500, 50
@@ -36,7 +36,7 @@ class ContactErrors:
 def contacts_in_question(believed: Contact) -> dict[str, Contact]:
     """The contact believed and others that a pad may really meet, by what they are called; none twice."""
     spread = [(width, tuple((width / WIDTHS[1] * d, weight) for d, weight in MEASURED_REACH)) for width in WIDTHS]
-    others = {f"reach of {width:g} grid units": Contact(reach=reach) for width, reach in spread}
+    others = {f"reach of {width:g} mm": Contact(reach=reach) for width, reach in spread}
     others["published disc, K = 0.6"] = PUBLISHED_CONTACT
     return {"as believed": believed} | {name: other for name, other in others.items() if other != believed}
 

@@ -262,9 +262,7 @@ def _bound(z: Tensor, responses: Tensor, step: Tensor, free: Tensor, masks: Tens
     shared = torch.einsum("lk,qk,qki->lqi", masks, gain, rates)
     total = 1 + torch.einsum("lk,qk->lq", masks, gain**2)
     # (1 + u u')^-1 = 1 - u u' / (1 + u'u)
-    xx, yy, xy = (
-        information[..., i, j] - shared[..., i] * shared[..., j] / total for i, j in ((0, 0), (1, 1), (0, 1))
-    )
+    xx, yy, xy = (information[..., i, j] - shared[..., i] * shared[..., j] / total for i, j in ((0, 0), (1, 1), (0, 1)))
     prior_x, prior_y = 12 / (step * math.isqrt(z.shape[1])) ** 2
     # at a faint scatter the first difference cancels where one direction alone is told, and the prior must not with it
     volume = (xx * yy - xy**2).clamp(min=0) + prior_x * yy + prior_y * xx + prior_x * prior_y

@@ -6,6 +6,8 @@ them to the same bits, so that it can run in slices on any thread or machine and
 
 import json
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,6 @@ from design.evaluation.expected_error import (
 from design.pad.contact import boustrophedon
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import Contact
 
 from .parametrization import Fibres, border_of, first_course
 from .problem import SearchProblem
@@ -184,10 +185,18 @@ class GradientSearch:
         masks, scatter = masks.float(), search.response_scatter.scaled(louder)
         total = torch.zeros((), device=search.device)
         for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
+            signals_at = partial(
+                press_signals,
+                *(travel, cross, slope),
+                contact=contact,
+                ends=self.fibres.ends,
+                unit_mm=pad.layout.unit_mm,
+            )
 
-            def responses(positions: Array, contact: Contact = contact, scale: float = scale) -> Tensor:
-                stretch = press_signals(travel, cross, slope, positions, contact, self.fibres.ends) / length
-                return (stretch / scale).float().to(search.device)
+            def responses(
+                positions: Array, signals_at: Callable[[Array], Tensor] = signals_at, scale: float = scale
+            ) -> Tensor:
+                return (signals_at(positions) / (scale * length)).float().to(search.device)
 
             with torch.no_grad():
                 partners = confusable(responses(presses.positions), responses(presses.far), masks, scatter)
@@ -195,7 +204,8 @@ class GradientSearch:
             given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
             total = total + over_losses(expected_error(*given), masks, shares)
             if search.sharpness > 0:
-                total = total + search.sharpness * sharpness(responses(boustrophedon(pad.sensed, SEARCHED)))
+                in_order = signals_at(boustrophedon(pad.sensed, SEARCHED))
+                total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
 
     def _broken(self) -> bool:

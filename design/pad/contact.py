@@ -16,7 +16,7 @@ from design.pad.kernels import press
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.published.sampled_signals import quantized_signals
-from design.settings import PUBLISHED_CONTACT, Contact, Layout, Rectangle
+from design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
 from .courses.curves import lengths
 from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes, kernel_ends, layout_of
@@ -29,6 +29,7 @@ MOST_SAMPLES = 2**20
 """Most points a fibre is sampled at."""
 _WEIGHTS = {"uniform": press.UNIFORM, "inverse_square": press.INVERSE_SQUARE, "inverse": press.INVERSE}
 _LENGTHS = {"manhattan": press.MANHATTAN, "euclidean": press.EUCLIDEAN}
+PressShape = tuple[tuple[Array, Array], Array, press.Law]
 
 
 def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None) -> Array:
@@ -37,10 +38,11 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     The boundary belongs to the press: a straight fibre that runs along an edge counts with its whole length there.
 
     Args:
-        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M.
+        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M, whose grid unit is the
+            default pitch, 11.25 mm.
         presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, whose signals add; where their
             shapes overlap a fibre counts once for each.
-        contact: shape, weight and length; PUBLISHED_CONTACT if None.
+        contact: what a press does to a fibre; the measured one, `Contact()`, if None.
 
     Returns:
         (Q, F) signals, or (..., Q, F) for a population; with the default weight and length in grid units. Uniform
@@ -49,7 +51,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     Raises:
         InputError: presses of the wrong shape or not finite.
     """
-    return signals_and_spans(pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT))[0]
+    return signals_and_spans(pad, presses, or_default("contact", contact, Contact))[0]
 
 
 def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
@@ -76,7 +78,7 @@ def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Cont
     fibres = travel.shape[1]
     require_room(len(travel) * len(flat) * fibres)
     out = np.zeros(len(travel) * len(flat) * fibres)
-    visited = _run_exact(travel, cross, ends, flat, contact, _NONE, _NONE, out)
+    visited = _run_exact(travel, cross, ends, flat, press_shape(contact, grid_unit_mm(pad)), _NONE, _NONE, out)
     return _summed(out, (*batch, *places, fibres)), visited
 
 
@@ -100,13 +102,14 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     """
     from scipy.sparse import csr_array
 
-    contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
+    contact = or_default("contact", contact, Contact)
     travel, cross, ends, _ = fibre_axes(instance("pad", pad, Morphology))
     places, strays = as_presses(presses)[0], press.family_strays(cross, ends)
-    starts = press.count_touched(strays[0], places, press_shape(contact)[1], ends)
+    shape = press_shape(contact, pad.unit_mm)
+    starts = press.count_touched(strays[0], places, shape[1], ends)
     require_room(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
-    _run_exact(travel, cross, ends, places, contact, starts, fibre, signal)
+    _run_exact(travel, cross, ends, places, shape, starts, fibre, signal)
     found = csr_array((signal, fibre, starts), shape=(len(places), len(pad.knots)))
     found.eliminate_zeros()
     return found
@@ -120,13 +123,13 @@ def _run_exact(
     cross: Array,
     ends: press.Ends,
     places: Array,
-    contact: Contact,
+    shape: PressShape,
     starts: Ints,
     fibre: Ints,
     out: Array,
 ) -> int:
     """`exact_signals` over the cores."""
-    slope, shape, strays = population_slopes(travel, cross), press_shape(contact), press.family_strays(cross, ends)
+    slope, strays = population_slopes(travel, cross), press.family_strays(cross, ends)
 
     def work(begin: int, end: int) -> int:
         return exact_signals(travel, cross, slope, strays, ends, places, *shape, begin, end, starts, fibre, out)
@@ -169,11 +172,26 @@ def fibre_axes(
     return travel, cross, ends, knots.shape[:-3]
 
 
-def press_shape(contact: Contact) -> tuple[tuple[Array, Array], Array, press.Law]:
-    """A contact as the kernels take it: chains and extents in the frame of each family, and the law of its weight."""
+def grid_unit_mm(pad: Morphology | Array, layout: Layout | None = None) -> float:
+    """Return the grid unit of a pad or of knots, mm: the default pitch where no layout says another."""
+    layout = pad.layout if isinstance(pad, Morphology) else layout
+    return layout.unit_mm if layout else DEFAULT_PITCH_MM
+
+
+def press_shape(contact: Contact, unit_mm: float) -> PressShape:
+    """Return a contact as the kernels take it, in grid units.
+
+    Args:
+        contact: what a press does to a fibre.
+        unit_mm: the pad's grid unit, mm.
+
+    Returns:
+        Chains and extents in the frame of each family, and the law of its weight.
+    """
     length = _LENGTHS[contact.length]
     if contact.reach:
-        end, profile = contact.reach[-1][0], press.profile_of(contact.reach)
+        points = contact.profile_points(unit_mm)
+        end, profile = points[-1][0], press.profile_of(points)
         return *press.frames(end, None), press.Law(end, press.PROFILE, length, profile)
     return *press.frames(contact.radius, contact.sides), press.Law(contact.radius, _WEIGHTS[contact.weight], length)
 
@@ -184,7 +202,7 @@ def signals_quantized(
     """Signals by the published rule: segments of a sampled fibre count whole if they start inside the press.
 
     Args:
-        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M.
+        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M, as in `signals`.
         presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, as in `signals`.
         contact: shape and weight; PUBLISHED_CONTACT if None.
         samples: points per fibre, uniform along the travel axis, at least 2 (published: 2000).
@@ -202,8 +220,8 @@ def quantized_and_samples(
     pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int
 ) -> tuple[Array, int]:
     """`signals_quantized`, and the number of samples that were looked at for them."""
-    shape = press_shape(contact)
     travel, cross, ends, batch = fibre_axes(pad)
+    shape = press_shape(contact, grid_unit_mm(pad))
     samples = as_samples(samples, travel.shape[1])
     places, shape_of_presses = as_presses(presses, several=True)
     require_room(len(travel) * len(places) * travel.shape[1])

@@ -178,10 +178,9 @@ class Twin:
         mapping("provenance", self.provenance)
         self.contact()
 
-    def contact(self, unit_mm: float | None = None) -> Contact:
-        """The measured contact, on a pad of that grid unit; of the twin's own if None."""
-        unit_mm = self.morphology.unit_mm if unit_mm is None else real("unit_mm", unit_mm, 1e-3, MOST_MM)
-        points = zip((self.distance_mm / unit_mm).tolist(), self.weight.tolist(), strict=True)
+    def contact(self) -> Contact:
+        """The measured contact."""
+        points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
         return Contact(reach=tuple(points), length="euclidean")
 
     def laid_signals(self, places_mm: ArrayLike) -> Array:
@@ -192,7 +191,7 @@ class Twin:
         if (pressed_mm := reals("places_mm", places_mm, MOST_MM)).shape[1:] != (2,):
             raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
         places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
-        reach = self.contact().reach
+        reach = self.contact().profile_points(self.morphology.unit_mm)
         profiles = [profile_of(reach)]
         if self.angle_weight is not None:
             points = zip((d for d, _ in reach), self.angle_weight.tolist(), strict=True)

@@ -67,7 +67,7 @@ def draw_plan(
 
 
 def _contact_shape(contact: Contact, unit_mm: float) -> Circle | Polygon:
-    radius = (_half_width(contact.reach) if contact.reach else contact.radius) * unit_mm
+    radius = _half_width(contact.reach) if contact.reach else contact.radius * unit_mm
     if contact.reach or contact.sides is None:
         return Circle((0, 0), radius, color=INK, alpha=0.15, linewidth=0)
     angle = 2 * np.pi * np.arange(contact.sides) / contact.sides
@@ -75,7 +75,7 @@ def _contact_shape(contact: Contact, unit_mm: float) -> Circle | Polygon:
 
 
 def _half_width(reach: Sequence[tuple[float, float]]) -> float:
-    """The greatest distance at which a measured weight is half of its largest, along straight lines, grid units."""
+    """The greatest distance at which a measured weight is half of its largest, along straight lines, mm."""
     distance, weight = np.abs(np.array(reach)).T
     half = weight.max() / 2
     last = int(np.flatnonzero(weight >= half)[-1])  # the last point of all is 0

@@ -43,7 +43,7 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
     return spec.replaced(
         {
             "pad": stated | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
-            "contact": twin.contact(size.unit_mm).model_dump(),
+            "contact": twin.contact().model_dump(),
             "search": {**SEARCH, **given, "noise": _noise(twin)},
         }
     )

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from design.common.settings import Settings
 
 from .contact import MEASURED_REACH, PUBLISHED_CONTACT, Contact
-from .layout import MOST_FIBRES, Counts, Layout, Pitch
+from .layout import DEFAULT_PITCH_MM, MOST_FIBRES, Counts, Layout, Pitch
 from .pad import PadSettings, Polygon, Rectangle, Sensed, between_fibres, sensed_rectangle
 from .rules import RulesSettings
 from .search import Lost, Scatter, SearchSettings
@@ -19,6 +19,7 @@ PUBLISHED: Mapping[str, Settings] = {
 """The world of the paper, by section, as far as it is another than the default."""
 
 __all__ = [
+    "DEFAULT_PITCH_MM",
     "MEASURED_REACH",
     "MOST_FIBRES",
     "PUBLISHED",

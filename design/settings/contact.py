@@ -1,21 +1,28 @@
 """`[contact]`: what a press does to a fibre."""
 
+import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from design.common.settings import Settings, as_tuple, none_as
+from design.common.settings import Settings, as_python, as_tuple, none_as
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *none_as("circle")]
 
 
 MEASURED_REACH = (
-    *((0.0, 1.0), (0.2, 0.936), (0.4, 0.768), (0.6, 0.551), (0.8, 0.346)),
-    *((1.0, 0.188), (1.2, 0.085), (1.4, 0.029), (1.65, 0.0)),
+    *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
+    *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
 )
-"""How the built pad answers: about a Gaussian of standard deviation 0.55, with a smooth end in place of its tails."""
+"""How the built pad answers: about a Gaussian of standard deviation 6.2 mm, with a smooth end in place of its tails."""
+MAX_OVERSHOOT = 0.15
+"""By which a spline may leave the range of the two points it runs between, share of the largest weight: smooth profiles
+stay far below it, one that leaves its points would count for what nobody has measured."""
 
 Point = tuple[Annotated[float, Field(ge=0, le=1e4)], Annotated[float, Field(ge=-1e3, le=1e3)]]
 
@@ -30,7 +37,8 @@ class Contact(Settings):
 
     The signal of a fibre is the integral of a weight over its length: that of `reach` by distance d to the press
     centre; or, where `reach` is empty, `weight` inside a regular polygon or circle (paper, formulas (1), (2)), which is
-    meant as well where `radius`, `sides` or `weight` are given and `reach` is not. Lengths are in grid units.
+    meant as well where `radius`, `sides` or `weight` are given and `reach` is not. Shapes are in grid units, as
+    published; a press that was measured is as wide in mm on pads of any pitch.
 
     Attributes:
         radius: circumradius K of the shape, > 0.
@@ -39,8 +47,9 @@ class Contact(Settings):
             paper's 1 / d kept finite within a hundredth of the radius).
         length: "manhattan" (|dx| + |dy|, as the published code has it, and the default of shapes) or "euclidean", the
             default of a reach.
-        reach: points (distance, weight) from distance 0 to where the weight is 0 and stays so, joined by a cubic spline
-            over d^2. A weight may be below 0. MEASURED_REACH if nothing of the contact is given.
+        reach: points (distance in mm, weight) from distance 0 to where the weight is 0 and stays so, joined by a cubic
+            spline over d^2, which may leave their range by MAX_OVERSHOOT. A weight may be below 0. MEASURED_REACH if
+            nothing of the contact is given.
     """
 
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, where reach is []")
@@ -52,13 +61,14 @@ class Contact(Settings):
         default="euclidean", description="length of a fibre element: euclidean, or |dx| + |dy| as published"
     )
     reach: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
-        default=MEASURED_REACH, description="measured weight by distance, [[0, 1], ..., [d, 0]]; [] for a shape"
+        default=MEASURED_REACH, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]]; [] for a shape"
     )
 
     @model_validator(mode="before")
     @classmethod
     def _of_one_kind(cls, given: object) -> object:
         """What is left out, by what is given: a shape as published, or a reach."""
+        given = as_python(given)  # `Settings` does so later, and an array says not whether it is empty
         if not isinstance(given, Mapping):
             return given
         reach = given.get("reach", () if _SHAPE & given.keys() else MEASURED_REACH)
@@ -78,7 +88,50 @@ class Contact(Settings):
             raise ValueError("it must be of 3 points or more, whose distances ascend from 0")
         if weights[-1] != 0 or not any(weights):
             raise ValueError("the last weight must be 0, and some other one not")
+        if reach != MEASURED_REACH:  # so that the default needs no SciPy, which takes a while to load
+            _check_overshoot(reach)
         return reach
+
+    def profile_points(self, unit_mm: float) -> tuple[Point, ...]:
+        """Return the measured profile as the kernels take it, on a pad of some grid unit.
+
+        Args:
+            unit_mm: the pad's grid unit, mm.
+
+        Returns:
+            Points (distance in grid units, weight) of `reach`.
+        """
+        return tuple((distance_mm / unit_mm, weight) for distance_mm, weight in self.reach)
+
+
+def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":
+    """Fit the cubic spline of a measured profile over the squared distance, so that it is smooth at the centre as well.
+
+    It meets 0 without a kink at its end.
+
+    Args:
+        points: (distance, weight), the last of weight 0.
+    """
+    import numpy as np  # settings alone take none
+    from scipy.interpolate import CubicSpline
+
+    distance, weight = np.array(points).T
+    return CubicSpline(distance**2, weight, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
+
+
+def _check_overshoot(points: tuple[Point, ...]) -> None:
+    """Refuse points between which their spline swings far beyond them."""
+    spline = profile_spline(points)
+    slack = MAX_OVERSHOOT * max(abs(weight) for _, weight in points)
+    extremes = [square for square in spline.derivative().roots(extrapolate=False).tolist() if math.isfinite(square)]
+    for (begin, first), (end, second) in pairwise(points):
+        low, high = min(first, second) - slack, max(first, second) + slack
+        for weight in (float(spline(square)) for square in extremes if begin**2 < square < end**2):
+            if not low <= weight <= high:
+                raise ValueError(
+                    f"between the points at {begin:g} and {end:g} mm their spline comes to {weight:.3g}, "
+                    f"allowed is {low:.3g} to {high:.3g}; points closer together keep it there"
+                )
 
 
 _SHAPE = {"radius", "sides", "weight"}

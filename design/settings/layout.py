@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+DEFAULT_PITCH_MM = 11.25
+"""Of the built pad."""
 MOST_FIBRES = 1024
 """Most fibres of a family, of a pad that is made of tiles too."""
 
@@ -52,7 +54,7 @@ class Layout:
             raise InputError("a pad of 0 horizontals and 0 verticals has no fibre, allowed is 1 or more in all")
 
     @classmethod
-    def of(cls, fibres: "Counts | Layout", pitch_mm: Pitch = 11.25) -> "Layout":
+    def of(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
         """From what is short: M or (H, V), and one pitch or (along x, along y); a layout is itself.
 
         Raises:

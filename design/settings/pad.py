@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, mo
 
 from design.common.settings import Settings, as_tuple, none_as
 
-from .layout import Layout
+from .layout import DEFAULT_PITCH_MM, Layout
 
 Millimetres = Annotated[float, Field(gt=0, le=1e6)]
 Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
@@ -77,7 +77,8 @@ class PadSettings(Settings):
     """`[pad]`: what the pad is, and which part of it is pressed.
 
     Attributes:
-        horizontals, verticals: of either family, where `grid` says nothing of it; 0 leaves it out. None: as `grid`.
+        horizontals, verticals: of either family, where `grid` says nothing of it; None: as `grid`. 0 leaves it out: the
+            pad is then a strip one pitch wide, and the fibres of the other family run across it, one pitch long.
         pitch_mm: of neighbouring fibre ends, both ways, or (along x, along y).
         leads: "one side": the lower edge, as a connector wants; they come down beside the pad, nested.
         sensed_mm: (width, height), at most the pad's own; "beyond": half a pitch beyond the outermost fibres, or
@@ -90,10 +91,16 @@ class PadSettings(Settings):
     MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), where the next two do not say")
-    horizontals: Count = Field(default=None, description='fibres that run along x, 0 for none, or as "grid"')
-    verticals: Count = Field(default=None, description='fibres that run along y, 0 for none, or as "grid"')
+    horizontals: Count = Field(
+        default=None,
+        description='fibres along x, or as "grid"; 0: a strip along x, its fibres run across, one pitch long',
+    )
+    verticals: Count = Field(
+        default=None,
+        description='fibres along y, or as "grid"; 0: a strip along y, its fibres run across, one pitch long',
+    )
     pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_pitches)] = Field(
-        default=11.25, description="distance of neighbouring fibre ends, mm, or [along x, along y]"
+        default=DEFAULT_PITCH_MM, description="distance of neighbouring fibre ends, mm, or [along x, along y]"
     )
     deep_family: Literal["horizontal", "vertical"] = Field(
         default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"

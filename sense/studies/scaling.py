@@ -23,7 +23,7 @@ from design.evaluation.levenberg_marquardt import fit
 from design.evaluation.localisation_error import fresh_presses, training_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
-from design.settings import Rectangle, between_fibres
+from design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from sense.recordings.processing.limits import Array
 
 from .pads import described
@@ -123,7 +123,7 @@ def _found(tile: Morphology, grid: int, way: str, side: int, seed: int) -> State
 
     def given(places: Array) -> tuple[Array, Array]:
         """Inputs of the network, and the places (Q, 2) its outputs count from."""
-        found = signals(pad, places)
+        found = signals(pad, places, PUBLISHED_CONTACT)
         if way == SHARED:
             return around(found, tile.grid)
         return found if way == PUBLISHED else shares(found), np.zeros((len(places), 2))

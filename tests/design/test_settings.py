@@ -1,5 +1,6 @@
 """`pad.toml`: defaults, comments, refusals."""
 
+import re
 import tomllib
 
 import numpy as np
@@ -244,22 +245,100 @@ def test_a_shape_beside_a_reach_is_refused_since_it_would_change_nothing(shape):
     assert Spec({"contact": stated | shape | {"reach": []}}).section(Contact).reach == ()
 
 
+def test_the_measured_profile_is_in_mm_and_in_grid_units_of_the_built_pad_in_fifths():
+    distance = [d for d, _ in Contact().profile_points(11.25)]
+    assert distance == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.65]  # to the bit
+    assert [d for d, _ in Contact().profile_points(5.0)] == [d / 5 for d, _ in MEASURED_REACH]
+
+
 def test_the_measured_reach_is_about_a_gaussian():
-    distance = np.linspace(0, 2, 400)
+    distance = np.linspace(0, 22, 400)
     weight = profile_weights(profile_of(MEASURED_REACH), MEASURED_REACH[-1][0], distance)
-    np.testing.assert_allclose(weight, np.exp(-(distance**2) / (2 * 0.55**2)), atol=0.015)
+    np.testing.assert_allclose(weight, np.exp(-(distance**2) / (2 * 6.2**2)), atol=0.015)
     assert (np.diff(weight) <= 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (
+            [[0, 1], [0.5, 0.8], [0.51, 0.6], [1.2, 0]],
+            "between the points at 0 and 0.5 mm their spline comes to 1.77, allowed is 0.65 to 1.15",
+        ),
+        ([[0, 10], [9, 10], [10, 0]], "between the points at 0 and 9 mm their spline comes to 20.5, allowed is 8.5"),
+        ([[0, -1], [0.2, 1], [1, 0]], "between the points at 0.2 and 1 mm their spline comes to 7.48, allowed is"),
+    ],
+)
+def test_a_profile_whose_spline_leaves_its_points_is_refused(points, message):
+    with pytest.raises(InputError, match=rf"^pad\.toml: \[contact\] reach: got .*{re.escape(message)}") as refused:
+        Spec({"contact": {"reach": points}}, "pad.toml").section(Contact)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("points", [5, 7, 13, 40])
+@pytest.mark.parametrize("skirt", [0.0, 0.05, 0.3])
+def test_a_smooth_profile_with_a_skirt_below_0_is_a_contact(points, skirt):
+    distance = np.linspace(0, 18, points)
+    weight = np.exp(-0.5 * (distance / 5) ** 2) - skirt * np.exp(-0.5 * ((distance - 13) / 2.5) ** 2)
+    reach = np.column_stack([distance, np.append(weight[:-1], 0)]).tolist()
+    assert len(Contact(reach=reach).reach) == points
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "plain"),
+    [
+        (PadSettings, {"grid": np.int64(3)}, {"grid": 3}),
+        (
+            PadSettings,
+            {"pitch_mm": np.array([8, 15.0]), "horizontals": np.uint8(0)},
+            {"pitch_mm": (8, 15.0), "horizontals": 0},
+        ),
+        (
+            PadSettings,
+            {"keep_out_mm": [np.array([[0, 0], [4, 0], [0, 4]])]},
+            {"keep_out_mm": [[[0, 0], [4, 0], [0, 4]]]},
+        ),
+        (Contact, {"radius": np.float64(0.9), "sides": np.int32(4)}, {"radius": 0.9, "sides": 4}),
+        (Contact, {"reach": np.array([[0, 1], [5, 0.5], [12, 0]])}, {"reach": ((0, 1), (5, 0.5), (12, 0))}),
+        (SearchSettings, {"lost": np.array([0.5, 0.5]), "seed": np.uint32(7)}, {"lost": (0.5, 0.5), "seed": 7}),
+        (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
+        (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
+    ],
+)
+def test_numbers_of_numpy_are_numbers(model, given, plain):
+    assert model(**given) == Spec({}).section(model, **given) == model(**plain)
+    assert model(**given).model_dump_json() == model(**plain).model_dump_json()
+
+
+@pytest.mark.parametrize(
+    "grid", [np.float64(4), np.int64(0), np.array([4]), np.bool_(True), np.datetime64("2026-01-01")]
+)
+def test_values_of_numpy_that_are_no_such_number_are_refused_as_pythons_are(grid):
+    with pytest.raises(InputError, match=r"^\[pad\] grid: got "):
+        PadSettings(grid=grid)
+
+
+def test_a_list_that_holds_itself_is_refused():
+    endless = []
+    endless.append(endless)
+    with pytest.raises(InputError, match=r"\[pad\] keep_out_mm"):
+        PadSettings(keep_out_mm=endless)
 
 
 def test_functions_that_restate_the_paper_have_its_contact_by_default():
     pad, presses = Morphology.random(2, 3, seed=0), [[1.2, 1.7], [2.0, 0.8]]
-    for function in (signals, signals_quantized):
-        np.testing.assert_array_equal(function(pad, presses), function(pad, presses, PUBLISHED_CONTACT))
-    np.testing.assert_array_equal(signals_sparse(pad, presses).toarray(), signals(pad, presses))
+    np.testing.assert_array_equal(signals_quantized(pad, presses), signals_quantized(pad, presses, PUBLISHED_CONTACT))
     assert published_objective(pad) == published_objective(pad, PUBLISHED_CONTACT)
-    assert information(pad) == information(pad, PUBLISHED_CONTACT) != information(pad, Contact())
     few = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
     assert localisation_error(pad, **few) == localisation_error(pad, PUBLISHED_CONTACT, **few)
+
+
+def test_signals_have_the_measured_contact_by_default_as_scores_have():
+    pad, presses = Morphology.random(2, 3, seed=0), [[1.2, 1.7], [2.0, 0.8]]
+    measured = signals(pad, presses, Contact())
+    np.testing.assert_array_equal(signals(pad, presses), measured)
+    np.testing.assert_array_equal(signals_sparse(pad, presses).toarray(), measured)
+    assert information(pad) == information(pad, Contact()) == score(pad, lost=0)["information"]
 
 
 def test_what_is_designed_for_unless_asked_is_measured_but_by_the_published_method():

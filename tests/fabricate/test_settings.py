@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 
 from design.common.errors import InputError
@@ -150,3 +151,8 @@ def test_the_defaults_are_those_the_pads_were_made_with():
 def test_settings_are_read_from_a_spec_and_nothing_else(other):
     with pytest.raises(InputError, match=r"spec is .*, expected a Spec"):
         FabricationSettings.from_spec(other)
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert MouldSettings(wall_mm=np.int64(3)) == MouldSettings(wall_mm=3)
+    assert PrinterSettings(bed_mm=np.array([200, 210, 220])) == PrinterSettings(bed_mm=[200, 210, 220])

@@ -1,5 +1,6 @@
 """`[rig]` and `[localizer]`: the defaults, and where their ranges end."""
 
+import numpy as np
 import pytest
 
 from design.common.errors import InputError
@@ -99,3 +100,9 @@ def test_inputs_that_do_not_fit_the_pad_are_one_line(channels: tuple[int, ...], 
 def test_channels_are_numbers_of_inputs(channels: object) -> None:
     with pytest.raises(InputError, match=r"^\[rig\] channels"):
         RigSettings(channels=channels)  # type: ignore[arg-type]
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    box_mm = np.array([[-30, 30], [-30, 30], [5, 60]]).ravel()
+    rig = RigSettings(presses=np.int64(50), noise_mv=np.float32(0.5), channels=np.arange(3), box_mm=box_mm)  # type: ignore[arg-type]
+    assert rig == RigSettings(presses=50, noise_mv=0.5, channels=(0, 1, 2), box_mm=(-30, 30, -30, 30, 5, 60))

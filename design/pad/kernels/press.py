@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from design.settings.contact import profile_spline
+
 from .pchip import piece_of
 
 Array = NDArray[np.float64]
@@ -66,15 +68,8 @@ def weigh(square: float, law: Any) -> float:
 
 @lru_cache(maxsize=64)
 def profile_of(reach: tuple[tuple[float, float], ...]) -> Array:
-    """The profile (B, 5) of `weigh` through points (distance, weight), the last of weight 0.
-
-    A cubic spline over the squared distance, so that it is smooth at the centre as well, which meets 0 without a kink
-    at its end.
-    """
-    from scipy.interpolate import CubicSpline
-
-    distance, weight = np.array(reach).T
-    spline = CubicSpline(distance**2, weight, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
+    """The profile (B, 5) of `weigh` through points (distance, weight), the last of weight 0: their `profile_spline`."""
+    spline = profile_spline(reach)
     return np.ascontiguousarray(np.column_stack([spline.x[:-1], spline.c[::-1].T]))  # one order: compiled once
 
 

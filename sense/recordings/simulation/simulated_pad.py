@@ -110,7 +110,7 @@ def measured_alike(pad: Morphology, twin: Twin, size: PadSettings | None = None)
     """
     gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live(twin)]).T
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
-    plan = planned(pad, twin.contact(pad.unit_mm), size)
+    plan = planned(pad, twin.contact(), size)
     noise_v = np.full(plan.channels, np.median(noises_v))
     return SimulatedPad(
         plan.channels,

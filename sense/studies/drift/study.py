@@ -19,7 +19,7 @@ from design.criteria.information import idle_share
 from design.evaluation.localisation_error import training_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
-from design.settings import between_fibres
+from design.settings import PUBLISHED_CONTACT, between_fibres
 from sense.localizer.calibration.calibration import split_presses
 from sense.localizer.evaluation import distances
 from sense.localizer.evaluation import idle_share as recorded_idle_share
@@ -250,7 +250,8 @@ def _conclude(
     results = iter(states)
     for label, kind in kinds.items():
         if label in pads:
-            touched = signals(pads[label], training_presses(between_fibres(pads[label].layout), SIDE, settings["seed"]))
+            places = training_presses(between_fibres(pads[label].layout), SIDE, settings["seed"])
+            touched = signals(pads[label], places, PUBLISHED_CONTACT)
             idle.append({"label": label, "kind": "contact model", "idle_percent": 100 * idle_share(touched)})
         for name in FILTERS:
             state = next(results)

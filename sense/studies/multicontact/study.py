@@ -12,7 +12,7 @@ from design.common.figures import CURVES, INK, draw_confusions, head, tidy
 from design.evaluation.localisation_error import fresh_presses
 from design.pad.contact import signals
 from design.pad.morphology import Morphology
-from design.settings import between_fibres
+from design.settings import PUBLISHED_CONTACT, between_fibres
 from sense.recordings.processing.limits import Array
 from sense.studies.indentation.force import COUNTS, readings
 from sense.studies.pads import described
@@ -80,7 +80,7 @@ def _located(
     """The test pairs as they were made, "pressed", and as networks find them, "found": (T, 2, 2), grid units."""
     rng = np.random.default_rng([5, seed])
     places = _drawn(pad, presses + test, 2, rng)
-    given = signals(pad, places)
+    given = signals(pad, places, PUBLISHED_CONTACT)
     find = learnt(way, given[:presses], places[:presses], rng, members, hidden, epochs)
     return {"pressed": places[presses:], "found": find(given[presses:])}
 
@@ -92,7 +92,7 @@ def _counted(pad: Morphology, presses: int, test: int, members: int, hidden: int
     rng = np.random.default_rng([6, seed])
     places = _drawn(pad, presses + test, MOST, rng)
     number = rng.integers(MOST + 1, size=presses + test)
-    alone = signals(pad, places.reshape(-1, 2)).reshape(*places.shape[:2], -1)
+    alone = signals(pad, places.reshape(-1, 2), PUBLISHED_CONTACT).reshape(*places.shape[:2], -1)
     signalled = (alone * (np.arange(MOST) < number[:, None])[:, :, None]).sum(axis=1)
     read = readings(signalled, signalled[:presses].max(axis=0), NOISE_COUNTS, rng)
     networks = fit_many(read[:presses], np.eye(MOST + 1)[number[:presses]], rng.spawn(members), hidden, epochs)

@@ -79,7 +79,7 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(tmp_path, monkeypatch, 
     scored = CliRunner().invoke(design, ["score", "out/pad/morphology.json", "--twin", str(twin)])
     assert json.loads(scored.output)["terms"] == pytest.approx(document["terms"], rel=1e-9)
     wider = designed("--twin", twin, spec=QUICK_TWIN + "[pad]\npitch_mm = 20.0\n")[1]["provenance"]["settings"]
-    assert wider["contact"]["reach"][-1] == [0.75, 0]
+    assert wider["contact"]["reach"][-1] == [15, 0]
     assert (wider["pad"]["pitch_mm"], wider["pad"]["sensed_mm"]) == (20, [18, 31.5])
 
 

@@ -19,7 +19,7 @@ from design.criteria.information import (
 )
 from design.criteria.published_objective import published_presses, published_terms
 from design.pad.contact import boustrophedon
-from design.settings import Layout, between_fibres
+from design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 BETWEEN = between_fibres(Layout.of(4))
 
@@ -110,7 +110,9 @@ def test_disorder_area_of_a_known_bump():
 def test_idle_share_of_the_published_pads(published, name, share):
     """Table III of the paper: 70 % and 57 % in simulation."""
     places = boustrophedon(BETWEEN, 32, 5 / 49)
-    assert idle_share(signals(Morphology.load(published / f"{name}.mat"), places)) == pytest.approx(share, abs=0.01)
+    assert idle_share(signals(Morphology.load(published / f"{name}.mat"), places, PUBLISHED_CONTACT)) == pytest.approx(
+        share, abs=0.01
+    )
 
 
 def test_idle_share_counts_changes_within_the_threshold():

@@ -15,6 +15,7 @@ from design.settings import PUBLISHED_CONTACT, PadSettings
         (Morphology.straight(4), Contact()),
         (Morphology.random(4, 5, 1), Contact()),
         (Morphology.random((2, 5), 3, 2, (8.0, 13.0)), PUBLISHED_CONTACT),
+        (Morphology.random((2, 5), 3, 2, (8.0, 5.0)), Contact()),
         (Morphology.straight((1, 0)), Contact()),
     ],
 )

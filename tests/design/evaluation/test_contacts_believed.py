@@ -15,10 +15,10 @@ def test_the_contact_believed_comes_first_and_none_twice() -> None:
         assert next(iter(contacts.items())) == ("as believed", believed)
         assert len({contact.model_dump_json() for contact in contacts.values()}) == len(contacts)
     assert list(contacts_in_question(Contact(radius=0.9)))[1:] == [
-        *("reach of 0.45 grid units", "reach of 0.55 grid units", "reach of 0.7 grid units"),
+        *("reach of 5 mm", "reach of 6.2 mm", "reach of 7.9 mm"),
         "published disc, K = 0.6",
     ]
-    assert "reach of 0.55 grid units" not in contacts_in_question(Contact())
+    assert "reach of 6.2 mm" not in contacts_in_question(Contact())
     assert "published disc, K = 0.6" not in contacts_in_question(PUBLISHED_CONTACT)
 
 

@@ -136,7 +136,7 @@ def test_single_precision_serves():
 
 def test_a_pad_errs_more_the_more_fibres_are_lost_and_the_louder_they_are():
     pad = Morphology.straight(3)
-    wide = Contact(reach=((0, 1), (0.5, 0.66), (1.0, 0.19), (1.65, 0)), length="euclidean")
+    wide = Contact(reach=((0, 1), (5.6, 0.66), (11.2, 0.19), (18.6, 0)), length="euclidean")
     quiet, loud = (expected_errors(pad, wide, 2, noise, PadSettings(grid=3)) for noise in (0.01, 0.05))
     assert quiet == sorted(quiet)
     assert np.all(np.array(loud) > quiet)

@@ -209,7 +209,7 @@ def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
         SMALL.model_copy(update={"steps": 1, "starts": 1, "generations": 1, "noise": 0.11}),
     )
     monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [worse])
-    contact = Contact(reach=((0, 1), (0.5, 0.7), (1, 0.2), (1.6, 0)), length="manhattan")
+    contact = Contact(reach=((0, 1), (5.6, 0.7), (11.2, 0.2), (18, 0)), length="manhattan")
     plain = expected_errors(straight, contact, quick.lost, quick.noise, PadSettings())
     assert np.all(np.array(plain) < expected_errors(worse, contact, quick.lost, quick.noise, PadSettings()))
     found = search(contact=contact, settings=quick, rules=free)

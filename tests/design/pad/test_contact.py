@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from scipy.interpolate import PchipInterpolator
 
-from design import Contact, InputError, Morphology, signals_quantized
+from design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
+from design.criteria.published_objective import published_terms
 from design.pad.contact import boustrophedon
-from design.settings import PUBLISHED_CONTACT, Layout, between_fibres
+from design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout, between_fibres
 
 SETS = [
     ("1para", PUBLISHED_CONTACT),
@@ -27,6 +28,34 @@ def test_quantized_signals_are_the_published_samples(published, name, contact):
     pad = Morphology.load(published / f"{name}.mat")
     found = signals_quantized(pad, content["loc_all"], contact)
     np.testing.assert_allclose(found, content["sens_raw_all"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pitch_mm", [4.0, 11.25, 25.0, (100.0, 8.0), (8.0, 100.0)])
+def test_a_measured_press_is_as_wide_in_mm_on_pads_of_any_pitch(pitch_mm):
+    """A straight fibre right under it signals the integral of a Gaussian of 6.2 mm, one beside it the lesser."""
+    pad = Morphology.straight(9, pitch_mm)
+    for offset_mm in (0.0, 4.0):
+        press = pad.to_grid([[offset_mm, offset_mm]])
+        expected_mm = np.sqrt(2 * np.pi) * 6.2 * np.exp(-0.5 * (offset_mm / 6.2) ** 2)
+        for found in (
+            signals(pad, press),
+            signals_sparse(pad, press).toarray(),
+            signals_quantized(pad, press, Contact(), 20_001),
+        ):
+            assert pad.unit_mm * found[0, [4, 13]] == pytest.approx(np.full(2, expected_mm), rel=0.02)
+
+
+def test_knots_without_a_pitch_are_of_the_default_one():
+    pad, presses = Morphology.random(3, 4, seed=0), np.random.default_rng(0).uniform(0, 4, (20, 2))
+    assert pad.pitch_mm == DEFAULT_PITCH_MM
+    np.testing.assert_array_equal(signals(pad.knots, presses), signals(pad, presses))
+    other = Morphology(pad.knots, 5.0)
+    assert not np.allclose(signals(other, presses), signals(pad, presses), atol=0.1)
+
+
+def test_a_population_has_the_grid_unit_of_its_layout():
+    pad = Morphology.random((3, 2), 4, seed=0, pitch_mm=(5.0, 8.0))
+    assert published_terms(pad.knots[None], Contact(), layout=pad.layout) == published_terms(pad, Contact())
 
 
 def oracle(pad, presses, contact, samples):
@@ -85,8 +114,8 @@ def test_a_population_is_its_members_one_by_one():
     presses = boustrophedon(between_fibres(Layout.of(3)), 5, 0.1)
     batch = signals_quantized(np.stack([pad.knots for pad in pads]), presses)
     assert batch.shape == (4, 25, 6)
-    for pad, signals in zip(pads, batch, strict=True):
-        np.testing.assert_array_equal(signals, signals_quantized(pad, presses))
+    for pad, found in zip(pads, batch, strict=True):
+        np.testing.assert_array_equal(found, signals_quantized(pad, presses))
 
 
 def test_no_presses_give_no_signals_and_far_presses_none_either():

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from design import InputError, Morphology, signals
 from design.pad.knots import assemble
+from design.settings import PUBLISHED_CONTACT
 
 
 @given(grid=st.integers(1, 5), knots=st.integers(0, 6), seed=st.integers(0, 2**32 - 1))
@@ -125,8 +126,8 @@ def test_a_pad_repeated_as_tiles_answers_alike_in_each_of_them():
     pad = tile.tiled(4)
     assert (pad.grid, pad.pitch_mm) == (12, 5.0)
     places = np.random.default_rng(0).uniform(3.6, 6.4, (50, 2))
-    answers = signals(pad, places).reshape(50, 2, 4, 3)
-    moved = signals(pad, places + np.array([3, 0])).reshape(50, 2, 4, 3)
+    answers = signals(pad, places, PUBLISHED_CONTACT).reshape(50, 2, 4, 3)
+    moved = signals(pad, places + np.array([3, 0]), PUBLISHED_CONTACT).reshape(50, 2, 4, 3)
     # One tile to the right: the same horizontals, the verticals of the next tile.
     np.testing.assert_allclose(moved[:, 0], answers[:, 0], atol=1e-9)
     np.testing.assert_allclose(moved[:, 1, 1:], answers[:, 1, :-1], atol=1e-9)

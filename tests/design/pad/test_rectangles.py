@@ -104,7 +104,8 @@ def test_the_gradient_on_a_rectangle_is_that_of_finite_differences(contact, pad,
 
     def value(across):
         there = torch.tensor(travel[0])
-        return (upstream * press_signals(there, across, pchip_slopes(there, across), places, contact, ends)).sum()
+        slope = pchip_slopes(there, across)
+        return (upstream * press_signals(there, across, slope, places, contact, ends, pad.unit_mm)).sum()
 
     across = torch.tensor(cross[0], requires_grad=True)
     value(across).backward()

@@ -68,10 +68,10 @@ def test_a_frame_mirrors_turns_scales_and_shifts():
     assert Frame(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(np.array([[0.0, -4.0]]))
 
 
-def test_a_reach_stays_as_it_is_in_mm_on_a_pad_of_another_pitch(twin):
-    wide = twin.contact(2 * PAD.pitch_mm)
-    assert wide.reach[-1][0] == pytest.approx(1.6 / 2)
-    assert wide.length == "euclidean"
+def test_the_contact_of_a_twin_is_its_profile_in_mm(twin):
+    contact = twin.contact()
+    assert contact.reach == tuple(zip(twin.distance_mm, twin.weight, strict=True))
+    assert contact.length == "euclidean"
 
 
 @pytest.mark.parametrize(
@@ -143,12 +143,6 @@ def test_courses_that_are_far_longer_than_a_pad_are_refused(twin, tmp_path):
     (tmp_path / "twin.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"twin\.json: laid_mm are 2.*e\+06 mm long in all, allowed are 1\.89e\+06"):
         Twin.load(tmp_path / "twin.json")
-
-
-@pytest.mark.parametrize("unit_mm", ["", 0.0, -1, np.nan, [3.0], True])
-def test_a_unit_that_no_pad_has_is_refused(twin, unit_mm):
-    with pytest.raises(InputError, match="unit_mm is"):
-        twin.contact(unit_mm)
 
 
 @pytest.mark.parametrize("places_mm", [[[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]])

@@ -38,7 +38,7 @@ def test_wiring_frame_and_reach_are_found(printed: Twin, found: Identification) 
     assert twin.frame.turn_deg == pytest.approx(printed.frame.turn_deg, abs=4)
     assert twin.frame.shift_mm == pytest.approx(printed.frame.shift_mm, abs=1.0)
     told, true = twin.contact().reach, printed.contact().reach
-    at = np.linspace(0, 1.2, 7)
+    at = np.linspace(0, 13.5, 7)
     assert np.interp(at, *np.array(told).T) == pytest.approx(np.interp(at, *np.array(true).T), abs=0.15)
     assert found.explained.mean() > 0.95
     assert found.explained.mean() > found.on_plan

@@ -8,9 +8,9 @@ from design import Contact, Morphology, signals
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.pad.contact import fibre_axes
 from design.pad.knots import kernel_ends
-from design.settings import PUBLISHED_CONTACT, Layout
+from design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 
-REACH = ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0))
+REACH = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))
 CONTACTS = [
     PUBLISHED_CONTACT,
     Contact(sides=None),
@@ -36,7 +36,8 @@ def square_ends(travel):
 
 
 def torch_signals(travel, cross, presses, contact):
-    return press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact, square_ends(travel))
+    slope = pchip_slopes(travel, cross)
+    return press_signals(travel, cross, slope, presses, contact, square_ends(travel), DEFAULT_PITCH_MM)
 
 
 def taylor_ratio(contact, seed):
@@ -68,7 +69,7 @@ def test_the_torch_function_gives_the_exact_signals():
     presses = np.random.default_rng(1).uniform(1, 4, (20, 2))
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     found = torch_signals(travel, cross, presses, PUBLISHED_CONTACT).T.numpy()
-    np.testing.assert_allclose(found, signals(pad, presses), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(found, signals(pad, presses, PUBLISHED_CONTACT), rtol=1e-12, atol=1e-14)
 
 
 def test_an_untouched_fibre_has_no_gradient_and_grazing_stays_finite():

@@ -95,7 +95,7 @@ def test_exact_signals_of_published_pads_are_the_limit_of_the_sampled_ones(publi
     presses = np.random.default_rng(0).uniform(0.5, 4.5, (10, 2))
     for name in ("1para", "5para_dis", "20para"):
         pad = Morphology.load(published / f"{name}.mat")
-        true = signals(pad, presses)
+        true = signals(pad, presses, PUBLISHED_CONTACT)
         errors = [np.abs(signals_quantized(pad, presses, samples=n) - true).max() for n in (2_000, 200_000)]
         assert errors[1] < errors[0] / 20
 

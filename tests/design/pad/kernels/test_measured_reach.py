@@ -11,9 +11,11 @@ from scipy.optimize import brentq
 
 from design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from design.pad.contact import signals_and_spans
+from design.settings import DEFAULT_PITCH_MM
 
 REACH = ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0))
-"""As measured: broad, and a little below 0 before its end."""
+"""As measured: broad, and a little below 0 before its end; grid units."""
+IN_MM = tuple((DEFAULT_PITCH_MM * d, weight) for d, weight in REACH)
 
 
 def measured_oracle(pad, press, length, fibre):
@@ -50,7 +52,7 @@ def measured_oracle(pad, press, length, fibre):
 def test_signals_of_a_measured_reach_equal_the_oracle(length):
     for knots in (0, 5):
         rng = np.random.default_rng(knots)
-        pad, contact = Morphology.random(2, knots, rng), Contact(reach=REACH, length=length)
+        pad, contact = Morphology.random(2, knots, rng), Contact(reach=IN_MM, length=length)
         presses = rng.uniform(0, 3, (2, 2))
         found = signals(pad, presses, contact)
         with warnings.catch_warnings():
@@ -63,7 +65,7 @@ def test_signals_of_a_measured_reach_equal_the_oracle(length):
 
 
 def test_a_measured_reach_is_not_felt_beyond_its_end():
-    contact = Contact(reach=REACH, length="euclidean")
+    contact = Contact(reach=IN_MM, length="euclidean")
     found, looked_at = signals_and_spans(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
     assert looked_at == 4  # fibres 1 and 2 of both families
     assert not found[1].any()

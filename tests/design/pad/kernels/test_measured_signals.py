@@ -10,20 +10,28 @@ from design.pad.contact import fibre_axes
 from design.pad.kernels.measured_signals import PRECISION, fibre_elements, spacing_of
 from design.pad.kernels.press import MANHATTAN
 from design.pad.knots import kernel_ends
-from design.settings import Layout
+from design.settings import DEFAULT_PITCH_MM, Layout
 
 REACHES = {
     "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),
-    "nearly a disc": ((0.0, 1.0), (0.3, 1.0), (0.55, 1.0), (0.65, 0.0), (0.8, 0.0)),
-    "below 0": ((0.0, -0.2), (0.2, -0.5), (0.5, 0.2), (0.9, 0.0)),
+    "nearly a disc": ((0.0, 1.0), (0.3, 1.0), (0.55, 1.0), (0.6, 0.85), (0.65, 0.15), (0.7, 0.0), (0.9, 0.0)),
+    "below 0": ((0.0, -0.3), (0.2, -0.5), (0.35, -0.35), (0.5, 0.1), (0.6, 0.2), (0.9, 0.0)),
     "beyond the pad": ((0.0, 1.0), (2.0, 0.8), (4.0, 0.3), (6.0, 0.0)),
 }
+"""In grid units."""
+
+
+def contact_of(reach, length="euclidean"):
+    """The contact on pads of the default pitch."""
+    return Contact(reach=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
 
 
 def pads():
     yield Morphology.straight(3)
     for knots in (1, 5, 21):
         yield Morphology.random(3, knots, seed=knots)
+    yield Morphology.random(3, 5, seed=6, pitch_mm=(30.0, 5.0))
+    yield Morphology.random(3, 5, seed=7, pitch_mm=6.0)
 
 
 def knots_of(pad):
@@ -34,7 +42,9 @@ def searched(pad, presses, contact):
     """(Q, 2M) signals of the kind that a search takes."""
     travel, cross = knots_of(pad)
     return (
-        press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact, kernel_ends(pad.layout))
+        press_signals(
+            travel, cross, pchip_slopes(travel, cross), presses, contact, kernel_ends(pad.layout), pad.unit_mm
+        )
         .detach()
         .numpy()
         .T
@@ -44,7 +54,7 @@ def searched(pad, presses, contact):
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
 @pytest.mark.parametrize("reach", REACHES.values(), ids=REACHES)
 def test_a_search_sees_the_signals_to_its_precision(reach, length):
-    contact = Contact(reach=reach, length=length)
+    contact = contact_of(reach, length)
     for pad in pads():
         presses = np.random.default_rng(0).uniform(0, 4, (60, 2))
         exact = signals(pad, presses, contact)
@@ -53,7 +63,7 @@ def test_a_search_sees_the_signals_to_its_precision(reach, length):
 
 def test_signals_of_the_opposite_reach_are_the_opposite():
     pad, presses = Morphology.random(3, 5, seed=0), np.random.default_rng(0).uniform(0, 4, (20, 2))
-    there, back = (Contact(reach=tuple((d, sign * w) for d, w in REACHES["broad"])) for sign in (1, -1))
+    there, back = (contact_of((d, sign * w) for d, w in REACHES["broad"]) for sign in (1, -1))
     np.testing.assert_allclose(searched(pad, presses, back), -searched(pad, presses, there), rtol=1e-12, atol=1e-14)
 
 
@@ -61,11 +71,12 @@ def test_signals_of_the_opposite_reach_are_the_opposite():
 def test_the_gradient_is_that_of_the_exact_signals(reach):
     """Along a random change of all knots, within what a difference of exact signals can tell."""
     rng = np.random.default_rng(1)
-    contact, presses = Contact(reach=reach, length="euclidean"), rng.uniform(0, 4, (40, 2))
+    contact, presses = contact_of(reach), rng.uniform(0, 4, (40, 2))
     upstream = rng.normal(size=6)
     pad = Morphology.random(3, 5, seed=2)
     travel, cross = knots_of(pad)
-    found = press_signals(travel, cross, pchip_slopes(travel, cross), presses, contact, kernel_ends(pad.layout))
+    slope = pchip_slopes(travel, cross)
+    found = press_signals(travel, cross, slope, presses, contact, kernel_ends(pad.layout), pad.unit_mm)
     (torch.tensor(upstream)[:, None] * found).sum().backward()
     assert cross.grad is not None
     move = rng.normal(size=cross.shape)
@@ -88,7 +99,8 @@ def test_elements_lie_only_where_a_press_may_feel_them():
     felt = np.diff(starts) > 0
     assert felt.any(axis=1).nonzero()[0].tolist() == [0, 1, 2, 40, 41, 42]
     assert felt.any(axis=0).nonzero()[0].tolist() == [0, 1, 2, 3]
-    press_signals(travel, cross, slope, corner, Contact(reach=reach), kernel_ends(Layout.of(grid))).sum().backward()
+    layout = Layout.of(grid)
+    press_signals(travel, cross, slope, corner, contact_of(reach), kernel_ends(layout), layout.unit_mm).sum().backward()
     assert cross.grad is not None
     moved = cross.grad.numpy().astype(bool)
     assert moved[0, :4].all()

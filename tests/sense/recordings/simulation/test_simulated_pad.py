@@ -102,9 +102,9 @@ def test_it_is_pressed_where_the_printed_pad_was() -> None:
 def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin() -> None:
     twin, other = twin_of(Frame(mirrored=True, shift_mm=(3, 3))), Morphology.random(3, knots=2, seed=1, pitch_mm=9)
     recording = simulate(other, RigSettings(presses=100, hysteresis=0, creep=0, **STILL), like=twin)
-    expected = -0.05 * signals(other, other.to_grid(recording.presses_mm), twin.contact(9))
+    expected = -0.05 * signals(other, other.to_grid(recording.presses_mm), twin.contact())
     assert responses(recording) == pytest.approx(expected, abs=1e-3)
-    assert recording.source["contact"] == twin.contact(9).model_dump(mode="json")
+    assert recording.source["contact"] == twin.contact().model_dump(mode="json")
     assert recording.source["twin"]["presses"] == 900
     assert np.abs(recording.presses_mm).max() == pytest.approx(13.5, rel=0.02)
 

@@ -16,7 +16,7 @@ from design.pad.kernels.pchip import population_slopes
 from design.pad.kernels.press import family_strays
 from design.pad.kernels.roots import SCRATCH, roots_in_unit
 from design.pad.knots import kernel_ends
-from design.settings import Layout
+from design.settings import DEFAULT_PITCH_MM, Layout
 from tests.helpers.effort import few
 from tests.stress.clock import ends_in_time
 from tests.stress.design.mirrors import transposed
@@ -32,7 +32,7 @@ def test_gradients_are_finite_and_right_away_from_kinks(data):
     ends = fibre_axes(pad)[2]
     slope = population_slopes(travel[None], cross[None])[0]
     places = np.random.default_rng(data.draw(seeds())).uniform(0, pad.grid + 1, (3, 2))
-    shape = press_shape(contact)
+    shape = press_shape(contact, pad.unit_mm)
     upstream = np.ones((len(places), 2 * pad.grid))
     with ends_in_time():
         found = signals_gradient(
@@ -59,7 +59,7 @@ def test_gradients_are_finite_differences(seed, weight, length):
     cross = np.concatenate([level, level + np.cumsum(rng.uniform(0.05, 0.15, (2, 3)), axis=1), level + 0.5], axis=1)
     contact = Contact(radius=0.6, sides=None, weight=weight, length=length)
     slope, place = population_slopes(travel[None], cross[None])[0], np.array([[1.0, 1.1]])
-    shape, strays = press_shape(contact), np.array([2.0, 2.0])
+    shape, strays = press_shape(contact, DEFAULT_PITCH_MM), np.array([2.0, 2.0])
     ends = kernel_ends(Layout.of(1))
 
     def total(v: Array) -> float:

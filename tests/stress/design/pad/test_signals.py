@@ -66,17 +66,19 @@ def test_signals_lie_between_nothing_and_the_whole_fibre(data):
 @given(st.data())
 def test_signals_of_any_measured_reach_lie_within_the_whole_fibre_at_its_heaviest(data):
     pad, rng = data.draw(pads((1, 2), (0, 6))), np.random.default_rng(data.draw(seeds()))
-    distances = np.cumsum(rng.choice([1e-3, 0.1, 0.5, 3.0], data.draw(st.integers(2, 12))))
-    weights = np.append(rng.uniform(-1, 1, len(distances)), 0.0)
+    end_mm = data.draw(st.sampled_from([1e-2, 1.0, 5.0, 20.0, 200.0]))
+    distances = np.linspace(0, end_mm, data.draw(st.integers(8, 20)))
+    waves = np.cos(np.pi * rng.uniform(0, 2) * distances / end_mm) * (1 - distances / end_mm) ** 2
+    weights = data.draw(st.sampled_from([-1e3, -1.0, 1e-3, 1.0])) * waves
     contact = Contact(
-        reach=tuple(zip([0.0, *distances.tolist()], weights.tolist(), strict=True)),
+        reach=tuple(zip(distances.tolist(), weights.tolist(), strict=True)),
         length=data.draw(st.sampled_from(["manhattan", "euclidean"])),
     )
     places = data.draw(presses(pad))
     with ends_in_time():
         found = signals(pad, places, contact)
-    _, _, law = press_shape(contact)
-    near = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise([0.0, *distances])])
+    _, _, law = press_shape(contact, pad.unit_mm)
+    near = np.linspace(0, law.radius, 2000)
     heaviest = max(abs(weigh(d * d, law)) for d in near)
     assert np.isfinite(found).all()
     assert (np.abs(found) <= whole_lengths(pad, contact) * heaviest * 1.01 + 1e-9).all()
