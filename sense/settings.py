@@ -66,6 +66,12 @@ class RigSettings(Settings):
     creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's answer that creeps")
     hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
     hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: time in which that goes, s")
+    scatter: float = Field(
+        default=0.18, ge=0, le=1, description="simulated pad: scatter of an answer from press to press, share of it"
+    )
+    scatter_common: float = Field(
+        default=0.36, ge=0, le=1, description="simulated pad: share of that variance that all fibres have in common"
+    )
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
     board: str = Field(default="due", min_length=1, max_length=100, description="what reads the fibres, by its name")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')

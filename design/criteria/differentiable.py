@@ -77,7 +77,7 @@ def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
 
 
 def arc_lengths(travel: Tensor, cross: Tensor, slope: Tensor) -> Tensor:
-    """Return the arc length (F,) of PCHIP curves by Gauss-Legendre quadrature, to about 1e-3 of it where they are steep.
+    """Return the arc lengths (F,) of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep.
 
     Args:
         travel, cross, slope: (F, n) knots and slopes.

@@ -1,25 +1,24 @@
-"""Expected localisation error: how far off a regression is that learns positions from responses, and what scatter adds.
+"""Expected localisation error: how far off a regression is that learns positions from responses, and what noise adds.
 
-The response x of a fibre is its relative stretch (signal over length, as a divider shows it), in full scales of straight
-fibres. A press scatters by a floor and by a share of the response, of whose variance all fibres have a part in common:
+The response x of a fibre is its relative stretch (signal over length, as a divider shows it), in full scales of
+straight fibres. It scatters by a floor and by a share of itself, of whose variance all fibres have a part in common:
 
     x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
 
-z = asinh(b x / floor) / b with b = share sqrt(1 - common) stabilises the variance of what fibres have for themselves
-(M. S. Bartlett, The use of transformations, Biometrics 3, 1947): z scatters by 1 wherever a press lies. For presses a
-and the set K of fibres that still work, two terms are added:
+For presses a and the set K of fibres that still work, two terms are added, as trained networks weigh them:
 
-    E_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|z_a - z_b|^2_K / 2 w^2),
-    B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' (1 + u_a u_a')^-1 J_a + 12 / size^2,    J_a = dz / dp there.
+    L_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|x_a - x_b|^2_K / 2 w^2),
+    B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' S_a^-1 J_a + 12 / size^2,     J_a = dx / dp there,
+    expected error = 0.8 B_K + 0.56 L_K.
 
-E_K is how far off kernel ridge regression finds each press when it has learnt from all the others, which is known
+L_K is how far off kernel ridge regression finds each press when it has learnt from all the others, which is known
 without learning anew (C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, 2006, chapter 2 and
 section 5.4.2; w is the width of the kernel, r the ridge, c_aa C's diagonal, p the positions from their middle). So it
 counts confusions by how far off they lead, as the ambiguity does; and besides, what a localizer has to learn between
 presses: responses that fold the pad too often are far apart for neighbours. B_K is the Cramer-Rao bound (van Trees
 1968, section 2.4) with what is known beforehand, that the position is one of the pad: what no localizer falls below,
-however many presses it has learnt from. u = sqrt(common) share x / sqrt(floor^2 + b^2 x^2) is how the gain in common
-shows in z. That the covariance itself depends on the position, which tells a few per cent more, is left out.
+however many presses it has learnt from. S_a is the covariance of the responses there, a diagonal matrix and a product
+of one vector. That it depends on the position, which tells a few per cent more, is left out.
 
 Presses are compared on a fine lattice over a window of the pad; where the pad is larger, presses of a coarse lattice
 over the rest of it that answer like some press of the window are learnt from as well, so that places far apart may not
@@ -28,7 +27,6 @@ look alike. The cost of a window grows with the pad's area, by which there are m
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,7 +39,7 @@ from design.pad.contact import lattice, relative_stretch
 from design.pad.courses.keep_out import outside
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import Contact, Layout, PadSettings, Rectangle, Scatter, SearchSettings, sensed_rectangle
+from design.settings import Contact, Layout, PadSettings, Rectangle, Scatter, SearchSettings, Sensed, sensed_rectangle
 
 SEARCHED, JUDGED, WINDOW = 12, 14, 5.0
 """Presses along a side of a window's lattice, in a search and where a pad is judged, and its longest side, grid units.
@@ -49,12 +47,14 @@ With 10 in place of 12 a search errs more under a small contact; 14 take a seven
 COARSE, BESIDE = 0.7, 1.0
 """Step of the lattice over the rest of the pad, and how far beside the window it begins, grid units."""
 MAX_PARTNERS, ALIKE = 36, 2.0
-"""Most presses of it that are learnt from besides, and the distance in widths of the kernel within which they are."""
+"""Most presses of it that are learnt from besides, and how near they answer, widths of the kernel."""
 LATTICES, MAX_SETS = 4, 32
 """Lattices, and sets of failed fibres of a size, by which a finished pad is judged."""
-WIDTH, RIDGE = 0.75, 1e-2
-"""Width of the kernel, of a straight fibre's full scale in z, and the ridge: such errors go best with those of trained
-networks, over straight, gently and strongly curved pads."""
+WIDTH, RIDGE = 0.8, 1e-2
+"""Width of the kernel, full scales, and the ridge."""
+BY_NOISE, BY_LEARNING = 0.8, 0.56
+"""Weights of both terms. Such errors go best with those of trained networks, within 7 % over straight, gently and
+strongly curved pads: a network's mean error is below the root of a variance, and it learns better than the ridge."""
 EPSILON = 1e-12
 """Squared length, so that its root has a gradient at 0."""
 FULL_SCALE_SIDE = 24
@@ -82,7 +82,7 @@ class Presses(NamedTuple):
 
 
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Return the expected error with 0, 1, ... fibres failed, by the formula of this module, always on the same presses.
+    """Return the expected error with 0, 1, ... fibres failed, by this module's formula, always on the same presses.
 
     Args:
         pad: the fibres.
@@ -107,7 +107,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         touched = torch.cat([near, far], dim=1).any(dim=1)  # on a large pad most fibres are far from all the presses
         # and most sets of failed fibres are alike to what is left
         sets = [mask[:, touched].unique(dim=0, return_inverse=True) for mask in masks]
-        partners = confusable(near[touched], far[touched], torch.cat([few for few, _ in sets]), search.response_scatter)
+        partners = confusable(near[touched], far[touched], torch.cat([few for few, _ in sets]))
         responses = torch.cat([near, far[:, partners]], dim=1)[touched]
         given = responses, presses.joined(partners), torch.tensor(presses.step), torch.tensor(presses.free)
         errors.append([expected_error(*given, few, search.response_scatter)[rows].mean().item() for few, rows in sets])
@@ -119,8 +119,7 @@ def error_terms(errors: Sequence[float]) -> dict[str, float]:
     return {f"expected_error_lost_{lost}": value for lost, value in enumerate(errors)}
 
 
-@lru_cache(maxsize=64)
-def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Any) -> float:
+def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> float:
     """Return the mean over straight fibres of their largest relative stretch, to which responses are scaled."""
     presses = lattice(sensed_rectangle(layout, sensed_mm), FULL_SCALE_SIDE)
     largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
@@ -161,36 +160,23 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
     return Presses(positions, (high - low) / side, outside(positions, size), far)
 
 
-def stabilised(responses: Tensor, scatter: Scatter) -> Tensor:
-    """Return z of the module's formula for responses of any shape, in full scales of straight fibres."""
-    own = scatter.share * math.sqrt(1 - scatter.common)
-    scaled = responses / scatter.floor
-    return torch.asinh(own * scaled) / own if own > 0 else scaled
-
-
-def kernel_width(scatter: Scatter) -> float:
-    """Return w of the module's formula."""
-    return WIDTH * stabilised(torch.ones((), dtype=torch.float64), scatter).item()
-
-
-def confusable(near: Tensor, far: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
+def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
     """Return which presses (P,) of `far` answer most like some press of a window, under any of some losses.
 
     Args:
         near: (F, Q) responses of the window.
         far: (F, N) responses over the rest of the pad.
         masks: (L, F), 1 for a fibre that works.
-        scatter: of responses.
 
     Returns:
         At most MAX_PARTNERS indices, ascending; none that is ALIKE widths of the kernel or more away.
     """
     if not far.shape[1]:
         return torch.empty(0, dtype=torch.int64)
-    z, other = (stabilised(x.detach(), scatter).float() / kernel_width(scatter) for x in (near, far))
+    window, beyond = (x.detach().float().T / WIDTH for x in (near, far))
     least = torch.full((far.shape[1],), torch.inf, device=far.device)
     for mask in masks.float().unique(dim=0):
-        least = torch.minimum(least, torch.cdist(other.T * mask, z.T * mask).amin(dim=1))
+        least = torch.minimum(least, torch.cdist(beyond * mask, window * mask).amin(dim=1))
     best = least.topk(min(MAX_PARTNERS, len(least)), largest=False)
     return best.indices[best.values < ALIKE].sort().values
 
@@ -198,7 +184,7 @@ def confusable(near: Tensor, far: Tensor, masks: Tensor, scatter: Scatter) -> Te
 def expected_error(
     responses: Tensor, positions: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter
 ) -> Tensor:
-    """Return E + B of the module's formula for each of some losses, with gradient by the responses.
+    """Return the expected error of the module's formula for each of some losses, with gradient by the responses.
 
     Args:
         responses: (F, Q + P) in full scales of straight fibres, for the presses of a lattice of Q = side^2, row by row,
@@ -213,12 +199,12 @@ def expected_error(
         (L,) grid units.
     """
     where, apart, masks = (given.to(responses.dtype) for given in (positions, step, masks))
-    z, count = stabilised(responses, scatter), len(free)
-    bound = _bound(z[:, :count], responses[:, :count], apart, free, masks, scatter)
+    count = len(free)
+    bound = _bound(responses[:, :count], apart, free, masks, scatter)
     learnt = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(where))])
     middle = where[:count].mean(dim=0)
-    found = _LeaveOneOut.apply(z[:, learnt] / kernel_width(scatter), where[learnt] - middle, masks, int(free.sum()))
-    return found + bound
+    left_out = _LeaveOneOut.apply(responses[:, learnt] / WIDTH, where[learnt] - middle, masks, int(free.sum()))
+    return BY_NOISE * bound + BY_LEARNING * left_out
 
 
 def over_losses(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
@@ -237,7 +223,7 @@ def over_losses(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Ten
 
 
 def _corners(values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Values (Q, ...) of a lattice at the corners of each of its cells: below left, below right, above left and right."""
+    """Values (Q, ...) of a lattice at the four corners of each of its cells, row by row from below."""
     side = math.isqrt(len(values))
     grid = values.reshape(side, side, *values.shape[1:])
     return grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
@@ -249,35 +235,35 @@ def _rates(values: Tensor, step: Tensor) -> Tensor:
     return torch.stack([(b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])], dim=-1)
 
 
-def _bound(z: Tensor, responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
-    """(L,) B, over the cells of the lattice that are free."""
+def _bound(responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
+    """(L,) B for responses (F, Q) on a lattice, over its cells that are free."""
     cells = torch.stack([corner.flatten() for corner in _corners(free)]).all(dim=0)
     if not cells.any():  # no more than slits between keep-outs
         return masks.new_zeros(len(masks))
-    rates = _rates(z, step)[cells]
-    own = scatter.share**2 * (1 - scatter.common)
     middle = torch.stack([corner.flatten(0, 1) for corner in _corners(responses.T)]).mean(dim=0)[cells]
-    gain = math.sqrt(scatter.common) * scatter.share * middle / (scatter.floor**2 + own * middle**2).sqrt()
+    deviation = (scatter.floor**2 + scatter.share**2 * (1 - scatter.common) * middle**2).sqrt()
+    rates = _rates(responses, step)[cells] / deviation[..., None]
+    gain = math.sqrt(scatter.common) * scatter.share * middle / deviation
     information = torch.einsum("lk,qki,qkj->lqij", masks, rates, rates)
     shared = torch.einsum("lk,qk,qki->lqi", masks, gain, rates)
     total = 1 + torch.einsum("lk,qk->lq", masks, gain**2)
-    # (1 + u u')^-1 = 1 - u u' / (1 + u'u)
+    # Sherman and Morrison: (1 + u u')^-1 = 1 - u u' / (1 + u'u)
     xx, yy, xy = (information[..., i, j] - shared[..., i] * shared[..., j] / total for i, j in ((0, 0), (1, 1), (0, 1)))
-    prior_x, prior_y = 12 / (step * math.isqrt(z.shape[1])) ** 2
-    # at a faint scatter the first difference cancels where one direction alone is told, and the prior must not with it
+    prior_x, prior_y = 12 / (step * math.isqrt(len(free))) ** 2
+    # at a faint noise the first difference cancels where one direction alone is told, and the prior must not with it
     volume = (xx * yy - xy**2).clamp(min=0) + prior_x * yy + prior_y * xx + prior_x * prior_y
     return ((xx + yy + prior_x + prior_y) / volume).sqrt().mean(dim=1)
 
 
 class _LeaveOneOut(torch.autograd.Function):
-    """E with its gradient in closed form, since both come from the same inverse."""
+    """L with its gradient in closed form, since both come from the same inverse."""
 
     @staticmethod
-    def forward(ctx: Any, z: Tensor, positions: Tensor, masks: Tensor, count: int) -> Tensor:
-        """(L,) E over the first `count` presses, for z (F, Q) in widths of the kernel."""
-        (fibres, presses), losses = z.shape, len(masks)
+    def forward(ctx: Any, responses: Tensor, positions: Tensor, masks: Tensor, count: int) -> Tensor:
+        """(L,) L over the first `count` presses, for responses (F, Q) in widths of the kernel."""
+        (fibres, presses), losses = responses.shape, len(masks)
         # differences, unlike products, do not cancel: single precision serves
-        apart = z[:, :, None] - z[:, None, :]
+        apart = responses[:, :, None] - responses[:, None, :]
         kernel = torch.exp(torch.mm(masks / -2, apart.square().view(fibres, presses**2)).view(losses, presses, presses))
         ridged = kernel.clone()
         ridged.diagonal(dim1=1, dim2=2).add_(RIDGE)
@@ -290,7 +276,7 @@ class _LeaveOneOut(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient by z."""
+        """Gradient by the responses."""
         apart, kernel, inverse, alpha, length, masks = ctx.saved_tensors
         diagonal = inverse.diagonal(dim1=1, dim2=2)
         share = upstream[0][:, None] / ctx.count * (torch.arange(diagonal.shape[1]) < ctx.count).to(diagonal)

@@ -199,7 +199,7 @@ class GradientSearch:
                 return (signals_at(positions) / (scale * length)).float().to(search.device)
 
             with torch.no_grad():
-                partners = confusable(responses(presses.positions), responses(presses.far), masks, scatter)
+                partners = confusable(responses(presses.positions), responses(presses.far), masks)
             positions = presses.joined(partners)
             given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
             total = total + over_losses(expected_error(*given), masks, shares)

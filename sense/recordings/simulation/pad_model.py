@@ -1,12 +1,13 @@
 """The simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The strain of a fibre is its signal by the contact model times how far the probe is down. Three things the published
-recording shows come on top: the answer creeps (part of it follows slowly), unloading is not the reverse of loading
-(the fibre overshoots beyond its rest and comes back within seconds), and the rest itself wanders over minutes. A fibre
-is a resistor in a potential divider with a fixed one; an ADC with white noise reads their middle.
+The strain of a fibre is its relative stretch by the contact model times how far the probe is down. Four things the
+published recording shows come on top: every press is answered a little more or less strongly than the last one at the
+same position, the answer creeps (part of it follows slowly), unloading is not the reverse of loading (the fibre
+overshoots beyond its rest and comes back within seconds), and the rest itself wanders over minutes. A fibre is a
+resistor in a potential divider with a fixed one; an ADC with white noise reads their middle.
 
-Strengths are of the order of that recording: answers up to some 0.2 V on a rest near 2 V, overshoot of a fifth, rest
-wandering by 0.04 V, noise of 1.6 mV.
+Strengths are of the order of that recording: answers up to some 0.2 V on a rest near 2 V that scatter by a sixth of
+themselves, overshoot of a fifth, rest wandering by 0.04 V, noise of 1.6 mV.
 """
 
 import math
@@ -15,14 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from design import Contact, Morphology, signals
+from design import Contact, Morphology
+from design.pad.contact import relative_stretch
 from sense.recordings.processing.limits import Array
 from sense.settings import RigSettings
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095
-GAUGE = 0.08
-"""Relative change of a fibre's resistance per grid unit of signal at full depth, 5 mm."""
+GAUGE = 0.4
+"""Relative change of a fibre's resistance for its relative stretch at full depth, 5 mm."""
 FULL_DEPTH_MM = 5.0
 TRAVEL_S = 0.15
 """Time the probe takes from the surface to its depth, and back."""
@@ -157,21 +159,28 @@ def read_pad(
     """What the ADC gives of a plan of presses; as in `LivePad`, a press of half the depth gives half the strain.
 
     Args:
-        answers: (Q, C) signals at full depth in grid units; or V, as measured, which is how a held press differs from
+        answers: (Q, C) relative stretches at full depth; or V, as measured, which is how a held press differs from
             the rest.
         depths_mm: (Q,) how deep the presses are.
-        noise_v: (C,) by how much answers in V scatter in all, standard deviation; None for signals.
+        noise_v: (C,) by how much answers in V scatter whatever they are, standard deviation; None for stretches.
 
     Returns:
         (Q readings, C) V.
     """
     presses, channels = answers.shape
+    answers = answers * press_gains(presses, channels, rig, rng)
     model = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
     if noise_v is not None:
         own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
         answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)
     indented = indentation(cycle, rng.uniform(*DELAY_S, (presses, 2)))
     return model(strain(depths_mm[:, None] / FULL_DEPTH_MM * answers, indented))
+
+
+def press_gains(presses: int, fibres: int, rig: RigSettings, rng: np.random.Generator) -> Array:
+    """Draw by what each fibre answers each press more or less than usual, (Q, C) about 1, partly alike for all."""
+    own, common = rng.standard_normal((presses, fibres)), rng.standard_normal((presses, 1))
+    return 1 + rig.scatter * (np.sqrt(1 - rig.scatter_common) * own + np.sqrt(rig.scatter_common) * common)
 
 
 def held_share(cycle: Cycle, rig: RigSettings) -> float:
@@ -211,7 +220,7 @@ class Divider:
         self._rig, self._rng, self._linear = rig, rng, linear
 
     def __call__(self, strained: Array) -> Array:
-        """(R, C) strain, 1 for a signal of 1 at full depth, going on from what was asked before, to (R, C) volts."""
+        """(R, C) strain, the relative stretch at full depth or V, going on from what was asked before, to (R, C) volts."""
         if not len(strained):
             return strained
         shown = self._answer(strained)
@@ -234,18 +243,25 @@ class LivePad:
     ) -> None:
         self._pad, self._contact = pad, contact
         self._divider = Divider(len(pad.knots), rate_hz, rig, rng)
+        self._rig, self._rng = rig, rng
         self._known: dict[tuple[float, float], Array] = {}
+        self._gains = np.ones(len(pad.knots))
+        self._touched = False
 
     def volts(self, places_mm: Array, depths_mm: Array) -> Array:
         """(R, C) volts for tips at (R, 2) mm from the pad's centre, (R,) mm below its surface (above: less than 0)."""
         strained = np.zeros((len(places_mm), len(self._pad.knots)))
-        for row in np.flatnonzero(depths_mm > 0):
-            strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._signals(places_mm[row])
+        for row, touched in enumerate(depths_mm > 0):
+            if touched and not self._touched:
+                self._gains = press_gains(1, len(self._gains), self._rig, self._rng)[0]
+            self._touched = bool(touched)
+            if touched:
+                strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(places_mm[row])
         return self._divider(strained)
 
-    def _signals(self, place_mm: Array) -> Array:
-        """(C,) signals of a press at full depth; the tip of an arm at rest stays within hundredths of a millimetre."""
+    def _stretch(self, place_mm: Array) -> Array:
+        """(C,) of a press at full depth; the tip of an arm at rest stays within hundredths of a millimetre."""
         x, y = np.round(place_mm, 2).tolist()
         if (x, y) not in self._known:
-            self._known = {(x, y): signals(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
+            self._known = {(x, y): relative_stretch(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
         return self._known[x, y]

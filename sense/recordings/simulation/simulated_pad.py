@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from design import Contact, Morphology, Twin, signals
+from design import Contact, Morphology, Twin
 from design.common.errors import InputError
+from design.pad.contact import relative_stretch
 from design.pad.twin import TwinChannel
 from design.settings import PadSettings
 from sense.recordings.press_plan import Free, free_of, size_of, told_pad
@@ -24,8 +25,8 @@ class SimulatedPad:
     Attributes:
         channels: C. pressed_mm: (2, 2) low and high corner of where it is pressed, as the arm counts. free: which
             places there are.
-        answers: (Q, 2) mm as the arm counts to (Q, C) answers of presses at full depth, grid units of fibre, or V.
-        noise_v: (C,) V, standard deviation of an answer that no place explains; None where answers are grid units.
+        answers: (Q, 2) mm as the arm counts to (Q, C) answers of presses at full depth, relative stretch, or V.
+        noise_v: (C,) V, standard deviation of an answer that no place explains; None where answers are stretches.
         strengths: of the settings of `[rig]`, those that were measured.
         source: what a recording says of the pad, JSON.
     """
@@ -56,7 +57,7 @@ def planned(pad: Morphology, contact: Contact, size: PadSettings | None = None) 
         len(pad.knots),
         pad.to_mm(size.sensed),
         free_of(pad, size),
-        lambda places_mm: signals(pad, pad.to_grid(places_mm), contact),
+        lambda places_mm: relative_stretch(pad, pad.to_grid(places_mm), contact),
         None,
         {},
         source | ({"keep_out_mm": told["keep_out_mm"]} if size.keep_out_mm else {}),
