@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 from design.common.errors import InputError, instance
 from design.common.settings import or_default
-from design.pad.contact import boustrophedon, lattice, signals, signals_quantized
+from design.pad.contact import boustrophedon, lattice, relative_stretch, signals, signals_quantized
 from design.pad.courses.keep_out import outside
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
@@ -42,7 +42,7 @@ def ambiguities(
     from .ambiguity import ambiguity, full_scale
 
     presses = free_presses(size)
-    found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
+    found = torch.tensor(relative_stretch(pad, presses, contact).T, dtype=torch.float32)
     touched = found.any(dim=1)  # no other fibre tells presses apart: on a large pad most are between the presses
     found = found[touched]
     places = torch.tensor(presses, dtype=torch.float32)
@@ -107,6 +107,19 @@ def score(
     return all_terms(pad, ambiguities(pad, contact, asked.lost, asked.noise, size), contact, rules, size)
 
 
+def sharpness_of(pad: Morphology, contact: Contact, size: PadSettings) -> float:
+    """Return the signals' mean second difference along a serpentine over what is pressed, grid units."""
+    import torch
+
+    from .ambiguity import sharpness
+
+    return sharpness(torch.tensor(signals(pad, _serpentine(size), contact).T)).item()
+
+
+def _serpentine(size: PadSettings) -> Array:
+    return boustrophedon(size.sensed, 32, 5 / 49)
+
+
 def all_terms(
     pad: Morphology, spread: Sequence[float], contact: Contact, rules: RulesSettings, size: PadSettings
 ) -> dict[str, float]:
@@ -115,15 +128,13 @@ def all_terms(
 
     from design.pad.contact import fibre_axes
 
-    from .ambiguity import sharpness
     from .penalties import penalties
 
-    serpentine = boustrophedon(size.sensed, 32, 5 / 49)
-    found = signals(pad, serpentine, contact)
+    found = signals(pad, _serpentine(size), contact)
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     broken = penalties(travel, cross, size, rules)
     terms = ambiguity_terms(spread) | {"information": information(pad, contact), "idle_share": idle_share(found)}
-    terms["sharpness"] = sharpness(torch.tensor(found.T)).item()
+    terms["sharpness"] = sharpness_of(pad, contact, size)
     shape = PUBLISHED_CONTACT if contact.reach else contact
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
     terms |= {f"published_{name}": value for name, value in asdict(published_terms(pad, shape)[0]).items()}

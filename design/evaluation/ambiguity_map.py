@@ -8,6 +8,7 @@ import numpy as np
 from design.criteria.fibre_loss import loss_shares, lost_subsets
 from design.criteria.score import MOST_LOSSES
 from design.pad.contact import fibre_axes, press_shape, signals
+from design.pad.courses.curves import lengths
 from design.pad.kernels.measured_signals import element_signals, fibre_elements, spacing_of
 from design.pad.kernels.pchip import population_slopes
 from design.pad.knots import Array
@@ -27,7 +28,7 @@ def ambiguity_map(
             within the PRECISION of `measured_signals`.
         lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
     """
-    found = _signals(pad, presses, contact)
+    found = _signals(pad, presses, contact) / lengths(pad)
     largest = found.max(axis=0)
     full_scale = largest[largest > 0].mean() if largest.any() else 1.0
     fibres, most = found.shape[1], min(len(loss_shares(lost)), found.shape[1]) - 1

@@ -5,19 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from design.common.errors import instance, whole
+from design.common.errors import whole
 from design.criteria.fibre_loss import lost_subsets
-from design.pad.contact import signals
+from design.pad.contact import relative_stretch
+from design.pad.courses.keep_out import outside
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, Sensed
+from design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, PadSettings, Scatter
 
-from .localisation_error import LossError, PressSets
+from .expected_error import straight_full_scale
+from .localisation_error import LossError, PressSets, fresh_presses, training_presses
 
 WIDTHS = (5.0, 6.2, 7.9)
 """Standard deviations of the reaches, about Gaussian, that a press may have, mm; that of MEASURED_REACH second."""
-NOISE = 0.02
-"""Of a signal, share of full scale: what all readings of a press leave of the scatter of a built pad's responses."""
 SIDE, TEST, HIDDEN = 24, 500, 50
 """Presses a side to learn from, and fresh ones; neurons of a network."""
 LOST, SUBSETS = 3, 4
@@ -42,33 +42,53 @@ def contacts_in_question(believed: Contact) -> dict[str, Contact]:
 
 
 def errors_by_contact(
-    pad: Morphology, contacts: Mapping[str, Contact], sensed_mm: Sensed = "beyond", seed: int = 0
+    pads: Mapping[str, Morphology],
+    contacts: Mapping[str, Contact],
+    size: PadSettings,
+    scatter: Scatter,
+    seed: int = 0,
+    subsets: int = SUBSETS,
 ) -> list[ContactErrors]:
-    """Mean errors of the published network of a pad, "designed", and of straight fibres, under every contact.
+    """Return mean errors of the published network for pads of one layout under every contact, contact by contact.
 
-    A network is trained afresh for every contact, as a calibration is, on signals under NOISE.
+    A network is trained afresh for every contact, as a calibration is, on one response of each fibre to a press.
 
     Args:
-        sensed_mm: what is pressed (`PadSettings`). seed: of presses, noise and networks.
+        pads: by name.
+        contacts: by name.
+        size: says what is pressed.
+        scatter: of responses.
+        seed: of presses, scatter and networks.
+        subsets: most sets of failed fibres of a size.
     """
-    instance("pad", pad, Morphology)
     seed = whole("seed", seed, 0, 2**64 - 1)
-    fibres = len(pad.knots)
-    losses = [lost_subsets(fibres, lost, SUBSETS) for lost in range(min(LOST, fibres - 1) + 1)]
-    pads = {"designed": pad, "straight": Morphology.straight(pad.layout)}
+    fibres = size.layout.fibres
+    losses = [lost_subsets(fibres, lost, subsets) for lost in range(min(LOST, fibres - 1) + 1)]
     return [
-        ContactErrors(called, name, tuple(_sets(each, contact, sensed_mm, seed).loss_errors(losses, HIDDEN)))
+        ContactErrors(called, name, tuple(_sets(pad, contact, size, scatter, seed).loss_errors(losses, HIDDEN)))
         for called, contact in contacts.items()
-        for name, each in pads.items()
+        for name, pad in pads.items()
     ]
 
 
-def _sets(pad: Morphology, contact: Contact, sensed_mm: Sensed, seed: int) -> PressSets:
-    """Presses with the signals of a pad under noise, the same draws for every pad of as many fibres."""
+def beside_straight(pad: Morphology) -> dict[str, Morphology]:
+    """Return a pad, "designed", and straight fibres of its layout, by name."""
+    return {"designed": pad, "straight": Morphology.straight(pad.layout)}
+
+
+def _sets(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter, seed: int) -> PressSets:
+    """Presses with the responses of a pad, scattered by the same draws for every pad of as many fibres."""
     rng = np.random.default_rng([3, seed])
+    scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
 
-    def answer(places: Array) -> Array:
-        found = signals(pad, places, contact)
-        return found + NOISE * np.abs(found).max(axis=0).mean() * rng.standard_normal(found.shape)
+    def responses(positions: Array) -> Array:
+        found = relative_stretch(pad, positions, contact) / scale
+        own, common = rng.standard_normal(found.shape), rng.standard_normal((len(found), 1))
+        gain = 1 + scatter.share * (np.sqrt(1 - scatter.common) * own + np.sqrt(scatter.common) * common)
+        return found * gain + scatter.floor * rng.standard_normal(found.shape)
 
-    return PressSets.of(pad, SIDE, TEST, seed, answer, sensed_mm)
+    learned, fresh = (
+        positions[outside(positions, size)]
+        for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, TEST, seed))
+    )
+    return PressSets(learned, responses(learned), fresh, responses(fresh), seed)

@@ -55,6 +55,8 @@ WIDTH, RIDGE = 0.8, 1e-2
 BY_NOISE, BY_LEARNING = 0.8, 0.56
 """Weights of both terms. Such errors go best with those of trained networks, within 7 % over straight, gently and
 strongly curved pads: a network's mean error is below the root of a variance, and it learns better than the ridge."""
+WORSE = 8.0
+"""By how much more an error counts that straight fibres do not make."""
 EPSILON = 1e-12
 """Squared length, so that its root has a gradient at 0."""
 FULL_SCALE_SIDE = 24
@@ -207,18 +209,25 @@ def expected_error(
     return BY_NOISE * bound + BY_LEARNING * left_out
 
 
-def over_losses(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
+def over_losses(
+    errors: Tensor, masks: Tensor, shares: tuple[float, ...], straight: Sequence[float] | None = None
+) -> Tensor:
     """Return the geometric mean of errors over numbers of failed fibres: a gain of a tenth counts alike at each.
 
     Args:
         errors: (L,).
         masks: (L, F) the losses they are of.
         shares: P(k) of k = 0, 1, ... failed; what is not in `masks` is left out.
+        straight: errors of straight fibres with k failed. What is worse counts WORSE times as much: nobody lays
+            curved fibres to locate less well.
     """
     lost = (masks == 0).sum(dim=1)
     levels = [k for k in range(len(shares)) if (lost == k).any()]
     logs = torch.stack([errors[lost == k].mean().log() for k in levels])
     weights = torch.tensor([shares[k] for k in levels], dtype=logs.dtype, device=logs.device)
+    if straight is not None:
+        limits = torch.tensor([straight[k] for k in levels], dtype=logs.dtype, device=logs.device).log()
+        logs = logs + (WORSE - 1) * torch.relu(logs - limits)
     return (logs @ weights / weights.sum()).exp()
 
 

@@ -24,7 +24,7 @@ from design.common.errors import path as as_path
 from design.common.settings import or_default
 from design.criteria.fibre_loss import loss_shares
 from design.criteria.rules import Violation
-from design.criteria.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms
+from design.criteria.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms, sharpness_of
 from design.evaluation.expected_error import error_terms, expected_errors
 from design.pad.courses.passing import straight_course
 from design.pad.morphology import Morphology
@@ -80,6 +80,7 @@ class SearchResult:
             count as found, but by the published method.
         terms: every term of `score` for it, and its expected errors.
         violations: the rules it breaks; empty where rules are not enforced.
+        found_by: where it is from: "start 2", "genetic", "straight fibres", or "origin", the pad it was to start from.
         straight: expected errors and ambiguities of straight fibres on the same pad, by name, to set beside its own.
         history: one entry per noted step: {"run", "step", "objective"}.
         enforced: whether it was to keep to the rules.
@@ -90,6 +91,7 @@ class SearchResult:
     morphology: Morphology
     terms: dict[str, float]
     violations: list[Violation]
+    found_by: str
     straight: dict[str, float]
     enforced: bool = True
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -132,17 +134,19 @@ def search(
     profiling.looked_at("starts", len(problem.starts) - kept, len(problem.starts))
     with profiling.stage("search"), stopped_by_interrupt(stop), one_torch_thread():
         _advance(problem, states, stop, run, checkpoints)
-        found = _candidates(problem, states, stop)
+        found = _found(problem, states, stop)
     with profiling.stage("check and score"):
-        straight = _Judged(_straight(problem, stop), problem)
-        known = [] if origin is None else [_Judged(origin, problem)]
+        straight = _Candidate("straight fibres", _straight(problem, stop), problem)
+        candidates = [_Candidate(name, pad, problem) for name, pad in found]
+        if origin is not None:
+            candidates.append(_Candidate("origin", origin, problem))
         if problem.search.method != "genetic":  # the published method is left as it was published
-            known.append(straight)
-        best = min([*(_Judged(pad, problem) for pad in found), *known], key=lambda judged: judged.rank)
+            candidates.append(straight)
+        best = min(candidates, key=lambda candidate: candidate.rank)
         terms = best.errors() | all_terms(best.pad, best.ambiguities(), problem.contacts[0], problem.rules, problem.pad)
         beside = straight.errors() | ambiguity_terms(straight.ambiguities())
     told = problem.rules.enforce, _history(problem, states), time.perf_counter() - begin, stop.reason
-    return SearchResult(best.pad, terms, best.broken, beside, *told)
+    return SearchResult(best.pad, terms, best.broken, best.name, beside, *told)
 
 
 def _advance(
@@ -166,32 +170,36 @@ def _advance(
         run.report(_name(problem, start), min(reached.step, problem.steps), problem.steps, reached.objective)
 
 
-def _candidates(problem: SearchProblem, states: dict[int, State], stop: Stop) -> list[Morphology]:
+def _found(problem: SearchProblem, states: dict[int, State], stop: Stop) -> list[tuple[str, Morphology]]:
     """The fibres of every start; after a stop, those of the start that stands best, mended in what is left of time."""
     if not states:
-        return [finish(problem, 0, None)]
+        return [(_name(problem, 0), finish(problem, 0, None))]
     if not stop:
-        return [finish(problem, start, state) for start, state in sorted(states.items())]
+        return [(_name(problem, start), finish(problem, start, state)) for start, state in sorted(states.items())]
     # a start with nothing noted yet has only just begun
     noted = {start: state["history"][-1, 1] if len(state["history"]) else math.inf for start, state in states.items()}
     best = min(noted, key=lambda start: noted[start])
-    return [finish(problem, best, states[best], stop.mend_until())]
+    return [(_name(problem, best), finish(problem, best, states[best], stop.mend_until()))]
 
 
-class _Judged:
-    """A pad, the rules it breaks, and its expected errors (contacts, losses)."""
+class _Candidate:
+    """A pad that a search may hand back: the rules it breaks, and its expected errors (contacts, losses)."""
 
-    def __init__(self, pad: Morphology, problem: SearchProblem) -> None:
-        self._problem, self.pad = problem, pad
+    def __init__(self, name: str, pad: Morphology, problem: SearchProblem) -> None:
+        self.name, self.pad, self._problem = name, pad, problem
         self.broken: list[Violation] = problem.broken(pad)
         self._errors = [expected_errors(pad, contact, problem.search, problem.pad) for contact in problem.contacts]
 
     @property
     def rank(self) -> tuple[int, float]:
         """Least for the best pad: fewest broken rules first, then the least of what is minimised."""
-        errors = np.mean(self._errors, axis=0)
-        shares = loss_shares(self._problem.search.lost)[: len(errors)]
-        return len(self.broken), float(np.exp(np.log(errors) @ shares / sum(shares)))
+        search, total = self._problem.search, 0.0
+        for contact, errors in zip(self._problem.contacts, self._errors, strict=True):
+            shares = loss_shares(search.lost)[: len(errors)]
+            total += float(np.exp(np.log(errors) @ shares / sum(shares)))
+            if search.sharpness > 0:
+                total += search.sharpness * sharpness_of(self.pad, contact, self._problem.pad)
+        return len(self.broken), total
 
     def ambiguities(self) -> list[float]:
         """With 0, 1, ... lost, under the first contact."""

@@ -17,11 +17,12 @@ from design.common.files import read_json, write_json
 from design.settings import Contact
 
 from .contact import as_presses
+from .courses.curves import lengths
 from .kernels.press import profile_of, profile_weights
 from .knots import Array
 from .morphology import Morphology
 
-FORMAT = "padforge-twin/1"
+FORMAT = "padforge-twin/2"
 MOST_VOLTS, MOST_MM = 1e3, 1e4
 MOST_LOOKS = 1e3
 MOST_CHANNELS = 1024
@@ -71,7 +72,8 @@ class TwinChannel:
 
     Attributes:
         channel: from 0. fibre: which one it reads, from 0 as in the knots; None where no fibre explains it.
-        gain_v: V for a grid unit of fibre right under the press; below 0 where a press lowers the reading.
+        gain_v: V for a relative stretch of 1, the signal of the fibre over its length; below 0 where a press lowers
+            the reading.
         noise_v: standard deviation of a response that neither place nor history explains, V.
         explained: share of the variance of responses on presses held out; 0 where there is no fibre.
     """
@@ -89,6 +91,25 @@ class TwinChannel:
         for name, least in (("gain_v", -MOST_VOLTS), ("noise_v", 0.0)):
             object.__setattr__(self, name, real(name, getattr(self, name), least, MOST_VOLTS))
         object.__setattr__(self, "explained", real("explained", self.explained, -1e9, 1))
+
+
+@dataclass(frozen=True)
+class TwinScatter:
+    """What of the scatter of responses grows with them.
+
+    Attributes:
+        share: standard deviation of a response from press to press, share of the response.
+        common: share of that variance that all channels have in common.
+        floor: standard deviation of what does not grow, share of a channel's `noise_v`.
+    """
+
+    share: float = 0.0
+    common: float = 0.0
+    floor: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, most in (("share", 1), ("common", 0.99), ("floor", 1)):
+            object.__setattr__(self, name, real(name, getattr(self, name), 0, most))
 
 
 @dataclass(frozen=True)
@@ -130,6 +151,7 @@ class Twin:
         noise: standard deviation of a response that neither place nor history explains, share of full scale.
         sensed_mm: width and height of what was pressed, along the axes of the plan.
         presses: learnt from. provenance: free JSON. readings: how they run, None where nobody measured that.
+        scatter: what of `noise` and of the channels' grows with the response.
 
     Raises:
         InputError: what does not fit together, or is out of range.
@@ -148,6 +170,7 @@ class Twin:
     sensitivity: tuple[Array | None, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
     readings: TwinReadings | None = None
+    scatter: TwinScatter = TwinScatter()
 
     def __post_init__(self) -> None:
         fibres = len(instance("morphology", self.morphology, Morphology).knots)
@@ -183,10 +206,11 @@ class Twin:
         points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
         return Contact(reach=tuple(points), length="euclidean")
 
-    def laid_signals(self, places_mm: ArrayLike) -> Array:
-        """(Q, F) what the fibres as laid signal for presses at (Q, 2) mm as the arm counts, grid units.
+    def laid_stretch(self, places_mm: ArrayLike) -> Array:
+        """(Q, F) relative stretch of the fibres as laid by presses at (Q, 2) mm as the arm counts.
 
-        0 for a fibre that no channel reads. Summed over elements of at most LONGEST, within some 1e-4 of the integral.
+        It is their signal over the length of the fibre on the plan; 0 for a fibre that no channel reads. Summed over
+        elements of at most LONGEST, within some 1e-4 of the integral.
         """
         if (pressed_mm := reals("places_mm", places_mm, MOST_MM)).shape[1:] != (2,):
             raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
@@ -203,7 +227,7 @@ class Twin:
                 elements = _elements(self.morphology.to_grid(line), counts)
                 for press, place in enumerate(places):
                     out[press, fibre] = _answer(*elements, place, profiles, reach[-1][0])
-        return out
+        return out / lengths(self.morphology)
 
     @classmethod
     def load(cls, path: str | Path) -> "Twin":
@@ -229,6 +253,7 @@ class Twin:
                 None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
                 document.get("provenance", {}),
                 TwinReadings(**document["readings"]) if document.get("readings") else None,
+                TwinScatter(**document["scatter"]),
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: no valid twin ({error!r})") from error
@@ -248,6 +273,7 @@ class Twin:
             "laid_mm": _rounded(self.laid_mm),
             "sensitivity": None if self.sensitivity is None else _rounded(self.sensitivity),
             "noise": self.noise,
+            "scatter": asdict(self.scatter),
             "sensed_mm": list(self.sensed_mm),
             "presses": self.presses,
             "provenance": dict(self.provenance),

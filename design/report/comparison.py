@@ -15,7 +15,7 @@ from design.common.figures import CURVES, FAINT, INK, canvas, explain, head, sav
 from design.common.files import provenance, write_json
 from design.common.profiling import stage
 from design.common.settings import Spec
-from design.evaluation.contacts_believed import NOISE, errors_by_contact
+from design.evaluation.contacts_believed import beside_straight, errors_by_contact
 from design.optimisers.search import SearchRun
 from design.pad.courses.curves import crossings, lengths
 from design.pad.morphology import Morphology
@@ -130,7 +130,7 @@ def compare(pads: Sequence[Variant], out: Path, run: SearchRun, seed: int | None
             pad = found.morphology
         rows.append(_row(variant, pad, seed) | dict(making(pad, variant.spec, folder)))
     made_by = provenance("padforge design compare", seed or 0, packages=("torch",))
-    document = {"format": FORMAT, "noise": NOISE, "rows": rows, "provenance": made_by}
+    document = {"format": FORMAT, "rows": rows, "provenance": made_by}
     write_json(out / NAME, document)
     save_figure(_figure(rows), out / "comparison.png")
     return document
@@ -141,7 +141,8 @@ def _row(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
     size = variant.spec.section(PadSettings, **pad.layout.settings)
     contact = contact_of(variant.spec, settings)
     with stage("compare"):
-        found = errors_by_contact(pad, {"believed": contact}, size.sensed_mm, settings.seed)
+        asked = {"believed": contact}, size, settings.response_scatter, settings.seed
+        found = errors_by_contact(beside_straight(pad), *asked)
     errors = {each.pad: [pad.unit_mm * error.mean for error in each.errors] for each in found}
     return {
         "name": variant.name,

@@ -13,7 +13,7 @@ from design.settings import Contact, PadSettings, SearchSettings
 if TYPE_CHECKING:
     from design.common.settings import Spec
 
-FORMAT, NAME = "padforge-contacts/1", "contacts.json"
+FORMAT, NAME = "padforge-contacts/2", "contacts.json"
 
 
 def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:
@@ -30,19 +30,20 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     Returns:
         The document: rows of contact, pad and mean errors in mm with 0, 1, ... fibres lost.
     """
-    from design.evaluation.contacts_believed import NOISE, contacts_in_question, errors_by_contact
+    from design.evaluation.contacts_believed import beside_straight, contacts_in_question, errors_by_contact
 
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)
     believed = contact_of(spec, settings)
     with stage("contacts"):
-        found = errors_by_contact(pad, contacts_in_question(believed), size.sensed_mm, settings.seed)
+        asked = contacts_in_question(believed), size, settings.response_scatter, settings.seed
+        found = errors_by_contact(beside_straight(pad), *asked)
     rows = [
         {"contact": each.contact, "pad": each.pad, "errors_mm": [pad.unit_mm * error.mean for error in each.errors]}
         for each in found
     ]
     made_by = provenance("padforge run", settings.seed, [out / "morphology.json"], packages=("torch",))
-    document = {"format": FORMAT, "noise": NOISE, "rows": rows, "provenance": made_by}
+    document = {"format": FORMAT, "scatter": settings.response_scatter._asdict(), "rows": rows, "provenance": made_by}
     write_json(out / NAME, document)
     return document
 
@@ -53,7 +54,9 @@ def contact_line(document: Mapping[str, Any]) -> str:
     for pad in ("designed", "straight"):
         believed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
         told.append(f"{believed:.2f} mm as believed, {min(others):.2f} to {max(others):.2f} mm otherwise")
-    return f"contact: the pad errs by {told[0]}; straight fibres by {told[1]}"
+    return (
+        f"contact: with a small network on one reading of each fibre the pad errs by {told[0]}; straight by {told[1]}"
+    )
 
 
 def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -62,7 +65,7 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
     Raises:
         KeyError, TypeError, ValueError: the document is not as padforge writes it.
     """
-    rows = document["rows"]
+    rows, scatter = document["rows"], document["scatter"]
     most = max(len(row["errors_mm"]) for row in rows)
     return [
         PageSection(
@@ -71,9 +74,10 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
                 paragraph(
                     "What a press does to a fibre is believed, not known, until a printed pad is identified. Here the"
                     " pad, and straight fibres of the same pad, are simulated under other contacts as well: mean error"
-                    " in mm of the published network, trained afresh under each, on signals with a noise of"
-                    f" {float(document['noise']):.1%} of full scale. Where rows differ, simulated errors tell of the"
-                    " contact as much as of the pad; where straight fibres are ahead, optimising has not paid there."
+                    " in mm of the published network, a small one, trained afresh under each on one reading of each"
+                    f" fibre that scatters by {float(scatter['share']):.0%} of itself and {float(scatter['floor']):.1%}"
+                    " of full scale. Where rows differ, simulated errors tell of the contact as much as of the pad;"
+                    " where straight fibres are ahead, optimising has not paid there."
                 ),
                 table(
                     ["contact", "fibres", *(f"{lost} lost" for lost in range(most))],

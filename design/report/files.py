@@ -66,6 +66,7 @@ def run_search(
     document = {
         "format": "padforge-design/1",
         "terms": result.terms,
+        "found_by": result.found_by,
         "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],
         "history": result.history,
@@ -108,6 +109,7 @@ def found_before(out: Path) -> SearchResult | None:
             Morphology.load(out / "morphology.json"),
             terms,
             violations,
+            str(document["found_by"]),
             straight,
             bool(document["provenance"]["settings"]["rules"]["enforce"]),
             document["history"],

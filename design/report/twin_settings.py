@@ -1,20 +1,18 @@
 """Settings to design by what presses have shown of a printed pad."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from design.common.errors import InputError
+from design.evaluation.expected_error import straight_full_scale
 from design.pad.morphology import Morphology
 from design.pad.twin import Twin
-from design.settings import Contact, PadSettings, SearchSettings
+from design.settings import Contact, Layout, PadSettings, SearchSettings
 
 if TYPE_CHECKING:
     from design.common.settings import Spec
-
-SEARCH = {"knots": 8, "starts": 2}
-"""How a twin is designed for: more knots than these, or more steps, do not find better pads of four fibres a family."""
-
 
 KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
 """Of `[pad]`, that say where fibres end."""
@@ -32,7 +30,6 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
     twin = Twin.load(path)
     if spec.given(Contact) and spec.section(Contact) != Contact():
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
-    given = spec.given(SearchSettings)
     own = twin.morphology.layout
     stated = {**own.settings, **{key: spec.given(PadSettings)[key] for key in KEYS if key in spec.given(PadSettings)}}
     if pad is not None:
@@ -44,11 +41,18 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         {
             "pad": stated | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
             "contact": twin.contact().model_dump(),
-            "search": {**SEARCH, **given, "noise": _noise(twin)},
+            "search": {**spec.given(SearchSettings), **_scatter(twin, size)},
         }
     )
 
 
-def _noise(twin: Twin) -> float:
-    """What blurs a place by all that is read of a press: its onset and release tell of it besides how it is held."""
-    return twin.noise / math.sqrt(twin.readings.looks) if twin.readings else twin.noise
+def _scatter(twin: Twin, layout: Layout) -> dict[str, float]:
+    """How the responses of a held press scatter, in `[search]`'s shares of a full scale: that of straight fibres."""
+    gains_v, noises_v = np.array([(abs(each.gain_v), each.noise_v) for each in twin.channels if each.gain_v]).T
+    scale = straight_full_scale(layout, twin.contact(), "beyond")
+    noise = twin.scatter.floor * np.median(noises_v) / (np.median(gains_v) * scale)
+    return {
+        "noise": float(np.clip(noise, 1e-3, 10)),
+        "scatter": twin.scatter.share,
+        "scatter_common": twin.scatter.common,
+    }

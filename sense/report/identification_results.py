@@ -106,9 +106,9 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
     frame = document["frame"]
     return [
         f"twin of {document['presses']} presses -> {out / 'twin.json'}",
-        "channel fibre  gain (mV)  noise (mV)  explained  beside its plan (mm)",
+        "channel fibre gain (mV/%)  noise (mV)  explained  beside its plan (mm)",
         *(
-            f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 1e3:10.1f} {row['noise_v'] * 1e3:11.2f} "
+            f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 10:10.1f} {row['noise_v'] * 1e3:11.2f} "
             + (
                 f"{row['explained']:10.2f} {row['aside_mm']:10.2f} +- {row['unsure_mm']:.2f}"
                 if "aside_mm" in row
@@ -125,7 +125,7 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
 
 
 def _line(row: Mapping[str, Any]) -> str:
-    line = f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 1e3:10.1f} {row['noise_v'] * 1e3:11.2f}"
+    line = f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 10:10.1f} {row['noise_v'] * 1e3:11.2f}"
     return line + (
         f" {row['explained']:10.2f} {row['aside_mm']:10.2f} +- {row['unsure_mm']:.2f}" if "aside_mm" in row else ""
     )
@@ -164,13 +164,13 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
             row["channel"] + 1,
             _fibre(row),
             ", ".join(str(fibre + 1) for fibre in row["or_fibres"]) or "-",
-            f"{row['gain_v'] * 1e3:.1f}",
+            f"{row['gain_v'] * 10:.1f}",
             f"{row['noise_v'] * 1e3:.2f}",
             *([f"{row['explained']:.2f}", f"{row['aside_mm']:.2f} ± {row['unsure_mm']:.2f}"] if row in live else "--"),
         ]
         for row in document["channels"]
     ]
-    head = ["channel", "fibre", "or", "gain (mV a grid unit)", "noise (mV)", "explained", "beside its plan (mm)"]
+    head = ["channel", "fibre", "or", "gain (mV a %)", "noise (mV)", "explained", "beside its plan (mm)"]
     return [
         PageSection(
             "How the pad was laid",

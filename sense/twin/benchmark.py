@@ -40,8 +40,8 @@ CLOSE = Contact(radius=0.6)
 REACHES = ("gaussian", "disc", "skirted")
 WIDTH = 0.55
 """Standard deviation of the Gaussian reach, grid units; the others are about as wide."""
-GAIN_V, UNEVEN_GAIN = -0.06, 0.2
-"""V a grid unit, and how far channels differ in it: standard deviation of its logarithm."""
+GAIN_V, UNEVEN_GAIN = -0.5, 0.2
+"""V for a relative stretch of 1, and how far channels differ in it: standard deviation of its logarithm."""
 SMOOTH = 1.5
 """Length over which the way beside the plan changes, grid units."""
 
@@ -111,7 +111,7 @@ def printed_pad(
 
     silent = twin(0.0)
     places = rng.uniform(-0.5, 0.5, (400, 2)) * (width, height)
-    signals = silent.laid_signals(places)
+    signals = silent.laid_stretch(places)
     largest = [abs(gains[c]) * signals[:, fibre].max() for c, fibre in enumerate(read) if fibre is not None]
     return twin(noise * float(np.mean(largest)))
 
@@ -186,7 +186,7 @@ def _judged(world: str, found: Identification | Predict) -> Mapping[str, float |
     """Error of responses at fresh places, share of their spread; and of an identification what else it found."""
     pad = _pad(world)
     places_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (FRESH, 2)) * pad.sensed_mm
-    signals_there, live = pad.laid_signals(places_mm), [c for c in pad.channels if c.fibre is not None]
+    signals_there, live = pad.laid_stretch(places_mm), [c for c in pad.channels if c.fibre is not None]
     true = np.column_stack([channel.gain_v * signals_there[:, channel.fibre] for channel in live])
     if not isinstance(found, Identification):
         return {"error": _off(found(places_mm)[:, [channel.channel for channel in live]], true)}

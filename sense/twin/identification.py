@@ -18,6 +18,7 @@ from .fitting import Fit, Freedom, fit
 from .identified_pad import Identification
 from .laid_pad import LaidPad, Plan
 from .responses import Responses, information, of_one_depth, responses
+from .scatter import response_scatter
 from .smooth import smooth_function
 from .wiring import Wiring, wirings
 
@@ -104,6 +105,7 @@ def identify(
         [wiring for wiring, each in laid[1:] if best.evidence - each.evidence < DOUBT],
         _explained_on_plan([bare for _, bare in straight], learnt, held_out) if straight else None,
         _readings(recording, live, found.pad, noise_v, learnt.places_mm),
+        response_scatter(found.pad, learnt, noise_v[live]),
         learnt,
         held_out,
     )

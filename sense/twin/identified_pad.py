@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from design import Morphology
-from design.pad.twin import Twin, TwinChannel, TwinReadings
+from design.pad.courses.curves import lengths
+from design.pad.twin import Twin, TwinChannel, TwinReadings, TwinScatter
 from sense.recordings.processing.limits import Array, Indices, Mask
 
 from .fitting import Fit
@@ -33,6 +34,7 @@ class Identification:
         doubts: other wirings that the presses cannot tell from the one found.
         straight: what straight fibres explain that lie and are wired as suits them best; None where this pad's are.
         readings: how they run beside what presses answer; None where too few presses tell.
+        scatter: what of the noise grows with the response.
         learnt, held_out: responses of the live channels learnt from, and held out.
     """
 
@@ -47,6 +49,7 @@ class Identification:
     doubts: list[Wiring]
     straight: float | None
     readings: TwinReadings | None
+    scatter: TwinScatter
     learnt: Responses
     held_out: Responses
 
@@ -71,13 +74,13 @@ class Identification:
         own = dict(zip(self.live.tolist(), range(len(self.live)), strict=True))
         courses: list[Array | None] = [None] * len(self.pad.knots)
         counts: list[Array | None] = list(courses)
-        gains = np.zeros(len(self.noise_v))
+        gains, fibre_lengths = np.zeros(len(self.noise_v)), lengths(self.pad)
         for channel, row in own.items():
             line, counted = laid.course(row)
             fibre, mean = laid.fibres[row], counted.mean()
             ends = [1.5 * line[:1] - 0.5 * line[1:2], (line[1:] + line[:-1]) / 2, 1.5 * line[-1:] - 0.5 * line[-2:-1]]
             courses[fibre], counts[fibre] = self.pad.to_mm(np.vstack(ends)), counted / mean
-            gains[channel] = laid.own[row, 0] * mean
+            gains[channel] = laid.own[row, 0] * mean * fibre_lengths[fibre]
         distance, weights = _trimmed(laid)
         pressed = laid.frame.to_plan(self.learnt.places_mm)
         return Twin(
@@ -103,6 +106,7 @@ class Identification:
             tuple(counts),
             provenance or {},
             self.readings,
+            self.scatter,
         )
 
 

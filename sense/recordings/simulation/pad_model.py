@@ -220,7 +220,7 @@ class Divider:
         self._rig, self._rng, self._linear = rig, rng, linear
 
     def __call__(self, strained: Array) -> Array:
-        """(R, C) strain, the relative stretch at full depth or V, going on from what was asked before, to (R, C) volts."""
+        """(R, C) strain, relative stretch or V, going on from what was asked before, to (R, C) volts."""
         if not len(strained):
             return strained
         shown = self._answer(strained)
