@@ -322,7 +322,7 @@ def test_a_list_that_holds_itself_is_refused():
     endless = []
     endless.append(endless)
     with pytest.raises(InputError, match=r"\[pad\] keep_out_mm"):
-        PadSettings(keep_out_mm=endless)
+        Spec({}).section(PadSettings, keep_out_mm=endless)
 
 
 def test_functions_that_restate_the_paper_have_its_contact_by_default():

@@ -154,5 +154,7 @@ def test_settings_are_read_from_a_spec_and_nothing_else(other):
 
 
 def test_numbers_of_numpy_are_numbers():
-    assert MouldSettings(wall_mm=np.int64(3)) == MouldSettings(wall_mm=3)
-    assert PrinterSettings(bed_mm=np.array([200, 210, 220])) == PrinterSettings(bed_mm=[200, 210, 220])
+    assert Spec({}).section(MouldSettings, wall_mm=np.int64(3)) == MouldSettings(wall_mm=3)
+    assert Spec({}).section(PrinterSettings, bed_mm=np.array([200, 210, 220])) == PrinterSettings(
+        bed_mm=[200, 210, 220]
+    )

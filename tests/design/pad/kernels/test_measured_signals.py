@@ -1,5 +1,7 @@
 """Signals of a measured reach as a search takes them: beside the exact ones, and elements no more than are felt."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -21,7 +23,7 @@ REACHES = {
 """In grid units."""
 
 
-def contact_of(reach, length="euclidean"):
+def contact_of(reach, length: Literal["manhattan", "euclidean"] = "euclidean"):
     """The contact on pads of the default pitch."""
     return Contact(reach=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
 
