@@ -54,9 +54,7 @@ def contact_line(document: Mapping[str, Any]) -> str:
     for pad in ("designed", "straight"):
         believed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
         told.append(f"{believed:.2f} mm as believed, {min(others):.2f} to {max(others):.2f} mm otherwise")
-    return (
-        f"contact: with a small network on one reading of each fibre the pad errs by {told[0]}; straight by {told[1]}"
-    )
+    return f"contact: a small network on one reading of each fibre errs by {told[0]}; of straight ones by {told[1]}"
 
 
 def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
