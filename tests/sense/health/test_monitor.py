@@ -5,12 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from design import Morphology
 from design.common.errors import InputError
+from design.settings import PUBLISHED_CONTACT
 from sense import Recording, open_recording
+from sense import settings as sense_settings
 from sense.health.fault_likelihoods import HYPOTHESES
 from sense.health.fibre_prediction import TRACE
 from sense.health.health_model import HealthModel
 from sense.health.monitor import TEXTS, FibreFault, Monitor, _Press, examine, fault_lines
+from sense.recordings.simulation.published_protocol import simulate
 from tests.sense.health.pads import (
     BAD_FROM,
     LEARNT,
@@ -76,6 +80,16 @@ def test_one_value_farther_off_than_rests_ever_spread_is_open_and_else_stuck(
 
 def test_a_healthy_pad_is_left_in_peace(pad: Recording, model: HealthModel) -> None:
     assert later(model, pad.readings, pad) == []
+
+
+@pytest.mark.parametrize("after", [0, 3])
+def test_a_healthy_pad_is_left_in_peace_where_the_last_release_was_not_recorded(model: HealthModel, after: int) -> None:
+    """A simulated recording ends when the probe is sent up; others some readings later."""
+    for seed in range(9, 18):
+        rig = sense_settings.RigSettings(presses=31, seed=seed, drift_mv=10)
+        pad = simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT)
+        end = pad.lifted[29] + after
+        assert examine(model, pad.readings[:end], pad.times_s[:end], pad.begun[:30], pad.lifted[:30]) == [], seed
 
 
 def test_presses_one_by_one_tell_the_same(pad: Recording, model: HealthModel) -> None:
