@@ -118,6 +118,20 @@ def test_missing_readings_speak_for_nothing_until_they_are_missing_for_long(pad:
     assert finding.press - finding.since == 19
 
 
+def test_a_fibre_is_missing_after_twenty_presses_on_end(pad: Recording, model: HealthModel) -> None:
+    def without(*presses: range) -> list[tuple[int, int, str]]:
+        readings = pad.readings.copy()
+        for each in presses:
+            readings[pad.begun[BAD_FROM + each.start] : pad.lifted[BAD_FROM + each.stop - 1], 2] = np.nan
+        return [(finding.press, finding.since, finding.kind) for finding in later(model, readings, pad)]
+
+    first = BAD_FROM - LEARNT
+    assert without(range(19)) == []
+    assert without(range(19), range(20, 39)) == []  # the press between begins the count anew
+    assert without(range(20)) == [(first + 19, first, "missing")]
+    assert without(range(45)) == [(first + 19, first, "missing")]
+
+
 def test_a_recording_that_does_not_fit_is_refused(pad: Recording, model: HealthModel) -> None:
     presses = pad.begun, pad.lifted
     with pytest.raises(InputError, match="readings are of 5 fibres, health was learnt from 6"):
