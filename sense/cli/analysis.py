@@ -7,7 +7,7 @@ import click
 from design.common import command_line as common
 from design.common.errors import InputError
 
-from .options import FOLDER, lost_option, model_option, recording_argument, reported
+from .options import FOLDER, FibreNumbers, fibre_indices, lost_option, model_option, recording_argument, reported
 
 
 @click.command()
@@ -51,6 +51,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 @click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for every loss.")
 @click.option("--retrain", is_flag=True, help="As published: another network for every set of lost fibres.")
 @lost_option
+@click.option("--failed", type=FibreNumbers(), default=(), help="Map errors without these fibres too, from 1: as 2,5.")
 @common.seed_option
 @common.spec_option
 @common.out_option()
@@ -60,6 +61,7 @@ def fibre_loss(
     model: Path | None,
     retrain: bool,
     lost: int,
+    failed: tuple[int, ...],
     seed: int | None,
     spec: Path | None,
     out: Path | None,
@@ -70,7 +72,8 @@ def fibre_loss(
     \b
     padforge sense fibre-loss out/pad/recording --model out/pad
 
-    Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper). Retrained networks that are done are
+    Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
+    worst set of each size, and without those fibres that --failed names. Retrained networks that are done are
     kept when it is broken off, and the same command goes on from them.
     """
     from design.common.checkpoints import Checkpoints
@@ -95,6 +98,7 @@ def fibre_loss(
             retrain=retrain,
             options=options,
             lost=lost,
+            failed=fibre_indices(failed, opened.fibres),
             keep_in=unfinished,
             progress=report,
         )

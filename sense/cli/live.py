@@ -127,10 +127,10 @@ def _connected(
     stack: ExitStack, rig: str, model: Path, localizer: "Localizer", spec: Path | None
 ) -> "tuple[Source, bool]":
     """The readings of a converter, until `stack` is left, and whether the pad lies with its tracks up."""
-    from sense.live.sources import connected
+    from sense.live.sources import connected, lies_mirrored
     from sense.settings import RigSettings
 
-    mirrored = bool(load_spec(spec).section(RigSettings).mirrored)
+    mirrored = lies_mirrored(model, load_spec(spec).section(RigSettings))
     converter = _converter(rig, model, localizer, spec)
     stack.callback(converter.close)
     return connected(converter, localizer.rate_hz), mirrored

@@ -61,17 +61,39 @@ def press_trace(readings: Array, begun: int, lifted: int, low: int, high: int) -
             is filled with the nearest.
 
     Returns:
-        (C, TRACE) volts.
+        (C, TRACE) volts; NaN after the release if the press has no reading of its own from there.
     """
     before = np.arange(begun - REST, begun).clip(min(low, begun - 1))
     down = np.minimum(np.arange(begun, begun + SUNK), lifted - 1)
     up = np.minimum(np.arange(lifted, lifted + RELEASED), high - 1)
-    return readings[np.concatenate([before, down, up])].T
+    trace = readings[np.concatenate([before, down, up])].T
+    if high <= lifted:
+        # The nearest reading is of the pressed pad: the fibres would look as if they had stayed where they were.
+        trace[:, -RELEASED:] = np.nan
+    return trace
+
+
+def press_ranges(readings: Array, begun: Indices, lifted: Indices) -> tuple[Array, Indices, Indices]:
+    """Bound the readings that belong to each press by its neighbours.
+
+    Args:
+        readings: (R, C) volts.
+        begun: (Q,) first reading after the probe was sent down.
+        lifted: (Q,) first reading after it was sent up.
+
+    Returns:
+        Readings, with NaN where the recording ends before the last press has been released for RELEASED readings; and
+        (Q,) the first reading of each press, and the first that is no longer its own.
+    """
+    # No press follows that cuts the last one off, so what lacks of it is missing, and is not filled.
+    missing = max(int(lifted[-1]) + RELEASED - len(readings), 0)
+    readings = np.pad(readings, ((0, missing), (0, 0)), constant_values=np.nan) if missing else readings
+    return readings, np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
 
 
 def traces_of(readings: Array, begun: Indices, lifted: Indices) -> Array:
     """(Q, C, TRACE) traces of all presses of (R, C) readings."""
-    lows, highs = np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
+    readings, lows, highs = press_ranges(readings, begun, lifted)
     return np.stack([press_trace(readings, *press) for press in zip(begun, lifted, lows, highs, strict=True)])
 
 

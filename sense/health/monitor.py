@@ -13,7 +13,7 @@ from sense.recordings.processing.limits import MAX_VOLTS, Array, Floats, Indices
 
 from .alarm_thresholds import climb
 from .fault_likelihoods import HYPOTHESES, MOST, noise_of
-from .fibre_prediction import RELEASED, REST, History, expected, press_trace
+from .fibre_prediction import RELEASED, REST, History, expected, press_ranges, press_trace
 from .health_model import SETTLED, HealthModel, checked_presses
 
 MISSING = 20
@@ -108,7 +108,7 @@ class Monitor:
 
         Args:
             readings: (R, C) volts, NaN where missing: of this press alone, best from 10 readings before the probe was
-                sent down to 20 after it was sent up.
+                sent down to 20 after it was sent up; fewer after it only where the next press begins.
             begun, lifted: first of them after the probe was sent down, and up; 1 <= begun < lifted <= R.
 
         Returns:
@@ -271,7 +271,7 @@ def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices,
     readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
     instance("model", model, HealthModel).refuse_other(readings, times_s)
     monitor = Monitor(model)
-    lows, highs = np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
+    readings, lows, highs = press_ranges(readings, begun, lifted)
     findings: list[FibreFault] = []
     for down, up, low, high in zip(begun, lifted, lows, highs, strict=True):
         first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)

@@ -14,7 +14,7 @@ from design.common.settings import validated
 from design.settings import Contact, PadSettings
 from sense.recordings.processing.limits import Array
 from sense.recordings.recorder import FORMAT, START
-from sense.recordings.recording import Recording
+from sense.recordings.recording import Recording, is_mirrored
 from sense.rig.devices.protocols import Converter
 from sense.rig.session.averaging import Averager
 from sense.settings import RigSettings
@@ -82,6 +82,25 @@ def replayed(recording: Recording, speed: float) -> Source:
             done = end
 
     return Source(recording.fibres, recording.rate_hz, blocks())
+
+
+def lies_mirrored(model: Path, rig: RigSettings) -> bool:
+    """Return whether the pad lies with its tracks up, so that x and y of its plan are right-handed with z into it.
+
+    `[rig]` says so. Where it leaves that open, the pad lies as it did when the model was learnt: in a holder, perhaps,
+    which only the recording tells of.
+
+    Args:
+        model: folder of the model.
+        rig: settings of the rig that reads the pad.
+
+    Raises:
+        InputError: the recording beside the model is damaged.
+    """
+    if rig.mirrored is not None:
+        return rig.mirrored
+    path = model / RECORDED / START
+    return path.is_file() and is_mirrored(read_json(path, FORMAT).get("source"))
 
 
 def simulated(model: Path) -> "SimulatedConverter":

@@ -121,8 +121,7 @@ class Recording:
     @property
     def mirrored(self) -> bool:
         """Whether `[rig]` said that the pad lay with its tracks up: seen from above, x ran to the left of y."""
-        rig = self.source.get("rig")
-        return isinstance(rig, Mapping) and rig.get("mirrored") is True
+        return is_mirrored(self.source)
 
     @property
     def rate_hz(self) -> float:
@@ -293,6 +292,12 @@ def _validate_measured(recording: Recording, name: str, limit: float, unit: str)
         press = int(np.argmax(wrong))
         least = "more than 0" if name == "depths_mm" else "0 or more"
         raise InputError(f"{name} of press {press} is {values[press]:g} {unit}, allowed is {least}")
+
+
+def is_mirrored(source: object) -> bool:
+    """Return whether the source of a recording says that the pad lay with its tracks up, see `Recording.mirrored`."""
+    rig = source.get("rig") if isinstance(source, Mapping) else None
+    return isinstance(rig, Mapping) and rig.get("mirrored") is True
 
 
 def rate_of(times_s: Array) -> float:

@@ -14,9 +14,9 @@ _WIDTH = 0.36
 
 def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
     """Draw the error against the number of lost fibres, every way beside the others, and every set as a dot; below,
-    each way's errors over the pad, with all fibres and without the worst set of each size."""
+    each way's errors over the pad, with all fibres, without the worst set of each size, and without a chosen one."""
     ways = document["ways"]
-    columns = len(next(iter(ways.values()))["errors"])
+    columns = len(next(iter(ways.values()))["maps"])
     figure = Figure(figsize=(max(6.4, 1.9 * columns), 4.4 + 1.9 * len(ways)), layout="constrained")
     grid = figure.add_gridspec(1 + len(ways), columns, height_ratios=[4.4] + [1.9] * len(ways))
     axes = figure.add_subplot(grid[0, :])

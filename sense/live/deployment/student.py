@@ -154,7 +154,9 @@ def teach(
     shown, rows = plain[taught] + found.inputs[also], np.concatenate([taught, press[also]])
     scaling, table = Normalization.fit(shown, lessons[rows].places_mm, lessons[rows].measures)
     size = {"members": 1, "hidden": hidden, "layers": LAYERS, "lost": levels - 1, "epochs": LONGER * options.epochs}
-    weights = _trained(_samples(scaling, shown, lessons[rows]), table, options.model_copy(update=size), rng, progress)
+    # LONGER alone says for how long, whichever features the localizer is to take.
+    own = options.model_copy(update={**size, "features": "full"})
+    weights = _trained(_samples(scaling, shown, lessons[rows]), table, own, rng, progress)
     localizer = Localizer(
         as_int8(weights) if budget.quantized else weights,
         scaling,

@@ -5,7 +5,7 @@ experiment) knows beforehand which fibres will be lost, and trains on the others
 which up to 3 are lost.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,6 +41,7 @@ def fibre_loss_study(
     retrain: bool = False,
     options: settings.LocalizerSettings | None = None,
     lost: int = 3,
+    failed: Sequence[int] = (),
     keep_in: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
@@ -52,17 +53,19 @@ def fibre_loss_study(
         localizer: the one network; None for the second way alone. retrain: whether the second way is wanted.
         options: split, share and seed; the defaults if None.
         lost: fibres that are lost at once, at most; no more than leave one.
+        failed: fibres, by index, without which errors are mapped too, however many they are; none where empty.
         keep_in: folder for the networks that are done, from which a run that was broken off goes on;
             `Checkpoints.clear` removes them once the document is kept.
         progress: called with (networks done, networks in all).
 
     Returns:
         A document with "ways": for each, "errors" and "by_subset" as `evaluate` gives them, and "maps", errors by place
-        without the worst set of each size; and "test_presses".
+        without the worst set of each size and, at the end, without `failed`; and "test_presses".
 
     Raises:
-        InputError: neither way wanted, too few presses, a recording seen in a recalibration or that does not suit the
-            localizer, a localizer that knows no lost fibres, or networks in `keep_in` of other settings.
+        InputError: neither way wanted, no such fibres or none left, too few presses, a recording seen in a
+            recalibration or that does not suit the localizer, a localizer that knows no lost fibres, or networks in
+            `keep_in` of other settings.
     """
     instance("retrain", retrain, bool)
     if localizer is None and not retrain:
@@ -72,16 +75,17 @@ def fibre_loss_study(
         instance("localizer", localizer, Localizer)
     keep_in = None if keep_in is None else path("keep_in", keep_in)
     options, lost = or_default("options", options, settings.LocalizerSettings), whole("lost", lost, 0, MAX_FIBRES)
+    chosen = _chosen(failed, recording.fibres)
     training, test = split_unseen(recording, localizer, options)
     levels = range(min(lost, recording.fibres - 1) + 1)
     places_mm = recording.presses_mm[test]
     ways: dict[str, Any] = {}
     if localizer is not None:
         locate = partial(localizer.locate, localizer.inputs(recording)[test])
-        ways[ONE] = _way(recording.fibres, levels, locate, places_mm)
+        ways[ONE] = _way(recording.fibres, levels, chosen, locate, places_mm)
     if retrain:
-        found = _retrained(recording, training, test, options, levels, keep_in, progress)
-        ways[MANY] = _way(recording.fibres, levels, found.__getitem__, places_mm)
+        found = _retrained(recording, training, test, options, levels, chosen, keep_in, progress)
+        ways[MANY] = _way(recording.fibres, levels, chosen, found.__getitem__, places_mm)
     made_by = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
     return {
@@ -94,13 +98,27 @@ def fibre_loss_study(
     }
 
 
-def _way(fibres: int, levels: range, locate: Callable[[Lost], Found], places_mm: Array) -> dict[str, Any]:
+def _chosen(failed: Sequence[int], fibres: int) -> list[Lost]:
+    """The set of fibres that is mapped beside the worst ones, if there is one."""
+    numbers = instance("failed", failed, Sequence)
+    subset = tuple(sorted({whole("failed fibre", fibre, 0, fibres - 1) for fibre in numbers}))
+    if len(subset) == fibres:
+        raise InputError(f"failed are all {fibres} fibres, at least one must be left")
+    return [subset] if subset else []
+
+
+def _way(
+    fibres: int, levels: range, chosen: Sequence[Lost], locate: Callable[[Lost], Found], places_mm: Array
+) -> dict[str, Any]:
     rows, by_subset = errors_by_loss(fibres, levels, locate, places_mm)
     worst = [
         max((each for each in by_subset if len(each["lost"]) == level), key=lambda each: each["mean_mm"])["lost"]
         for level in levels
     ]
-    maps = [{"lost": lost, "by_place": by_place(locate(tuple(lost)).places_mm, places_mm)} for lost in worst]
+    maps = [
+        {"lost": list(lost), "by_place": by_place(locate(tuple(lost)).places_mm, places_mm)}
+        for lost in (*worst, *chosen)
+    ]
     return {"errors": rows, "by_subset": by_subset, "maps": maps}
 
 
@@ -110,11 +128,13 @@ def _retrained(
     test: Indices,
     options: settings.LocalizerSettings,
     levels: range,
+    chosen: Sequence[Lost],
     keep_in: Path | None,
     progress: Callable[[int, int], None],
 ) -> dict[Lost, Found]:
     """What the network of each set of lost fibres finds for the test presses; finished ones are not made again."""
     subsets = [subset for level in levels for subset in lost_subsets(recording.fibres, level)]
+    subsets += [subset for subset in chosen if subset not in subsets]
     about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
     kept = Checkpoints(keep_in, {"fibre-loss": about}) if keep_in else None
     states = kept.begin(resume=True) if kept else {}

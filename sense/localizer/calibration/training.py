@@ -35,8 +35,8 @@ from .networks.masked_network import draw_alive, entries, forward_fast, initial,
 from .networks.training_presses import TrainingPresses, as_unseen
 
 LEAST_BATCHES, MOST_STEPS, LONGER = 10, 11_000, 2
-"""Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths,
-which are harder to learn, so many times more."""
+"""Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths, and
+without the release, which are harder to learn, so many times more."""
 WEIGHT_DECAY = 1e-2
 INPUT_NOISE = 0.02
 """Noise on the scaled inputs while training, their spread being about 1."""
@@ -143,7 +143,7 @@ def train_members(
     """
     begin = time.monotonic()
     learn = as_unseen(learn, table)
-    steps = training_steps(len(learn.inputs), options) * (LONGER if learn.stretch else 1)
+    steps = training_steps(len(learn.inputs), options) * (LONGER if learn.stretch or options.features != "full" else 1)
     networks, seconds = options.members, None
     with one_torch_thread():
         if time_budget is not None:

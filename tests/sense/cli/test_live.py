@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ from design import Morphology
 from sense import Localizer, Recording
 from sense.cli.live import view_lines
 from sense.live.page_server import LivePage
+from sense.live.streams import messages
 from sense.recordings.simulation.published_protocol import simulate
 from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.rig.emulators import live_pad
@@ -80,6 +82,32 @@ def test_a_replay_shows_the_pad_as_it_lay(
     monkeypatch.setattr(LivePage, "show", lambda page, view: seen.append(view))
     assert live("--replay", str(tmp_path / "short"), "--speed", "1e6")[0] == 0
     assert {view["mirrored"] for view in seen} == {mirrored}
+
+
+def test_a_rig_shows_the_pad_as_it_lay_when_the_model_was_learnt(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A holder had said that it lies with its tracks up, so that `[rig]` leaves it open."""
+
+    class Ended(SimulatedConverter):
+        def read(self) -> ConverterSamples:
+            raise KeyboardInterrupt
+
+    shutil.copytree(model, tmp_path / "model")
+    path = tmp_path / "model/recording/start.json"
+    start = json.loads(path.read_text())
+    start["source"]["rig"]["mirrored"] = True
+    path.write_text(json.dumps(start))
+    seen: list[dict] = []
+    told: list[bool] = []
+    monkeypatch.setattr(live_pad, "SimulatedConverter", Ended)
+    monkeypatch.setattr(LivePage, "show", lambda page, view: seen.append(view))
+    monkeypatch.setattr(messages, "Messages", lambda pipeline, mirrored: told.append(mirrored))
+    arguments = ["padforge", "sense", "live", "--port", "0", "--model", str(tmp_path / "model")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit):
+        padforge.main()
+    assert {view["mirrored"] for view in seen} == set(told) == {True}
 
 
 def test_mistakes_and_faults_are_one_line(live, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from sense.health.fibre_prediction import (
     COMPONENTS,
     INPUTS,
     MEMBERS,
+    RELEASED,
     REST,
     TARGETS,
     TRACE,
@@ -130,6 +131,22 @@ def test_the_trace_of_a_press_keeps_to_it() -> None:
     assert whole[0].tolist() == [*range(20, 50), *range(55, 75)]
     tight = fibre_prediction.press_trace(readings, begun=30, lifted=34, low=28, high=36)
     assert tight[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
+
+
+def test_what_was_not_recorded_of_a_release_is_missing() -> None:
+    readings = np.arange(100.0)[:, None] * [1.0, 2.0]
+    # The next press begins before a reading of the release was taken.
+    none = fibre_prediction.press_trace(readings, begun=30, lifted=55, low=0, high=55)
+    assert none[0, :-RELEASED].tolist() == [*range(20, 50)]
+    assert np.isnan(none[:, -RELEASED:]).all()
+    begun, lifted = np.array([10, 50]), np.array([30, 70])
+    for end in (70, 74, 90):
+        cut_off, last = traces_of(readings[:end], begun, lifted)[:, 0]
+        assert cut_off[-RELEASED:].tolist() == [*range(30, 50)]
+        assert np.array_equal(last, [*range(40, 70), *range(70, end), *[np.nan] * (90 - end)], equal_nan=True)
+    # One that the next press cuts short is filled.
+    cut_off, _ = traces_of(readings, begun, np.array([45, 70]))[:, 0]
+    assert cut_off[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]
 
 
 def test_the_others_tell_what_a_fibre_answers(pad: Recording, model: HealthModel) -> None:

@@ -5,12 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from design import Morphology
 from design.common.errors import InputError
+from design.settings import PUBLISHED_CONTACT
 from sense import Recording, open_recording
+from sense import settings as sense_settings
 from sense.health.fault_likelihoods import HYPOTHESES
 from sense.health.fibre_prediction import TRACE
 from sense.health.health_model import HealthModel
 from sense.health.monitor import TEXTS, FibreFault, Monitor, _Press, examine, fault_lines
+from sense.recordings.simulation.published_protocol import simulate
 from tests.sense.health.pads import (
     BAD_FROM,
     LEARNT,
@@ -78,6 +82,16 @@ def test_a_healthy_pad_is_left_in_peace(pad: Recording, model: HealthModel) -> N
     assert later(model, pad.readings, pad) == []
 
 
+@pytest.mark.parametrize("after", [0, 3])
+def test_a_healthy_pad_is_left_in_peace_where_the_last_release_was_not_recorded(model: HealthModel, after: int) -> None:
+    """A simulated recording ends when the probe is sent up; others some readings later."""
+    for seed in range(9, 18):
+        rig = sense_settings.RigSettings(presses=31, seed=seed, drift_mv=10)
+        pad = simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT)
+        end = pad.lifted[29] + after
+        assert examine(model, pad.readings[:end], pad.times_s[:end], pad.begun[:30], pad.lifted[:30]) == [], seed
+
+
 def test_presses_one_by_one_tell_the_same(pad: Recording, model: HealthModel) -> None:
     readings = pad.readings.copy()
     noisy(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
@@ -102,6 +116,20 @@ def test_missing_readings_speak_for_nothing_until_they_are_missing_for_long(pad:
     assert (finding.kind, finding.fibres) == ("missing", (2,))
     # The trace of the press before reaches into the gap only where presses follow at once: here it does.
     assert finding.press - finding.since == 19
+
+
+def test_a_fibre_is_missing_after_twenty_presses_on_end(pad: Recording, model: HealthModel) -> None:
+    def without(*presses: range) -> list[tuple[int, int, str]]:
+        readings = pad.readings.copy()
+        for each in presses:
+            readings[pad.begun[BAD_FROM + each.start] : pad.lifted[BAD_FROM + each.stop - 1], 2] = np.nan
+        return [(finding.press, finding.since, finding.kind) for finding in later(model, readings, pad)]
+
+    first = BAD_FROM - LEARNT
+    assert without(range(19)) == []
+    assert without(range(19), range(20, 39)) == []  # the press between begins the count anew
+    assert without(range(20)) == [(first + 19, first, "missing")]
+    assert without(range(45)) == [(first + 19, first, "missing")]
 
 
 def test_a_recording_that_does_not_fit_is_refused(pad: Recording, model: HealthModel) -> None:

@@ -12,7 +12,8 @@ from design import Morphology
 from design.common.errors import InputError
 from design.settings import PUBLISHED_CONTACT
 from sense import Recording
-from sense.live.sources import connected, replayed, simulated
+from sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
+from sense.recordings.recorder import FORMAT, START
 from sense.recordings.simulation.published_protocol import simulate
 from sense.rig.boards.due.driver import Arduino
 from sense.rig.devices.protocols import ConverterSamples, RigFault
@@ -117,6 +118,27 @@ def test_a_board_is_followed_and_its_loss_told() -> None:
                     pass
         finally:
             converter.close()
+
+
+@pytest.mark.parametrize(
+    ("said", "recorded", "lies"),
+    [
+        (None, True, True),  # a holder had said so
+        (None, False, False),
+        (None, None, False),
+        (True, False, True),
+        (False, True, False),
+    ],
+)
+def test_a_pad_lies_as_the_rig_says_or_else_as_it_was_recorded(
+    tmp_path: Path, said: bool | None, recorded: bool | None, lies: bool
+) -> None:
+    rig = RigSettings(mirrored=said)
+    assert lies_mirrored(tmp_path, rig) is bool(said)  # no recording lies beside the model
+    (tmp_path / RECORDED).mkdir()
+    start = {"format": FORMAT, "source": {"kind": "rig", "rig": {"mirrored": recorded}}}
+    (tmp_path / RECORDED / START).write_text(json.dumps(start))
+    assert lies_mirrored(tmp_path, rig) is lies
 
 
 def test_the_simulated_pad_is_that_of_the_model(model: Path, tmp_path: Path) -> None:

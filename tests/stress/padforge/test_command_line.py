@@ -85,7 +85,10 @@ COMMANDS: dict[tuple[str, ...], tuple[list[tuple[str, ...]], dict[str, tuple[str
     ("sense", "recalibrate"): ([RECORDING], {"--model": ("empty",), "--seed": SEED, "--out": FOLDER, "--json": None}),
     ("sense", "fibre-loss"): (
         [RECORDING],
-        {"--model": MODEL, "--lost": ("0", "1"), "--seed": SEED, "--spec": SPEC, "--out": FOLDER, "--json": None},
+        {
+            **{"--model": MODEL, "--lost": ("0", "1"), "--failed": ("1", "1,2"), "--seed": SEED},
+            **{"--spec": SPEC, "--out": FOLDER, "--json": None},
+        },
     ),
     ("sense", "learning-curve"): ([RECORDING], {"--seed": SEED, "--spec": SPEC, "--out": FOLDER, "--json": None}),
     ("sense", "live", "--replay", "pad/recording"): (

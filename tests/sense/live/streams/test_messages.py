@@ -1,14 +1,16 @@
 """Messages for other programs: what they say agrees with what the pipeline found."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sense import Live, Localizer, Recording
 from sense.health.monitor import FibreFault
+from sense.live.pipeline import Estimate
 from sense.live.streams.messages import FORMAT, Message, Messages
-from sense.recordings.formats.ros.topics import HEALTH, KINDS, PRESSED, READINGS, TOUCHES
+from sense.recordings.formats.ros.topics import HEALTH, KINDS, PRESSED, READINGS, TOUCHES, heights
 
 
 @pytest.fixture
@@ -51,6 +53,24 @@ def test_places_are_metres_with_variances(told) -> None:
         assert (position["z"], covariance[14]) == (0, -1)  # depth was not learnt
         stamp = message.msg["header"]["stamp"]
         assert stamp["sec"] + stamp["nanosec"] * 1e-9 == pytest.approx(pad["time_s"], abs=1e-9)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_touch_lies_below_the_surface_in_a_right_handed_frame(
+    brief: Recording, localizer: Localizer, mirrored: bool
+) -> None:
+    """Seen from above, y of the plan runs up and x to the right, or to the left where the pad lies with its tracks up;
+    depth runs away from whoever looks."""
+    pipeline = Live([localizer], None, brief.fibres, brief.rate_hz)
+    estimate = Estimate(0, 1.5, "full", True, 3, 4, 1, 1, 1, 2, (), depth_mm=2.5, depth_r90_mm=0.5)
+    events = Messages(pipeline, mirrored).of(brief.times_s[:1], brief.readings[:1], [estimate])
+    (touch,) = of(TOUCHES, list(events))
+    pose = touch.msg["pose"]
+    z_axis = np.cross([-1 if mirrored else 1, 0, 0], [0, 1, 0])
+    assert pose["pose"]["position"]["z"] == pytest.approx(np.dot([0, 0, -2.5e-3], z_axis))
+    assert pose["covariance"][14] == pytest.approx((0.5e-3 / 1.6449) ** 2)
+    exported = replace(brief, source={"rig": {"mirrored": mirrored}})
+    assert pose["pose"]["position"]["z"] == heights(exported, np.array([2.5]))[0]
 
 
 def test_health_is_told_first_and_with_every_fault(told, brief, localizer) -> None:

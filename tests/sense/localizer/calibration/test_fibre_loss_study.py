@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import padforge
 from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fibre_loss_study as loss_study
 from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
+from sense.report import fibre_loss_figure
 from sense.settings import LocalizerSettings as Options
 
 
@@ -52,6 +54,27 @@ def test_both_ways_stand_side_by_side_on_the_same_presses(localizer: Localizer, 
     assert document["training_presses"] == 300 - len(localizer.test)
     json.dumps(document, allow_nan=False)
     assert len(loss_study.fibre_loss_lines(document)) == 6
+
+
+def test_a_chosen_set_of_fibres_is_mapped_beside_the_worst_ones(localizer: Localizer, recording: Recording) -> None:
+    """Of more fibres, too, than are lost in the errors."""
+    document = fibre_loss_study(recording, localizer, retrain=True, lost=1, failed=(3, 1, 3))
+    plain = fibre_loss_study(recording, localizer, retrain=True, lost=1)
+    for name, way in document["ways"].items():
+        *worst, chosen = way["maps"]
+        assert chosen["lost"] == [1, 3]
+        assert {**way, "maps": worst} == plain["ways"][name]
+    expected = evaluate(localizer, recording, (2,))["by_subset"]
+    (mean_mm,) = (each["mean_mm"] for each in expected if each["lost"] == [1, 3])
+    cells = document["ways"][ONE]["maps"][-1]["by_place"]
+    weights = [cell["presses"] for cell in cells]
+    assert np.average([cell["mean_mm"] for cell in cells], weights=weights) == pytest.approx(mean_mm)
+    for failed, message in (
+        ((4,), "failed fibre is 4, allowed is a whole number from 0 to 3"),
+        ((0, 1, 2, 3), "failed are all 4 fibres, at least one must be left"),
+    ):
+        with pytest.raises(InputError, match=message):
+            fibre_loss_study(recording, localizer, failed=failed)
 
 
 def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recording: Recording) -> None:
@@ -141,6 +164,25 @@ def test_the_command_writes_a_document_and_a_figure(run: Callable[..., tuple[obj
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "neither --model nor --retrain" in err
     assert not Path("other").exists()
+
+
+def test_the_figure_maps_the_fibres_that_are_named(
+    run: Callable[..., tuple[object, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles: list[str] = []
+    real = fibre_loss_figure.save_figure
+
+    def seen(figure: Figure, path: Path) -> None:
+        titles.extend(axes.get_title() for axes in figure.axes[1:] if axes.get_title())
+        real(figure, path)
+
+    monkeypatch.setattr(fibre_loss_figure, "save_figure", seen)
+    code, out, _ = run("fibre-loss", "rec", "--model", "model", "--lost", "1", "--failed", "2,4", "--json")
+    assert (code, json.loads(out)["ways"][ONE]["maps"][-1]["lost"]) == (0, [1, 3])
+    assert titles[0] == "all fibres"
+    assert titles[2:] == ["without 2+4"]
+    code, out, err = run("fibre-loss", "rec", "--model", "model", "--failed", "5")
+    assert (code, out, err) == (2, "", "padforge: fibre 5: no such fibre, allowed are 1 to 4\n")
 
 
 def test_networks_are_kept_until_the_result_is_written(

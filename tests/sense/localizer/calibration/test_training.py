@@ -15,6 +15,7 @@ from sense.localizer.calibration.networks import masked_network
 from sense.localizer.calibration.networks.masked_network import draw_alive
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
 from sense.localizer.response.response_model import looked_up
+from sense.settings import Features
 
 
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
@@ -59,6 +60,18 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
     inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
     assert inwards.min() >= -1e-6
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
+
+
+@pytest.mark.parametrize(("features", "longer"), [("full", 1), ("causal", 2), ("early", 2)])
+def test_without_the_release_networks_learn_for_twice_as_many_steps(features: Features, longer: int) -> None:
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-1, 1, (40, 2)).astype(np.float32)
+    table = rng.standard_normal((5, 5, 2, 3)).astype(np.float32)
+    samples = TrainingPresses(np.zeros((40, 2, 3), np.float32), np.ones((40, 2), bool), places)
+    options = sense_settings.LocalizerSettings(features=features, hidden=8, layers=1, epochs=3, batch=16)
+    totals: list[int] = []
+    training.train_members(samples, table, options, rng, lambda done, total: totals.append(total))
+    assert set(totals) == {longer * options.members * 3 * training.LEAST_BATCHES}
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,24 @@ def test_two_places_that_answer_alike_are_both_thought_of() -> None:
     assert found[0, 1] == pytest.approx(0.1, abs=0.05)
 
 
+def test_a_grid_position_stands_for_its_whole_cell() -> None:
+    """A fibre without noise that gives the position itself: what blurs it is where in its cell a press lies."""
+    axis, nodes = np.linspace(-1, 1, SIDE), np.linspace(-1, 1, (SIDE + 1) // 2)
+    table = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)[:, :, None]
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(-1, 1, (PRESSES, 2))
+    observer = Observer.fit(table, positions[:, None], np.ones((PRESSES, 1), dtype=bool), positions)
+    presses = rng.uniform(-0.8, 0.8, (50, 2))
+    _, told = observer(presses[:, None], np.ones((50, 1), dtype=bool))
+    cell = nodes[1] - nodes[0]
+    # Beside it the scatter that is taken for usual where there is none is little.
+    likelihood = np.exp(-0.5 * (presses[:, :, None] - nodes) ** 2 / (cell**2 / 12))
+    share = likelihood / likelihood.sum(axis=2, keepdims=True)
+    mean = share @ nodes
+    np.testing.assert_allclose(told[:, 4:6] / 2, mean, atol=0.02 * cell)
+    np.testing.assert_allclose(np.exp(4 * (told[:, 6:8] - 1)), np.maximum(share @ nodes**2 - mean**2, 1e-4), rtol=0.12)
+
+
 @given(seed=st.integers(0, 999))
 def test_what_lost_fibres_give_is_not_looked_at(seed: int) -> None:
     observer, inputs, _ = OBSERVED

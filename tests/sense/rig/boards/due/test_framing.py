@@ -71,6 +71,30 @@ def test_cobs_takes_out_the_zeros_and_puts_them_back(payload: bytes) -> None:
     assert cobs_decode(coded) == payload
 
 
+def cobs_byte_by_byte(payload: bytes) -> bytes:
+    """Consistent overhead byte stuffing as a board does it: a run is closed by a zero, or as soon as it has 254."""
+    coded, run = bytearray(), bytearray()
+    for byte in payload:
+        if byte:
+            run.append(byte)
+        if not byte or len(run) == 254:
+            coded += bytes([255 if byte else len(run) + 1]) + run
+            run.clear()
+    return bytes(coded + bytes([len(run) + 1]) + run)
+
+
+@pytest.mark.parametrize("length", [253, 254, 255, 507, 508, 509])
+@pytest.mark.parametrize("before", [b"", b"\0", b"\x07\0"])
+@pytest.mark.parametrize("after", [b"", b"\0", b"\0\x07", b"\0\0"])
+def test_runs_about_the_longest_that_a_count_can_tell_are_coded_as_on_the_board(
+    before: bytes, length: int, after: bytes
+) -> None:
+    payload = before + bytes(1 + k % 255 for k in range(length)) + after
+    coded = cobs_encode(payload)
+    assert coded == cobs_byte_by_byte(payload)
+    assert cobs_decode(coded) == payload
+
+
 @given(st.lists(FRAMES, max_size=8), st.data())
 def test_frames_come_back_whatever_the_portions(frames: list[Frame], data: st.DataObject) -> None:
     sent = b"".join(map(encode, frames))
