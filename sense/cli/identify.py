@@ -37,6 +37,6 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
         def report(what: str, done: int, of: int) -> None:
             bar.update(task, completed=done, total=of, note=what)
 
-        inputs = [path for path in (recording, morphology) if path.is_file()]
+        inputs = [path for path in (recording, morphology) if not path.is_dir()]
         document = identify_into(read_recording(recording), pad, folder, seed or 0, inputs=inputs, report=report)
     common.show_result(document, identification_lines(document, folder), as_json)
