@@ -1,6 +1,7 @@
 """Files as every stage writes and reads them: atomic, together or not at all, self-describing JSON."""
 
 from .blame import as_written, refuse_unwritable, writing
+from .dependents import check_replaceable, find_dependents
 from .folders import claimed, resolve_exchange, settle, staged
 from .litter import UNFINISHED, clear_litter, scratch, unfinished_file
 from .locks import held, lock
@@ -12,8 +13,10 @@ __all__ = [
     "UNFINISHED",
     "as_written",
     "atomic",
+    "check_replaceable",
     "claimed",
     "clear_litter",
+    "find_dependents",
     "held",
     "lock",
     "open_in_place",
