@@ -96,8 +96,7 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     """
     import trimesh
 
-    path = as_path("path", path)
-    require_file(path)
+    path = require_file(as_path("path", path))
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it says on top of raising
     try:
         if path.suffix.lower() == ".3mf":

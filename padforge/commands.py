@@ -11,6 +11,7 @@ from design.cli.main import compare_command
 from design.cli.main import design as design_group
 from design.common.command_line import (
     INTERRUPTED,
+    force_option,
     load_spec,
     out_option,
     profile_option,
@@ -75,6 +76,7 @@ def _init(path: Path, preset: str | None) -> None:
 @click.option("--resume", is_flag=True, help="Go on where a run into the same folder was broken off.")
 @seed_option
 @out_option("out/pad")
+@force_option
 @profile_option
 @click.pass_context
 def _run(
@@ -85,6 +87,7 @@ def _run(
     resume: bool,
     seed: int | None,
     out: Path,
+    force: bool,
 ) -> None:
     """Do the whole job: optimise, mould, record presses on the simulated rig, calibrate, report.
 
@@ -95,7 +98,8 @@ def _run(
     padforge run --resume
 
     Of a time budget the search takes half at most, and the calibration what is left after all else. --resume keeps
-    what is finished and was made of the same settings and files; a search goes on from its states.
+    what is finished and was made of the same settings and files; a search goes on from its states. A calibration of
+    other than simulated presses, and a pad from which more was made than a run makes, give way with --force only.
 
     Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
     """
@@ -104,7 +108,7 @@ def _run(
 
     from .running import Run, check_ahead, run_stages
 
-    run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget)
+    run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
     check_ahead(run)
     with claimed(out):
         if (code := run_stages(run)) != INTERRUPTED:

@@ -14,7 +14,7 @@ def write_report(folder: Path) -> Path:
         InputError: no stage has left anything, or a file is damaged.
         Fault: there are files of another pad or recording among them, which the page tells first.
     """
-    from design.common.files import as_written, write_text
+    from design.common.files import as_written, settle, write_text
     from design.common.page.elements import PageSection, page
     from design.report.contact_section import contact_sections
     from design.report.sections import design_sections, provenance_row, provenance_section, stage_pages
@@ -23,6 +23,7 @@ def write_report(folder: Path) -> Path:
     from sense.report.identification_results import identification_sections
 
     folder = as_path("folder", folder)
+    settle(folder)
     stages = (
         ("design", folder / "design.json", design_sections),
         ("fabrication", folder / "fabrication.json", fabrication_sections),

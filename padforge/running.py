@@ -46,6 +46,7 @@ class Run:
         formats: files of the mould, see `fabricate.export.FORMATS`.
         resume: whether to go on from what an earlier run has done.
         time_budget: seconds for all of it; None for no end.
+        force: whether to replace what others in `out` were made from, and what no run has made.
         begin_s: when it began, on the clock of `time.monotonic`.
     """
 
@@ -55,6 +56,7 @@ class Run:
     formats: tuple[str, ...] = ("stl", "step", "svg", "png")
     resume: bool = False
     time_budget: float | None = None
+    force: bool = False
     begin_s: float = field(default_factory=time.monotonic)
 
     @property
@@ -78,9 +80,14 @@ class Run:
 
 
 def check_ahead(run: Run) -> None:
-    """Refuse what would fail only after minutes of work: any section, sections that do not fit, a real recording."""
+    """Refuse what would fail only after minutes of work, or take away what no run makes again.
+
+    Raises:
+        InputError: any section, sections that do not fit, a real recording, or a pad or calibration to be kept.
+    """
     import numpy as np
 
+    from design.report.files import check_search
     from design.settings import PadSettings
     from fabricate import FabricationSettings
     from fabricate.export import require_formats
@@ -101,6 +108,33 @@ def check_ahead(run: Run) -> None:
     presses = run.spec.section(RigSettings).presses
     split_presses(presses, learning.split, learning.test_share, np.random.default_rng(0))
     refuse_replacing(run.out / "recording")
+    check_search(run.spec, run.out, run.seeds, _remade(), run.force)
+    _check_calibration(run)
+
+
+def _remade() -> set[str]:
+    """Names of what a run makes of a pad, beside its files of other kinds."""
+    from design.report.contact_section import NAME
+    from sense.report.calibration_results import FILES
+
+    return {"fabrication.json", "recording", NAME, *FILES}
+
+
+def _check_calibration(run: Run) -> None:
+    """Refuse to replace a localizer that has learnt from other presses than simulated ones: no run makes it again."""
+    from design.common.files import as_written, read_json
+    from sense.localizer.localizer import FORMAT
+
+    path = run.out / "localizer.json"
+    if run.force or not path.exists():
+        return
+    with as_written(path):
+        kind = read_json(path, FORMAT)["provenance"].get("recording_kind")
+    if kind != "simulated":
+        raise InputError(
+            f"{path}: learnt from a recording of kind {kind!r}, not a simulated one; "
+            "choose another --out, or replace it with --force"
+        )
 
 
 def run_stages(run: Run) -> int:
@@ -152,7 +186,7 @@ def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult
         if found.stopped != "interrupted":
             progress.note("design", made_of, ["design.json", "morphology.json"])
 
-    return run_search(run.spec, run.out, run.seeds, run=how, written=written)[1]
+    return run_search(run.spec, run.out, run.seeds, run=how, written=written, remade=_remade(), force=run.force)[1]
 
 
 def _moulded(
@@ -211,7 +245,7 @@ def _calibrated(run: Run, progress: RunProgress, kept: list[str], recording: "Re
     if progress.has("calibration", made_of):
         kept.append("calibration")
         return _document(run.out / "calibration.json")
-    document = run_calibration(run.spec, recording, run.out, run.seeds, run.left_s(keep_s=FINISH_S))
+    document = run_calibration(run.spec, recording, run.out, run.seeds, run.left_s(keep_s=FINISH_S), force=True)
     progress.note("calibration", made_of, FILES)
     return document
 

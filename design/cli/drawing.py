@@ -6,7 +6,15 @@ from typing import Any
 
 import click
 
-from design.common.command_line import json_option, load_spec, out_option, pad_folder, show_result, spec_option
+from design.common.command_line import (
+    force_option,
+    json_option,
+    load_spec,
+    out_option,
+    pad_folder,
+    show_result,
+    spec_option,
+)
 
 
 @click.command("import")
@@ -20,10 +28,17 @@ from design.common.command_line import json_option, load_spec, out_option, pad_f
     help="How far fibres and their ends may be off what is drawn.",
 )
 @out_option()
+@force_option
 @json_option
 @click.pass_context
 def import_(
-    context: click.Context, plan: Path, spec: Path | None, tolerance_mm: float, out: Path | None, as_json: bool
+    context: click.Context,
+    plan: Path,
+    spec: Path | None,
+    tolerance_mm: float,
+    out: Path | None,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Take fibres from a drawing, .svg or .dxf, one curve each; exit 1 if they break a rule.
 
@@ -34,7 +49,7 @@ def import_(
     [pad] of the settings says which fibres there are and where they end. Taken are curves in layers or groups whose
     names begin with fibre, horizontal or vertical, else all open ones; what is named pad is its border.
     """
-    from design.common.files import provenance, staged
+    from design.common.files import check_replaceable, provenance, staged
     from design.criteria.rules import check_rules
     from design.pad.courses.drawings.plan import import_plan
     from design.pad.morphology import Morphology
@@ -50,6 +65,7 @@ def import_(
     folder = out or pad_folder(plan)
     with staged(folder) as together:
         Morphology.of_layout(found.pad.knots, size.layout, made_by).save(together / "morphology.json")
+        check_replaceable(folder / "morphology.json", together / "morphology.json", force=force)
     broken = check_rules(found.pad, rules, size)
     fibres = [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(found.fibres, 1)]
     knots = found.pad.knots.shape[1] - 2

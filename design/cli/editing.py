@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from design.common.command_line import load_spec, out_option, pad_folder, spec_option
+from design.common.command_line import force_option, load_spec, out_option, pad_folder, spec_option
 
 PORT = 8322
 _LOOK_S = 0.2
@@ -18,8 +18,9 @@ _LOOK_S = 0.2
 @click.argument("pad", required=False, type=click.Path(path_type=Path))
 @spec_option
 @out_option(what="Morphology to write when it is saved", file=True)
+@force_option
 @click.option("--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Of the page; 0: any.")
-def edit(pad: Path | None, spec: Path | None, out: Path | None, port: int) -> None:
+def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, port: int) -> None:
     """Draw fibres in a browser of this machine, and see at once which rules they break and where presses are confused.
 
     \b
@@ -49,7 +50,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, port: int) -> No
     judged = Answers(size, settings.section(RulesSettings), settings.section(Contact), settings.section(SearchSettings))
     text = page_text("design.cli.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
     with ExitStack() as stack:
-        session = Session(judged, pad, out, lambda view: page.show(view))
+        session = Session(judged, pad, out, lambda view: page.show(view), force)
         page = LocalPage(port, text, {"/edit": session.edit, "/save": session.save})
         stack.enter_context(page)
         click.echo(

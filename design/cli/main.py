@@ -8,6 +8,7 @@ import click
 
 from design.common.command_line import (
     INTERRUPTED,
+    force_option,
     json_option,
     load_spec,
     out_option,
@@ -48,6 +49,7 @@ twin_option = click.option(
 @scheduler_option
 @seed_option
 @out_option("out/pad")
+@force_option
 @json_option
 @profile_option
 @click.pass_context
@@ -65,6 +67,7 @@ def design(
     scheduler: str | None,
     seed: int | None,
     out: Path,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Optimise the course of the fibres, or look at a finished morphology.
@@ -79,7 +82,8 @@ def design(
     padforge design import plan.svg                   fibres drawn elsewhere
 
     Writes morphology.json, design.json, design.svg and design.png. Exit 1 if the best pad breaks a rule. Ctrl-C ends
-    with the best so far (exit 130); that and a kill leave what --resume goes on from.
+    with the best so far (exit 130); that and a kill leave what --resume goes on from. A pad from which a mould, a
+    recording or others beside it were made is replaced with --force only.
     """
     if context.invoked_subcommand is not None:
         return
@@ -91,7 +95,7 @@ def design(
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with claimed(out), cluster(scheduler) as executor:
         how = SearchRun(resume=resume, time_budget=time_budget, executor=executor)
-        document, result = run_search(load_spec(spec), out, overrides, origin, how, twin)
+        document, result = run_search(load_spec(spec), out, overrides, origin, how, twin, force=force)
     show_result(document, search_lines(result, out), as_json)
     context.exit(INTERRUPTED if result.stopped == "interrupted" else 1 if result.violations else 0)
 

@@ -34,6 +34,8 @@ seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice (default: that of the settings, 0)."
 )
 
+force_option = click.option("--force", is_flag=True, help="Replace files that others in the folder were made from.")
+
 
 def out_option(default: str = "", what: str = "Folder for the results", file: bool = False) -> Callable[..., Any]:
     """`--out`, the folder (or file) results go to: unless `default` names one, a command takes that of `pad_folder`."""

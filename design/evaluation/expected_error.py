@@ -55,7 +55,7 @@ WIDTH, RIDGE = 0.8, 1e-2
 BY_NOISE, BY_LEARNING = 0.8, 0.56
 """Weights of both terms. Such errors go best with those of trained networks, within 7 % over straight, gently and
 strongly curved pads: a network's mean error is below the root of a variance, and it learns better than the ridge."""
-WORSE = 8.0
+WORSE, MARGIN = 8.0, 0.93
 """By how much more an error counts that straight fibres do not make."""
 EPSILON = 1e-12
 """Squared length, so that its root has a gradient at 0."""
@@ -227,7 +227,7 @@ def over_losses(
     weights = torch.tensor([shares[k] for k in levels], dtype=logs.dtype, device=logs.device)
     if straight is not None:
         limits = torch.tensor([straight[k] for k in levels], dtype=logs.dtype, device=logs.device).log()
-        logs = logs + (WORSE - 1) * torch.relu(logs - limits)
+        logs = logs + (WORSE - 1) * torch.relu(logs - limits - math.log(MARGIN))
     return (logs @ weights / weights.sum()).exp()
 
 

@@ -12,6 +12,7 @@ from design.settings import Layout, PadSettings, RulesSettings
 
 KNOTS_PER_TURN = 3  # before, at and after: a turn of given radius needs its shoulders
 STRAIGHT_START = 3  # the last of the default's: zigzags more often lead to the better pad
+AMPLITUDE = 0.1
 WIDEST_BORDER = 0.45  # of the pad's side: a wider border leaves no room, which the rule check then says
 
 
@@ -91,7 +92,7 @@ def first_course(
     refined = straight_course(pad, rules, knots) if origin is None else refine(origin.knots, knots, layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
         return refined
-    inner = refined[:, 1:-1] + 0.1 * rng.standard_normal(refined[:, 1:-1].shape)
+    inner = refined[:, 1:-1] + AMPLITUDE * rng.standard_normal(refined[:, 1:-1].shape)
     return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
 
 

@@ -1,7 +1,7 @@
 """A search as it is asked for: settings in; morphology.json, design.json and the plan out."""
 
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ from design.common.checkpoints import Checkpoints
 from design.common.command_line import progress
 from design.common.errors import InputError
 from design.common.figures import save_figure
-from design.common.files import as_written, provenance, read_json, sha256, staged, write_json
+from design.common.files import as_written, check_replaceable, provenance, read_json, sha256, staged, write_json
 from design.common.profiling import stage
 from design.criteria.rules import Violation, check_rules
 from design.optimisers.search import SearchResult, SearchRun, search
@@ -27,6 +27,18 @@ if TYPE_CHECKING:
     from design.optimisers.search import SearchListener
 
 
+@dataclass(frozen=True)
+class _Request:
+    """A search as it is asked for: its settings, the pad it starts from, and where its result will have come from."""
+
+    pad: PadSettings
+    contact: Contact
+    settings: SearchSettings
+    rules: RulesSettings
+    begin: Morphology | None
+    made_by: dict[str, Any]
+
+
 def run_search(
     spec: "Spec",
     out: Path,
@@ -35,6 +47,8 @@ def run_search(
     run: SearchRun | None = None,
     twin: Path | None = None,
     written: Callable[[SearchResult], None] = lambda result: None,
+    remade: Collection[str] = (),
+    force: bool = False,
 ) -> tuple[dict[str, Any], SearchResult]:
     """Search with the settings of `spec`, write all results to `out`, and return `design.json` with the result.
 
@@ -46,7 +60,57 @@ def run_search(
         run: how long it may take and on what it runs; its states are kept in `out`, and a bar tells its progress.
         twin: a `twin.json`, for whose reach, noise and sensed rectangle to search.
         written: called when the results are on the disk, before the states of a search that came to its end go.
+        remade: names of what else in `out` is made anew with the pad.
+        force: whether a pad is replaced that others in `out` were made from.
+
+    Raises:
+        InputError: settings that cannot be, or others were made from the pad in `out`; what is found is kept to go on.
     """
+    asked, remade = _request(spec, overrides, origin, twin), {"design.json", *remade}
+    pad, path = asked.pad, out / "morphology.json"
+    check_replaceable(path, asked.made_by, remade, force)
+    with progress() as bar:
+        run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
+        result = search(pad, asked.contact, asked.settings, asked.rules, origin=asked.begin, run=run)
+    document = {
+        "format": "padforge-design/1",
+        "terms": result.terms,
+        "found_by": result.found_by,
+        "straight": result.straight,
+        "violations": [asdict(violation) for violation in result.violations],
+        "history": result.history,
+        "seconds": round(result.seconds, 3),
+        "stopped": result.stopped,
+        "provenance": asked.made_by,
+    }
+    with stage("figures"), staged(out) as together:
+        Morphology.of_layout(result.morphology.knots, pad.layout, asked.made_by).save(together / path.name)
+        check_replaceable(path, together / path.name, remade, force)  # a search of the same settings may end elsewhere
+        document["morphology_sha256"] = sha256(together / path.name)
+        figure = draw_plan(result.morphology, asked.contact, result.violations, pad.keep_out_mm)
+        save_figure(figure, together / "design.svg")
+        save_figure(figure, together / "design.png")
+        write_json(together / "design.json", document)
+    written(result)
+    if not result.stopped:
+        Checkpoints(out / "search", {}).clear()
+    return document, result
+
+
+def check_search(
+    spec: "Spec", out: Path, overrides: dict[str, Any], remade: Collection[str] = (), force: bool = False
+) -> None:
+    """Refuse ahead what `run_search` would refuse, by the same arguments.
+
+    Raises:
+        InputError: as there.
+    """
+    made_by = _request(spec, overrides).made_by
+    check_replaceable(out / "morphology.json", made_by, {"design.json", *remade}, force)
+
+
+def _request(spec: "Spec", overrides: dict[str, Any], origin: str | None = None, twin: Path | None = None) -> _Request:
+    """Read what a search is asked for by the arguments of `run_search`."""
     spec, inputs = (spec, []) if twin is None else (settings_for_twin(spec, twin), [twin])
     pad, rules = spec.section(PadSettings), spec.section(RulesSettings)
     begin, origin = None, origin or ("straight" if twin else "random")
@@ -58,33 +122,9 @@ def run_search(
     settings = spec.section(SearchSettings, **overrides)
     contact = contact_of(spec, settings)
     made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))  # as they are read
-    with progress() as bar:
-        run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
-        result = search(pad, contact, settings, rules, origin=begin, run=run)
     used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     made_by["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}
-    document = {
-        "format": "padforge-design/1",
-        "terms": result.terms,
-        "found_by": result.found_by,
-        "straight": result.straight,
-        "violations": [asdict(violation) for violation in result.violations],
-        "history": result.history,
-        "seconds": round(result.seconds, 3),
-        "stopped": result.stopped,
-        "provenance": made_by,
-    }
-    with stage("figures"), staged(out) as together:
-        Morphology.of_layout(result.morphology.knots, pad.layout, made_by).save(together / "morphology.json")
-        document["morphology_sha256"] = sha256(together / "morphology.json")
-        figure = draw_plan(result.morphology, contact, result.violations, pad.keep_out_mm)
-        save_figure(figure, together / "design.svg")
-        save_figure(figure, together / "design.png")
-        write_json(together / "design.json", document)
-    written(result)
-    if not result.stopped:
-        Checkpoints(out / "search", {}).clear()
-    return document, result
+    return _Request(pad, contact, settings, rules, begin, made_by)
 
 
 def found_before(out: Path) -> SearchResult | None:

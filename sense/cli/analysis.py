@@ -15,8 +15,9 @@ from .options import FOLDER, FibreNumbers, fibre_indices, lost_option, model_opt
 @recording_argument
 @common.seed_option
 @common.out_option()
+@common.force_option
 @common.json_option
-def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, as_json: bool) -> None:
+def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
     """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
 
     \b
@@ -25,7 +26,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
     if it did not, places are found as before. The old model is written over only where --out says so.
     """
-    from design.common.files import refuse_unwritable, staged, write_json
+    from design.common.files import check_replaceable, refuse_unwritable, staged, write_json
     from sense.health.model_folder import health_files, health_in
     from sense.localizer.calibration import recalibration
     from sense.localizer.localizer import Localizer
@@ -40,6 +41,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
     with staged(target, without=health_files()) as folder:
         localizer.save(folder)
+        replaced = target / "localizer.json"
+        check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *health_files()], force)
         write_json(folder / "recalibration.json", document)
         for name, known in health.items():  # it was learnt without places
             known.save(folder, name)

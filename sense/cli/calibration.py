@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 @common.seed_option
 @common.spec_option
 @common.out_option()
+@common.force_option
 @common.json_option
 @common.profile_option
 def calibrate(
@@ -35,6 +36,7 @@ def calibrate(
     seed: int | None,
     spec: Path | None,
     out: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
@@ -52,7 +54,9 @@ def calibrate(
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     folder = out or common.pad_folder(recording)
     with claimed(folder):
-        document = run_calibration(common.load_spec(spec), read_recording(recording), folder, overrides, time_budget)
+        document = run_calibration(
+            common.load_spec(spec), read_recording(recording), folder, overrides, time_budget, force
+        )
     common.show_result(document, calibration_lines(document), as_json)
 
 
@@ -62,6 +66,7 @@ def run_calibration(
     out: Path,
     overrides: Mapping[str, Any],
     time_budget: float | None = None,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Calibrate into `out` with the settings of `spec`, and say on stderr how far it is; returns `calibration.json`."""
     from sense.report.calibration_results import calibrate_into
@@ -76,6 +81,7 @@ def run_calibration(
             time_budget=time_budget,
             progress=report,
             warn=lambda line: click.echo(line, err=True),
+            force=force,
         )
 
 

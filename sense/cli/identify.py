@@ -14,9 +14,10 @@ from .options import FILE, read_recording, recording_argument
 @click.option("--morphology", type=FILE, required=True, help="The pad as planned: morphology.json or published .mat.")
 @common.seed_option
 @common.out_option()
+@common.force_option
 @common.json_option
 @common.profile_option
-def identify(recording: Path, morphology: Path, seed: int | None, out: Path | None, as_json: bool) -> None:
+def identify(recording: Path, morphology: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
     """Find from RECORDING how a printed pad was laid and wired, and what a press really does to it.
 
     \b
@@ -37,6 +38,8 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
         def report(what: str, done: int, of: int) -> None:
             bar.update(task, completed=done, total=of, note=what)
 
-        inputs = [path for path in (recording, morphology) if path.is_file()]
-        document = identify_into(read_recording(recording), pad, folder, seed or 0, inputs=inputs, report=report)
+        inputs = [path for path in (recording, morphology) if not path.is_dir()]
+        document = identify_into(
+            read_recording(recording), pad, folder, seed or 0, inputs=inputs, report=report, force=force
+        )
     common.show_result(document, identification_lines(document, folder), as_json)

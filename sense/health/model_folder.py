@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from design.common.files import settle
+from design.common.files import resolve_exchange
 from sense.recordings.formats.assembly import FOUND
 from sense.recordings.recording import Recording
 
@@ -14,8 +14,7 @@ from .trained_model import files_of
 
 def has_health(model: Path, name: str = COMMANDED) -> bool:
     """Whether health was learnt into a folder."""
-    settle(model)
-    return files_of(model, name)[0].exists()
+    return resolve_exchange(files_of(model, name).document).exists()
 
 
 def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[FibreFault]]:

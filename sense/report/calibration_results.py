@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from design.common.errors import InputError
-from design.common.files import refuse_unwritable, staged, write_json
+from design.common.files import check_replaceable, refuse_unwritable, staged, write_json
 from design.common.profiling import stage
 from sense.health.learning import learn_health
 from sense.health.model_folder import health_files
@@ -28,6 +28,7 @@ def calibrate_into(
     time_budget: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     warn: Callable[[str], None] = lambda line: None,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Calibrate, write all results to `out`, and return `calibration.json`.
 
@@ -37,11 +38,14 @@ def calibrate_into(
         time_budget: seconds to train for, see `calibrate`.
         progress: called with (steps of training done, in all), and (0, 0) when the health of the fibres is learnt.
         warn: told in a line what is not learnt, of depth, force or health, as the recording does not suffice.
+        force: whether a localizer is replaced that others in `out` were made from.
 
     Raises:
-        InputError: as `calibrate`, or `out` cannot be written.
+        InputError: as `calibrate`, `out` cannot be written, or others were made from the localizer in it.
     """
     refuse_unwritable(out)
+    path, known = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
+    check_replaceable(path, known, FILES, force)
     localizer, document = calibrate(recording, options, time_budget=time_budget, progress=progress)
     for line in left_out(recording, localizer):
         warn(line)
@@ -54,6 +58,7 @@ def calibrate_into(
             warn(f"no watch is kept on the fibres' health: {error}")
     with staged(out, without=health_files() - health_files(health)) as folder:  # it must not speak for another model
         localizer.save(folder)
+        check_replaceable(path, folder / path.name, FILES, force)  # other settings may be told by the result alone
         for name, model in health.items():
             model.save(folder, name)
         write_json(folder / "calibration.json", document)

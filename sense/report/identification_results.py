@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from design.common.files import provenance, refuse_unwritable, staged, write_json
+from design.common.files import check_replaceable, provenance, refuse_unwritable, staged, write_json
 from design.common.page.elements import PageSection, figures, paragraph, table
 from design.common.profiling import stage
 from sense.recordings.processing.limits import Array, Mask
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FORMAT = "padforge-identification/1"
 STRANGER = 0.02
 """Share of the variance by which a plan must explain more than straight fibres do, to be known by its presses."""
-COMMAND = "padforge sense identify"
+COMMAND, TWIN = "padforge sense identify", "twin.json"
 
 
 def identify_into(
@@ -32,18 +32,23 @@ def identify_into(
     *,
     inputs: list[Path] | None = None,
     report: Callable[[str, int, int], None] = lambda what, done, of: None,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Identify a pad, write twin.json, identification.json and two pictures to `out`, and return the document.
 
     Nothing in `out` changes before the last result is there.
 
+    Args:
+        force: whether a twin is replaced that others in `out` were made from.
+
     Raises:
-        InputError: as `identify`, or `out` cannot be written.
+        InputError: as `identify`, `out` cannot be written, or others were made from the twin in it.
     """
     from sense.twin.identification import identify  # here, so that a report that only tells of it does without
 
     refuse_unwritable(out)
     origin = provenance(COMMAND, seed, inputs or [])  # minutes later they may differ from what was read
+    check_replaceable(out / TWIN, origin, force=force)
     with stage("identify"):
         found = identify(recording, pad, seed, report)
     twin = found.twin(origin)
@@ -51,7 +56,8 @@ def identify_into(
     with staged(out) as folder, stage("figures"):
         from .identification_figures import draw_laid_plan, draw_responses
 
-        twin.save(folder / "twin.json")
+        twin.save(folder / TWIN)
+        check_replaceable(out / TWIN, folder / TWIN, force=force)  # the same plan, but perhaps another recording
         write_json(folder / "identification.json", document)
         draw_responses(found, folder / "twin_responses.png")
         draw_laid_plan(found, folder / "twin_plan.png")

@@ -85,7 +85,7 @@ class Command:
 
 
 COMMANDS = {
-    "design": Command("design --seed 1 --out pad", ((), RESUMED)),
+    "design": Command("design --seed 1 --force --out pad", ((), RESUMED)),
     "fabricate": Command("fabricate other/morphology.json --out pad"),
     "run": Command("run --seed 1 --formats stl,svg --out pad", ((), RESUMED)),
     "record": Command("sense record --morphology other/morphology.json --seed 1 --out pad/recording", old=False),

@@ -134,9 +134,9 @@ def test_a_time_budget_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.Monk
     )
     run, given = sense.cli.calibration.run_calibration, []
 
-    def noted(*arguments):
+    def noted(*arguments, **more):
         given.append(arguments[-1])
-        return run(*arguments)
+        return run(*arguments, **more)
 
     monkeypatch.setattr(sense.cli.calibration, "run_calibration", noted)
     begin = time.monotonic()
@@ -213,7 +213,7 @@ def test_fibres_of_another_search_are_not_kept(folder: Path) -> None:
     """One that was made in the folder meanwhile, with other settings than the run has."""
     before = digests(folder)
     (folder / "other.toml").write_text(SMALL.replace("starts = 1", "starts = 1\nseed = 5"))
-    assert called("design", "--spec", "other.toml", cwd=folder).code == 0
+    assert called("design", "--spec", "other.toml", "--force", cwd=folder).code == 0
     assert digests(folder)["morphology.json"] != before["morphology.json"]
     assert resumed(folder) == "mould, recording, contacts, calibration"
     assert digests(folder)["morphology.json"] == before["morphology.json"]

@@ -10,7 +10,7 @@ from threading import Lock
 from typing import Any
 
 from design.common.errors import InputError, real, shown, whole
-from design.common.files import provenance
+from design.common.files import check_replaceable, find_dependents, provenance
 from design.pad.courses.spare_knots import without_spares
 from design.pad.knots import FARTHEST
 from design.pad.morphology import Morphology
@@ -26,22 +26,33 @@ class Session:
     """A pad being drawn; several threads may ask at once.
 
     Attributes:
-        out: the file it is saved to: the next free name beside it where another one came there after this began.
+        out: the file it is saved to: the next free name beside it where another one came there after this began, or
+            others were made from it since.
     """
 
     def __init__(
-        self, answers: Answers, source: Path | None, out: Path, show: Callable[[dict[str, Any]], None]
+        self,
+        answers: Answers,
+        source: Path | None,
+        out: Path,
+        show: Callable[[dict[str, Any]], None],
+        force: bool = False,
     ) -> None:
         """Begin with the pad of a file, or with straight fibres.
 
         Args:
             show: takes what pages show whenever that has changed.
+            force: whether a pad is replaced that others beside it were made from.
+
+        Raises:
+            InputError: a pad that cannot be read, or others were made from the one at `out`.
         """
-        self.out, self._ours = out, out.exists()
+        self.out, self._ours, self._force = out, out.exists(), force
         self._answers, self._source, self._show = answers, source, show
         layout = answers.size.layout
         self._made_by = provenance("padforge design edit", None, [] if source is None else [source])
         self._made_by["settings"] = {"pad": answers.size.model_dump(mode="json")}
+        check_replaceable(out, self._made_by, force=force)
         begin = straight_courses(layout) if source is None else without_spares(Morphology.load(source).knots, layout)
         self._history = History(tuple(begin))
         self._lock, self._number, self._name = Lock(), 0, secrets.token_hex(8)
@@ -104,7 +115,8 @@ class Session:
         """
         with self._lock:
             courses = self._history.now
-            if not self._ours and self.out.is_file():
+            kept = not self._ours or (self.unsaved and not self._force and find_dependents(self.out))
+            if self.out.is_file() and kept:
                 self.out = free_name(self.out)
             pad = self._answers.morphology(courses)
             Morphology.of_layout(pad.knots, pad.layout, self._made_by).save(self.out)

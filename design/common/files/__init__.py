@@ -1,7 +1,8 @@
 """Files as every stage writes and reads them: atomic, together or not at all, self-describing JSON."""
 
 from .blame import as_written, refuse_unwritable, writing
-from .folders import claimed, settle, staged
+from .dependents import check_replaceable, find_dependents
+from .folders import claimed, resolve_exchange, settle, staged
 from .litter import UNFINISHED, clear_litter, scratch, unfinished_file
 from .locks import held, lock
 from .reading import MOST_BYTES, provenance, read_bytes, read_json, require_file, sha256, unchanged
@@ -12,8 +13,10 @@ __all__ = [
     "UNFINISHED",
     "as_written",
     "atomic",
+    "check_replaceable",
     "claimed",
     "clear_litter",
+    "find_dependents",
     "held",
     "lock",
     "open_in_place",
@@ -22,6 +25,7 @@ __all__ = [
     "read_json",
     "refuse_unwritable",
     "require_file",
+    "resolve_exchange",
     "scratch",
     "settle",
     "sha256",

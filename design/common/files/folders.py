@@ -1,8 +1,8 @@
 """Folders of results: one run at a time, files that appear together, and what a kill meanwhile has left half done.
 
 Files that belong together are made in a folder of their own. Renaming that to `EXCHANGE` is the one moment in which
-they become the valid ones: from then on they are put in place, by the next that reads or writes there if this run is
-killed, and until then nothing has changed.
+they become the valid ones: from then on they are put in place, by the next run that writes there if this one is
+killed, and until then nothing has changed. Who only reads changes nothing: see `resolve_exchange`.
 """
 
 import errno
@@ -12,8 +12,9 @@ import shutil
 import stat
 import time
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from design.common.errors import InputError
 
@@ -23,10 +24,18 @@ from .locks import BusyError, held, held_folder, is_folder
 
 EXCHANGE = f"{UNFINISHED}exchange"
 """Name of the folder whose files are being put in place."""
-_GONE, _KEPT = f"{UNFINISHED}gone", f"{UNFINISHED}kept"
-"""In it, the names of files that go as the others come, and those that were there before."""
+_NOTE, _SEAL, _KEPT = f"{UNFINISHED}note", f"{UNFINISHED}seal", f"{UNFINISHED}kept"
+"""In it, the names of files that come and go, what binds these to the folder, and the files that were there before."""
+_MAX_SEAL_BYTES = 1000
 PATIENCE_S = 10.0
 """How long another run is waited for that puts files in place: it takes milliseconds."""
+
+
+class _Note(NamedTuple):
+    """What an exchange does: names of files that come, and of those that go."""
+
+    come: list[str]
+    go: list[str]
 
 
 @contextmanager
@@ -58,7 +67,7 @@ def staged(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Yield an empty folder in `folder`; on success its files move to `folder`, on failure they vanish.
 
     Where they cannot all be moved, or an interrupt comes meanwhile, `folder` is put back as it was; after a kill
-    meanwhile they have all moved for whoever reads them by `reading`. What killed runs have left goes first.
+    meanwhile they have all moved for whoever reads them by `reading`. What killed runs of this user left goes first.
 
     Args:
         without: names of files in `folder` that go as the others come.
@@ -75,22 +84,97 @@ def staged(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
 
 
 def settle(folder: Path) -> None:
-    """Put in place what a killed run was putting in place in a folder, so that its files belong together.
+    """Put in place what a killed run of this user was putting in place in a folder, so that its files belong together.
 
     Raises:
-        InputError: they cannot be put in place.
+        InputError: they cannot be put in place, or are of another user or folder.
+    """
+    exchange = folder / EXCHANGE
+    with writing(folder), _exchange_in(folder) as note:
+        if note is None:
+            return
+        if {path.lstat().st_uid for path in (exchange, exchange / _NOTE, exchange / _SEAL)} != {_user()}:
+            raise InputError(f"{exchange}: left by a run of another user, who puts its files in place by another run")
+        _put(exchange, folder, note)
+        with scratch(folder) as away:
+            exchange.rename(away / EXCHANGE)
+
+
+def resolve_exchange(path: Path) -> Path:
+    """Return where the valid content of a file lies: in what a killed run was putting in place beside it, or at `path`.
+
+    Nothing is changed by it. A path at which nothing lies is returned for a file that goes.
+
+    Raises:
+        InputError: files beside it may be of two runs, as what was being put in place is of another folder.
+    """
+    with _exchange_in(path.parent) as note:
+        if note is None:
+            return path
+        pending = path.parent / EXCHANGE / path.name
+        comes = path.name in note.come and pending.exists()  # else it is in place
+        return pending if comes or path.name in note.go else path
+
+
+@contextmanager
+def _exchange_in(folder: Path) -> Iterator[_Note | None]:
+    """Yield what the exchange in a folder does, kept from others meanwhile; None where there is none.
+
+    Raises:
+        InputError: it was not begun in this folder, or another run does not come to its end.
     """
     exchange, until = folder / EXCHANGE, time.monotonic() + PATIENCE_S
     while is_folder(exchange) and not _is_strange(exchange, folder):
-        try:
-            with writing(folder), held(exchange, f"{folder}: another run is putting files in place; wait for its end"):
-                _put(exchange, folder)
-                with scratch(folder) as away:
-                    exchange.rename(away / EXCHANGE)
-        except BusyError:
-            if time.monotonic() > until:
-                raise
-            time.sleep(0.01)
+        with ExitStack() as end:
+            try:
+                end.enter_context(held(exchange, f"{folder}: another run is putting files in place; wait for its end"))
+            except BusyError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.01)
+                continue
+            yield _read_note(exchange, folder)
+            return
+    yield None
+
+
+def _write_note(stage: Path, folder: Path, note: _Note) -> None:
+    """Note what an exchange does, and bind that to this folder."""
+    (stage / _NOTE).write_text(json.dumps(note), encoding="utf-8")
+    (stage / _SEAL).write_text(_seal(stage, folder), encoding="utf-8")
+
+
+def _read_note(exchange: Path, folder: Path) -> _Note:
+    """Read what an exchange does, on the word of its seal alone.
+
+    Raises:
+        InputError: it was begun in another folder, by another program, or torn by a power cut.
+    """
+    seal = exchange / _SEAL
+    try:
+        about = seal.lstat()
+        small = stat.S_ISREG(about.st_mode) and about.st_size <= _MAX_SEAL_BYTES
+        if small and seal.read_text(encoding="utf-8") == _seal(exchange, folder):
+            return _Note(*json.loads((exchange / _NOTE).read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        if not is_folder(exchange):  # a run has come to its end meanwhile, where there are no locks
+            return _Note([], [])
+    raise InputError(
+        f"{exchange}: begun in another folder, or torn, so files here may be of two runs; remove it, and make them anew"
+    )
+
+
+def _seal(exchange: Path, folder: Path) -> str:
+    """Return what no archive and no copy carries along: numbers of files, and the time at which the note was written.
+
+    That is the system's own time of the last change, which nobody sets and a renamed folder leaves as it was.
+    """
+    note = (exchange / _NOTE).lstat()
+    return " ".join(map(str, (folder.stat().st_ino, exchange.lstat().st_ino, note.st_ino, note.st_ctime_ns)))
+
+
+def _user() -> int:
+    return getattr(os, "geteuid", int)()  # on Windows all files are of user 0
 
 
 def _is_strange(exchange: Path, folder: Path) -> bool:
@@ -104,26 +188,13 @@ def _is_strange(exchange: Path, folder: Path) -> bool:
     return bool(about.st_mode & stat.S_ISVTX) and made.st_uid not in (os.geteuid(), about.st_uid)
 
 
-def _put(exchange: Path, folder: Path) -> None:
+def _put(exchange: Path, folder: Path, note: _Note) -> None:
     """Put the files of an exchange in place, and those out of it that go; doing it again does the rest."""
-    for name in _gone(exchange):
-        with suppress(ValueError):  # a name that no file can have
-            (folder / name).unlink(missing_ok=True)
-    for file in _files(exchange):
-        file.replace(folder / file.name)
-
-
-def _gone(exchange: Path) -> list[str]:
-    """Names of the files that go; none where these have been noted by nobody, or a power cut has torn the note."""
-    note = exchange / _GONE
-    if note.is_symlink() or not note.is_file():
-        return []
-    try:
-        names = json.loads(note.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError, RecursionError):
-        return []
-    told = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-    return [name for name in told if Path(name).name == name not in ("", "..")]
+    for name in note.go:
+        (folder / name).unlink(missing_ok=True)
+    for name in note.come:
+        with suppress(FileNotFoundError):  # it is in place
+            (exchange / name).replace(folder / name)
 
 
 def _files(stage: Path) -> list[Path]:
@@ -140,12 +211,13 @@ def _exchange(stage: Path, folder: Path, without: Collection[str]) -> None:
             if not stat.S_ISREG(mode := path.stat().st_mode):
                 kind = "a folder" if stat.S_ISDIR(mode) else "no file"
                 raise InputError(f"{path}: is {kind}, expected a file or nothing")
-    (stage / _GONE).write_text(json.dumps(without), encoding="utf-8")
+    note = _Note(names, without)
+    _write_note(stage, folder, note)
     exchange = folder / EXCHANGE
     try:
         _commit(stage, folder)
         _keep(exchange / _KEPT, folder, (*names, *without))  # now that nobody else replaces them
-        _put(exchange, folder)
+        _put(exchange, folder, note)
         exchange.rename(stage)
     except BaseException:
         if not stage.exists():

@@ -12,7 +12,7 @@ from typing import Any
 
 from design.common.errors import InputError, shown
 
-from .folders import settle
+from .folders import resolve_exchange
 
 _PACKAGES = ("padforge", "numpy", "scipy")
 
@@ -20,17 +20,18 @@ MOST_BYTES = 2**28
 """A file of more is none that padforge has written, but for recordings."""
 
 
-def require_file(path: Path, most: int = MOST_BYTES) -> None:
+def require_file(path: Path, most: int = MOST_BYTES) -> Path:
     """Refuse what may never end, such as pipes and devices, and what is too large to be looked at.
 
-    Whatever a killed run was putting in place beside it is put there first.
+    Returns:
+        Where to read it, see `resolve_exchange`.
 
     Raises:
         InputError: nothing there, no file, or one of more than `most` bytes.
     """
-    settle(path.parent)
+    valid = resolve_exchange(path)
     try:
-        about = path.stat()
+        about = valid.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
     if stat.S_ISDIR(about.st_mode):
@@ -39,6 +40,7 @@ def require_file(path: Path, most: int = MOST_BYTES) -> None:
         raise InputError(f"{path}: cannot be read (a pipe or device, expected a file)")
     if about.st_size > most:
         raise InputError(f"{path}: cannot be read (it has {about.st_size} bytes, allowed are {most})")
+    return valid
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
@@ -47,10 +49,12 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     Raises:
         InputError: it cannot be read, or see `require_file`.
     """
-    require_file(path, most)
+    valid = require_file(path, most)
     try:
-        return path.read_bytes()
+        return valid.read_bytes()
     except OSError as error:
+        if isinstance(error, FileNotFoundError) and valid != path:  # a run has put it in place meanwhile
+            return read_bytes(path, most)
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
@@ -80,8 +84,7 @@ def sha256(path: Path) -> str:
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
         return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
-    require_file(path, sys.maxsize)
-    with path.open("rb") as file:
+    with require_file(path, sys.maxsize).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

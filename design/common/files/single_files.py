@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 from design.common.errors import InputError
 
 from .blame import writing
+from .folders import settle
 from .litter import UNFINISHED, unfinished_file
 
 try:
@@ -36,6 +37,7 @@ def atomic(path: Path) -> Iterator[Path]:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it is there and no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
+        settle(path.parent)  # or an older file would come over this one later
         with unfinished_file(path.parent, path.suffix) as temporary:
             yield temporary
             temporary.replace(path)

@@ -127,7 +127,7 @@ def plain_datasets(path: Path) -> Iterator[Datasets]:
     """
     import h5py
 
-    require_file(path, MOST_FILE_BYTES)
+    path = require_file(path, MOST_FILE_BYTES)
     try:
         with h5py.File(path, "r") as file:
             yield Datasets(file)

@@ -36,8 +36,7 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _is_hdf5(path: Path) -> bool:
-    require_file(path, MOST_FILE_BYTES)
-    with path.open("rb") as file:
+    with require_file(path, MOST_FILE_BYTES).open("rb") as file:
         start = file.read(_TEXT + len(_HDF5))
     return _HDF5 in (start[: len(_HDF5)], start[_TEXT:])
 

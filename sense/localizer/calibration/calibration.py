@@ -82,7 +82,7 @@ def calibrate(
     known = np.flatnonzero(recording.known)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
-    made_by["inputs"] = {"recording": recording.digest}
+    made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     from design.common.computing import one_torch_thread
 
     with stage("train"), one_torch_thread():

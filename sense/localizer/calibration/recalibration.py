@@ -82,6 +82,7 @@ def recalibrate(
     gain, error = validation.gain(before, after)
     made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
     made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance)}
+    made_by["recording_kind"] = recording.source.get("kind")
     widened = validation.widened(after)
     document = {
         "format": FORMAT,

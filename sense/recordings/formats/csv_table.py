@@ -39,9 +39,8 @@ class CsvTable:
     """
 
     def __init__(self, path: Path, gaps: bool = False) -> None:
-        self.path, self._gaps = path, gaps
-        require_file(path, MAX_BYTES)
-        with _reading(path) as file:
+        self.path, self._gaps = require_file(path, MAX_BYTES), gaps
+        with _reading(self.path) as file:
             self._skipped, header = _header(file)
             self._separator = _separator(header)
             self.names = [name.strip() for name in self._cells(header.rstrip("\n"))]

@@ -8,6 +8,8 @@ from click.testing import CliRunner
 
 import sense.cli.calibration
 import sense.report.calibration_figures
+from design import Morphology
+from design.common.files import sha256
 from sense import Localizer, Recording
 from sense.cli.main import sense as command
 
@@ -90,3 +92,27 @@ def test_errors_of_depth_and_force_are_listed_where_they_were_learnt(
     ]
     assert force == depth + 4
     assert len(lines) == force + 4
+
+
+def test_a_localizer_that_others_were_made_from_is_replaced_by_force_alone(few) -> None:
+    made_by = json.loads(Path("model/localizer.json").read_text())["provenance"]
+    assert made_by["recording_kind"] == "simulated"
+    Path("model/fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": made_by}}}))
+    before = {path.name: path.read_bytes() for path in Path("model").iterdir()}
+    words = (["calibrate", "--seed", "5"], ["calibrate", "--method", "published"], ["recalibrate", "--model", "model"])
+    for name, *more in words:
+        code, _, err = few(name, "rec", *more, "--out", "model")
+        assert (code, err.splitlines()[-1].partition(": ")[0]) == (2, "padforge"), err
+        assert "localizer.json: fibre_loss.json was made from it; choose another --out" in err
+        assert {path.name: path.read_bytes() for path in Path("model").iterdir()} == before
+    assert few("calibrate", "rec", "--out", "model")[0] == 0  # the same again
+    assert few("calibrate", "rec", "--out", "model", "--seed", "5", "--force")[0] == 0
+
+
+def test_a_twin_that_a_pad_was_designed_for_is_replaced_by_force_alone(few) -> None:
+    Morphology.straight(2).save("pad.json")
+    Path("twin.json").write_text('{"provenance": {"seed": 1}}')
+    Path("design.json").write_text(json.dumps({"provenance": {"inputs": {"twin.json": sha256(Path("twin.json"))}}}))
+    code, _, err = few("identify", "rec", "--morphology", "pad.json", "--out", ".")
+    assert code == 2
+    assert "twin.json: design.json was made from it; choose another --out" in err

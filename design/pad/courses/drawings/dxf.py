@@ -27,7 +27,7 @@ def read_dxf(path: Path) -> Drawing:
     from ezdxf import path as paths
     from ezdxf import units
 
-    require_file(path, MOST_BYTES)
+    path = require_file(path, MOST_BYTES)
     try:
         document = ezdxf.readfile(path)
         unit, millimetre = document.units, units.InsertUnits.Millimeters

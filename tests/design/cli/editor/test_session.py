@@ -10,7 +10,7 @@ from design import Contact, InputError, Morphology, PadSettings, RulesSettings, 
 from design.cli.editor.answers import Answers
 from design.cli.editor.session import Session
 from design.cli.main import design
-from design.common.files import sha256
+from design.common.files import sha256, write_json
 from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 
 
@@ -172,3 +172,25 @@ def test_where_a_pad_came_from_is_the_file_that_was_read(tmp_path):
     Morphology.straight(2).save(tmp_path / "pad.json")
     begun.save(b"{}")
     assert Morphology.load(begun.out).provenance["inputs"] == {"pad.json": read}
+
+
+def made_from(path, name="fabrication.json"):
+    write_json(path.parent / name, {"provenance": {"inputs": {path.name: sha256(path)}}})
+
+
+def test_a_pad_that_a_mould_was_made_from_since_stays(tmp_path):
+    begun, _ = session(tmp_path, Morphology.straight(2))
+    begun.save(b"{}")
+    made_from(tmp_path / "out.json")
+    begun.save(b"{}")  # as it is
+    before = (tmp_path / "out.json").read_bytes()
+    ask(begun, do="add", fibre=1)
+    assert begun.save(b"{}")["told"] == f"saved to {tmp_path / 'out-2.json'}"
+    assert (tmp_path / "out.json").read_bytes() == before
+
+
+def test_a_pad_that_a_mould_was_made_from_is_not_begun_to_be_replaced(tmp_path):
+    Morphology.straight(2).save(tmp_path / "out.json")
+    made_from(tmp_path / "out.json")
+    with pytest.raises(InputError, match=r"out.json: fabrication.json was made from it"):
+        session(tmp_path)

@@ -3,12 +3,23 @@
 import itertools
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from design.common.errors import InputError
-from design.common.files import atomic, claimed, read_bytes, staged
+from design.common.files import (
+    atomic,
+    claimed,
+    read_bytes,
+    resolve_exchange,
+    settle,
+    sha256,
+    staged,
+    unchanged,
+    write_text,
+)
 from design.common.files.folders import EXCHANGE
 from tests.helpers.kills import killed
 
@@ -36,11 +47,9 @@ def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> N
     for number in itertools.count():
         folder = made(tmp_path / str(number))
         ended = not killed(lambda folder=folder: renewed(folder), number, folder)
-        copy = shutil.copytree(folder, tmp_path / f"{number} read first at b")
-        assert read_bytes(copy / "b") == read_bytes(copy / "a")
-        found.append({name: read_bytes(folder / name) for name in ("a", "b")})
+        found.append({name: read_bytes(folder / name) for name in ("b", "a")})
         assert found[-1] in (OLD, NEW), number
-        assert [(folder / name).exists() for name in ("c", "gone")] == (
+        assert [resolve_exchange(folder / name).exists() for name in ("c", "gone")] == (
             [True, False] if found[-1] == NEW else [False, True]
         )
         assert (folder / "mine").read_bytes() == b"old"
@@ -81,59 +90,114 @@ def test_a_link_is_no_exchange(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "a").read_bytes() == b"another"
 
 
-ODD = '["../mine", "", "..", "/", "\\u0000", "\\ud800", 3, null, "gone"]'
+@pytest.fixture
+def broken_off(tmp_path: Path) -> Path:
+    """A folder in which a run was killed as it was putting its files in place: one of them is, and some are gone."""
+    for number in itertools.count():
+        folder = made(tmp_path / f"out {number}")
+        killed(lambda folder=folder: renewed(folder), number, folder)
+        if (folder / "a").read_bytes() != (folder / "b").read_bytes():
+            return folder
+    raise AssertionError
 
 
-@pytest.mark.parametrize("note", ["", "3", "[" * 100_000, ODD])
-def test_a_torn_or_odd_note_takes_nothing_out_of_other_folders(tmp_path: Path, note: str) -> None:
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_who_reads_changes_nothing(broken_off: Path) -> None:
+    before = content(broken_off)
+    assert {name: read_bytes(broken_off / name) for name in ("a", "b")} == NEW
+    assert unchanged(broken_off, {name: sha256(broken_off / name) for name in ("a", "b", "mine")}) == {"a", "b", "mine"}
+    with pytest.raises(InputError, match="cannot be read"):
+        read_bytes(broken_off / "gone")
+    assert content(broken_off) == before
+
+
+def copied(folder: Path, elsewhere: Path) -> None:
+    shutil.copytree(folder, elsewhere)
+
+
+def packed(folder: Path, elsewhere: Path) -> None:
+    archive = shutil.make_archive(str(elsewhere), "tar", folder)
+    shutil.unpack_archive(archive, elsewhere, filter="fully_trusted")
+
+
+def moved(folder: Path, elsewhere: Path) -> None:
+    """What a run was putting in place, moved to a folder of other files."""
+    made(elsewhere)
+    (folder / EXCHANGE).rename(elsewhere / EXCHANGE)
+
+
+@pytest.mark.parametrize("carried", [copied, packed, moved])
+def test_an_exchange_is_worth_nothing_elsewhere(tmp_path: Path, broken_off: Path, carried: Callable) -> None:
+    """Neither who reads nor who writes there carries it out, and nobody takes its files for a set."""
+    carried(broken_off, folder := tmp_path / "elsewhere")
+    before = content(folder)
+    for use in (
+        lambda: read_bytes(folder / "a"),
+        lambda: renewed(folder),
+        lambda: write_text(folder / "b", "another"),
+        lambda: settle(folder),
+    ):
+        with pytest.raises(InputError, match=f"{EXCHANGE}: begun in another folder"):
+            use()
+    assert content(folder) == before
+    shutil.rmtree(folder / EXCHANGE)
+    renewed(folder)
+    assert read_bytes(folder / "a") == read_bytes(folder / "b") == b"new"
+
+
+PLANTED: list[Callable[[Path], object]] = [
+    lambda exchange: None,
+    lambda exchange: (exchange / ".unfinished-gone").write_text('["mine"]'),
+    lambda exchange: [(exchange / f".unfinished-{name}").write_text("[" * 100_000) for name in ("note", "seal")],
+    lambda exchange: [os.mkfifo(exchange / f".unfinished-{name}") for name in ("note", "seal")],
+    lambda exchange: [(exchange / f".unfinished-{name}").symlink_to("/dev/zero") for name in ("note", "seal")],
+]
+
+
+@pytest.mark.parametrize("plant", PLANTED)
+def test_what_only_has_the_name_of_an_exchange_is_left_alone(tmp_path: Path, plant: Callable) -> None:
     folder = made(tmp_path / "out")
-    (tmp_path / "mine").touch()
-    exchange = folder / EXCHANGE
-    (exchange / "folder").mkdir(parents=True)
-    (exchange / "a").write_bytes(b"new")
-    (exchange / "b").symlink_to(tmp_path / "mine")
-    (exchange / ".unfinished-gone").write_text(note)
-    assert read_bytes(folder / "a") == b"new"
-    assert (folder / "b").read_bytes() == b"old"
-    assert {path.name for path in folder.iterdir()} == {"a", "b", "mine"} | ({"gone"} if note != ODD else set())
-    assert {path.name for path in tmp_path.iterdir()} == {"out", "mine"}
+    (folder / EXCHANGE).mkdir()
+    (folder / EXCHANGE / "a").write_bytes(b"planted")
+    plant(folder / EXCHANGE)
+    before = content(folder)
+    for use in (lambda: read_bytes(folder / "a"), lambda: renewed(folder)):
+        with pytest.raises(InputError, match="begun in another folder"):
+            use()
+    assert content(folder) == before
+
+
+def test_the_next_run_puts_in_place_what_it_reads(broken_off: Path) -> None:
+    write_text(broken_off / "b", "newer")
+    assert content(broken_off) == {"a": b"new", "b": b"newer", "c": b"new", "mine": b"old"}
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write everywhere")
-def test_who_may_not_put_files_in_place_is_told_so(tmp_path: Path) -> None:
-    folder = made(tmp_path / "out")
-    (folder / EXCHANGE).mkdir()
-    (folder / EXCHANGE / "a").write_bytes(b"new")
-    folder.chmod(0o555)
+def test_who_may_not_put_files_in_place_reads_them_and_is_told_so(broken_off: Path) -> None:
+    broken_off.chmod(0o555)
+    assert {name: read_bytes(broken_off / name) for name in ("a", "b")} == NEW
     with pytest.raises(InputError, match="cannot be written"):
-        read_bytes(folder / "a")
-    folder.chmod(0o755)
-    assert read_bytes(folder / "a") == b"new"
-
-
-def test_a_note_that_is_no_file_is_none(tmp_path: Path) -> None:
-    folder = made(tmp_path / "out")
-    for number, make in enumerate((os.mkfifo, lambda note: note.symlink_to("/dev/zero"))):
-        (folder / EXCHANGE).mkdir()
-        (folder / EXCHANGE / "a").write_text(f"new {number}")
-        make(folder / EXCHANGE / ".unfinished-gone")
-        assert read_bytes(folder / "a") == f"new {number}".encode()
-    assert (folder / "gone").exists()
+        settle(broken_off)
+    broken_off.chmod(0o755)
+    settle(broken_off)
+    assert (broken_off / "b").read_bytes() == b"new"
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() != 0, reason="root alone may give files away")
-def test_where_anybody_may_put_files_nobody_replaces_those_of_others(tmp_path: Path) -> None:
-    """As in /tmp: a name there that one reads must not let another user have files deleted by it."""
-    folder = made(tmp_path / "out")
-    folder.chmod(0o1777)
-    exchange = folder / EXCHANGE
-    exchange.mkdir()
-    (exchange / "a").write_bytes(b"another")
-    (exchange / ".unfinished-gone").write_text('["mine"]')
-    os.chown(exchange, 12345, 12345)
-    assert read_bytes(folder / "a") == (folder / "mine").read_bytes() == b"old"
-    with pytest.raises(InputError, match="cannot be written"):
-        renewed(folder)
-    assert (folder / "a").read_bytes() == b"old"
-    folder.chmod(0o775)  # those who share a folder may do so
-    assert read_bytes(folder / "a") == b"another"
+@pytest.mark.parametrize("given", ["", ".unfinished-seal"])
+def test_nobody_puts_files_of_another_user_in_place(broken_off: Path, given: str) -> None:
+    """Whoever shares a folder reads them; as in /tmp, where anybody may put files, not even that."""
+    os.chown(broken_off / EXCHANGE / given, 12345, 12345)
+    before = content(broken_off)
+    assert {name: read_bytes(broken_off / name) for name in ("a", "b")} == NEW
+    with pytest.raises(InputError, match="left by a run of another user"):
+        renewed(broken_off)
+    if not given:
+        broken_off.chmod(0o1777)
+        assert read_bytes(broken_off / "b") == b"old"
+        with pytest.raises(InputError, match="cannot be written"):
+            renewed(broken_off)
+    assert content(broken_off) == before

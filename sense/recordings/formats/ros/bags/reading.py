@@ -37,7 +37,7 @@ def read_bag(path: Path, wanted: Callable[[str], bool]) -> tuple[dict[str, Topic
     """
     bag = Bag(wanted)
     for file in _files(path):
-        require_file(file, MOST_FILE_BYTES)
+        file = require_file(file, MOST_FILE_BYTES)
         with _blamed(file):
             if file.suffix.lower() == ".mcap":
                 with file.open("rb") as stream:
