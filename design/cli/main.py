@@ -39,9 +39,7 @@ twin_option = click.option(
 @click.option("--method", type=click.Choice(["descent", "genetic"]), help="As [search] method.")
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
-@click.option(
-    "--from", "origin", metavar="random|straight|FILE", help="What to start from (default: random; a twin: straight)."
-)
+@click.option("--from", "origin", metavar="random|straight|FILE", help="What to start from (default: random).")
 @twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Where presses are told apart.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="End with the best after S seconds.")

@@ -143,10 +143,35 @@ def search(
         if problem.search.method != "genetic":  # the published method is left as it was published
             candidates.append(straight)
         best = min(candidates, key=lambda candidate: candidate.rank)
-        terms = best.errors() | all_terms(best.pad, best.ambiguities(), problem.contacts[0], problem.rules, problem.pad)
-        beside = straight.errors() | ambiguity_terms(straight.ambiguities())
-    told = problem.rules.enforce, _history(problem, states), time.perf_counter() - begin, stop.reason
-    return SearchResult(best.pad, terms, best.broken, best.name, beside, *told)
+        result = _scored(best, straight, problem)
+    history, seconds = _history(problem, states), time.perf_counter() - begin
+    return replace(result, history=history, seconds=seconds, stopped=stop.reason)
+
+
+def score_result(
+    morphology: Morphology,
+    found_by: str,
+    pad: PadSettings,
+    contact: Contact,
+    settings: SearchSettings,
+    rules: RulesSettings,
+) -> SearchResult:
+    """Return a pad as a search by these settings would hand it back.
+
+    Args:
+        morphology: the pad.
+        found_by: where it is from.
+        pad, contact, settings, rules: as `search` takes them.
+    """
+    problem = posed(pad, contact, settings, rules, None)
+    straight = _Candidate("straight fibres", _straight(problem, Stop(time.perf_counter(), None)), problem)
+    return _scored(_Candidate(found_by, morphology, problem), straight, problem)
+
+
+def _scored(best: "_Candidate", straight: "_Candidate", problem: SearchProblem) -> SearchResult:
+    terms = best.errors() | all_terms(best.pad, best.ambiguities(), problem.contacts[0], problem.rules, problem.pad)
+    beside = straight.errors() | ambiguity_terms(straight.ambiguities())
+    return SearchResult(best.pad, terms, best.broken, best.name, beside, problem.rules.enforce)
 
 
 def _advance(

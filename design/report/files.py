@@ -13,6 +13,7 @@ from design.common.files import as_written, check_replaceable, provenance, read_
 from design.common.profiling import stage
 from design.criteria.rules import Violation, check_rules
 from design.optimisers.search import SearchResult, SearchRun, search
+from design.optimisers.twin_search import search_for_twin
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -55,10 +56,9 @@ def run_search(
     Args:
         overrides: of the settings of the search, by name; those that are not None count.
         origin: "random", "straight" or the file of a morphology to start from, which also says how many knots a fibre
-            has unless `overrides` does; None for straight fibres with a twin, since under a wide reach the best pads
-            are gentle, and else for random ones.
+            has unless `overrides` does; None for random ones.
         run: how long it may take and on what it runs; its states are kept in `out`, and a bar tells its progress.
-        twin: a `twin.json`, for whose reach, noise and sensed rectangle to search.
+        twin: a `twin.json`, for whose reach, scatter and sensed rectangle to search (`search_for_twin`).
         written: called when the results are on the disk, before the states of a search that came to its end go.
         remade: names of what else in `out` is made anew with the pad.
         force: whether a pad is replaced that others in `out` were made from.
@@ -71,7 +71,12 @@ def run_search(
     check_replaceable(path, asked.made_by, remade, force)
     with progress() as bar:
         run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
-        result = search(pad, asked.contact, asked.settings, asked.rules, origin=asked.begin, run=run)
+        wanted = pad, asked.contact, asked.settings, asked.rules
+        if twin is None:
+            result = search(*wanted, origin=asked.begin, run=run)
+        else:
+            usual = spec.section(SearchSettings, **overrides)
+            result = search_for_twin(*wanted, usual, origin=asked.begin, run=run)
     document = {
         "format": "padforge-design/1",
         "terms": result.terms,
@@ -113,7 +118,7 @@ def _request(spec: "Spec", overrides: dict[str, Any], origin: str | None = None,
     """Read what a search is asked for by the arguments of `run_search`."""
     spec, inputs = (spec, []) if twin is None else (settings_for_twin(spec, twin), [twin])
     pad, rules = spec.section(PadSettings), spec.section(RulesSettings)
-    begin, origin = None, origin or ("straight" if twin else "random")
+    begin, origin = None, origin or "random"
     if origin == "straight":
         begin = Morphology.straight(pad.layout)
     elif origin != "random":
