@@ -31,8 +31,8 @@ def loss_masks(fibres: int, lost: int, most: int) -> Array:
 
 
 def loss_shares(lost: int | tuple[float, ...]) -> tuple[float, ...]:
-    """P(k), k = 0, 1, ...: equal up to a number of lost fibres, or the given weights scaled to the sum 1."""
-    weights = (1.0,) * (lost + 1) if isinstance(lost, int) else lost
+    """P(k), k = 0, 1, ...: half for none and equal up to a number of lost fibres, or the given weights, of sum 1."""
+    weights = (max(lost, 1.0), *(1.0,) * lost) if isinstance(lost, int) else lost
     return tuple(weight / sum(weights) for weight in weights)
 
 

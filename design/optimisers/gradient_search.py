@@ -24,7 +24,6 @@ from design.evaluation.expected_error import (
     confusable,
     drawn_window,
     expected_error,
-    expected_errors,
     over_losses,
     straight_full_scale,
     window_presses,
@@ -64,8 +63,6 @@ class GradientSearch:
         self._history: list[tuple[int, float]] = []
         pad, search, rules = problem.pad, problem.search, problem.rules
         self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
-        plain = Morphology.straight(pad.layout)
-        self.straight = [expected_errors(plain, contact, search, pad) for contact in problem.contacts]
         if state is None:
             course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
             self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
@@ -187,7 +184,7 @@ class GradientSearch:
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
         masks, scatter = masks.float(), search.response_scatter.scaled(louder)
         total = torch.zeros((), device=search.device)
-        for contact, scale, straight in zip(self.problem.contacts, self.scales, self.straight, strict=True):
+        for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
             signals_at = partial(
                 press_signals,
                 *(travel, cross, slope),
@@ -205,7 +202,7 @@ class GradientSearch:
                 partners = confusable(responses(presses.positions), responses(presses.far), masks)
             positions = presses.joined(partners)
             given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
-            total = total + over_losses(expected_error(*given), masks, shares, straight)
+            total = total + over_losses(expected_error(*given), masks, shares)
             if search.sharpness > 0:
                 in_order = signals_at(boustrophedon(pad.sensed, SEARCHED))
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))

@@ -75,16 +75,13 @@ def search_for_twin(
     with stage("judge"):
         found = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
     name = choose({each.pad: np.array([level.mean for level in each.errors]) for each in found})
-    parts = [plain, afresh, further]
+    parts = {"usual": plain, "twin": afresh, "from usual": further}
+    history = [entry | {"run": f"{part}, {entry['run']}"} for part, each in parts.items() for entry in each.history]
     return replace(
         score_result(pads[name], name, pad, contact, settings, rules),
-        history=[
-            {**entry, "run": f"{part}, {entry['run']}"}
-            for part, each in zip(SHARES, parts, strict=True)
-            for entry in each.history
-        ],
-        seconds=sum(each.seconds for each in parts),
-        stopped=next((each.stopped for each in parts if each.stopped), ""),
+        history=history,
+        seconds=sum(each.seconds for each in parts.values()),
+        stopped=next((each.stopped for each in parts.values() if each.stopped), ""),
     )
 
 

@@ -13,7 +13,7 @@ from design.settings import Contact, PadSettings, SearchSettings
 if TYPE_CHECKING:
     from design.common.settings import Spec
 
-FORMAT, NAME = "padforge-contacts/2", "contacts.json"
+FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 
 def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from design.common.settings import Spec
     from design.optimisers.search import SearchListener
 
+SURE = 0.05
+"""Share by which expected errors must differ to say which pad a trained network will locate better by."""
+
 
 @dataclass(frozen=True)
 class _Request:
@@ -183,24 +186,31 @@ def search_lines(result: SearchResult, out: Path) -> list[str]:
     return [
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s -> {out / 'morphology.json'}"
         + (f" ({result.stopped}: the best so far)" if result.stopped else ""),
-        *_located(result, "expected_error", "expected error"),
-        *_located(result, "ambiguity", "ambiguity"),
+        *_located(result),
         *(broken or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
         *([f"  ... and {more} more"] if more > 0 else []),
     ]
 
 
-def _located(result: SearchResult, name: str, told: str) -> list[str]:
-    """How well a pad and straight fibres locate by one measure, where the search has it: two lines."""
-    spread = [value for term, value in result.terms.items() if term.startswith(name)]
-    plain = [value for term, value in result.straight.items() if term.startswith(name)]
-    if not spread:
-        return []
-    lost = " / ".join(map(str, range(len(spread))))
-    return [
-        f"  {told} {' / '.join(f'{value:#.3g}' for value in spread)} grid units under noise, with {lost} fibres lost",
-        f"  {' ' * len(told)} {' / '.join(f'{value:#.3g}' for value in plain)} with straight fibres",
+def _located(result: SearchResult) -> list[str]:
+    """How well the pad and straight fibres are expected to locate, in mm, and where the pad is no better."""
+    errors, straight = (
+        [value for term, value in terms.items() if term.startswith("expected_error")]
+        for terms in (result.terms, result.straight)
+    )
+    unit_mm = result.morphology.unit_mm
+    designed, plain = (" / ".join(f"{unit_mm * value:.2f}" for value in values) for values in (errors, straight))
+    failed = " / ".join(map(str, range(len(errors))))
+    lines = [
+        f"  expected error {designed} mm with {failed} fibres failed, before anything is built",
+        f"                 {plain} mm with straight fibres",
     ]
+    if result.found_by == "straight fibres":
+        return [*lines, "  these are straight fibres: nothing better was found; more steps or time may find it"]
+    alike = [str(k) for k, pair in enumerate(zip(errors, straight, strict=True)) if pair[0] > (1 - SURE) * pair[1]]
+    if alike:
+        lines.append(f"  no better than straight fibres, as far as such figures tell, with {', '.join(alike)} failed")
+    return lines
 
 
 def _shown_on(bar: "Progress") -> "SearchListener":

@@ -6,7 +6,6 @@ from typing import Any
 
 from design.common.files import as_written, read_json, unchanged
 from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
-from design.criteria.score import AMBIGUITY_NOISE
 from design.settings import PadSettings, RulesSettings, sensed_rectangle
 
 _TERMS = {
@@ -34,8 +33,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     pad, enforced = settings["pad"], settings["rules"]["enforce"]
     layout = PadSettings(**pad).layout
     unit_mm, (low, high) = layout.unit_mm, sensed_rectangle(layout)
-    spread = {int(name[-1]): float(value) for name, value in terms.items() if name.startswith("ambiguity")}
-    headline = "expected_error" if "expected_error_lost_0" in terms else "ambiguity"  # a former search told none
+    levels = sorted(int(name[-1]) for name in terms if name.startswith("expected_error"))
     both = terms, document.get("straight", {})
     holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
     size = " x ".join(f"{round((b - a) * unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
@@ -50,17 +48,17 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
                 [
                     heading("Errors by lost fibres"),
                     paragraph(
-                        "What a localizer is expected to err, on average over all losses of so many fibres, and how far"
-                        " the place that a very noisy reading suggests lies from the one that was pressed, the"
-                        " ambiguity; in mm, and as much for straight fibres. Errors are expected under noise with a"
-                        f" standard deviation of {100 * float(settings['search']['noise']):.2g}% of a signal's full"
-                        f" scale, ambiguities are under {100 * AMBIGUITY_NOISE:.2g}%."
+                        "What a localizer is expected to err, in mm, on average over all sets of so many failed"
+                        " fibres, and as much for straight fibres: before anything is built, by a formula that goes"
+                        " with the errors of trained networks within some 5 %. Responses are taken to scatter by"
+                        f" {float(settings['search']['scatter']):.0%} of themselves from press to press, and by"
+                        f" {float(settings['search']['noise']):.1%} of full scale."
                     ),
                     table(
-                        ["fibres lost", "expected error", "straight", "ambiguity", "straight"],
+                        ["fibres failed", "expected error (mm)", "straight (mm)"],
                         [
-                            [lost, *(_mm(each, f"{name}_lost_{lost}", unit_mm) for name in MEASURES for each in both)]
-                            for lost in spread
+                            [failed, *(_mm(each, f"expected_error_lost_{failed}", unit_mm) for each in both)]
+                            for failed in levels
                         ],
                     ),
                 ],
@@ -74,14 +72,13 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         [
             (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
             (holds, "design rules"),
-            (f"{_mm(terms, f'{headline}_lost_0', unit_mm)} mm", f"{headline.replace('_', ' ')} of the design"),
+            (f"{_mm(terms, 'expected_error_lost_0', unit_mm)} mm", "expected error of the design"),
         ],
     )
     return [fibres]
 
 
 PAD = "morphology.json"
-MEASURES = ("expected_error", "ambiguity")
 Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
 """Its name, the document that it has left, and what a report has to say of that."""
 
