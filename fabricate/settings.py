@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from design.common.errors import InputError, instance
 from design.common.settings import Settings, Spec, as_tuple, none_as
-from design.settings import Layout, PadSettings, RulesSettings
+from design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 from .materials import FibreSettings, SiliconeSettings
 
@@ -35,7 +35,7 @@ class MouldSettings(Settings):
     wall_draft_deg: float = Field(default=2.0, ge=0, le=30, description="lean of the walls, for demoulding, degrees")
     silicone_mm: float = Field(default=6.0, gt=0, le=100, description="thickness of the cast pad, mm")
     border_mm: float = Field(default=0.0, ge=0, le=100, description="silicone beyond the fibre ends, mm")
-    ridge_width_mm: float = Field(default=0.4, ge=0.1, le=20, description="width of a ridge at its top, mm")
+    ridge_width_mm: float = Field(default=TRACK_WIDTH_MM, ge=0.1, le=20, description="width of a ridge at its top, mm")
     ridge_draft_deg: float = Field(default=0.0, ge=0, le=20, description="taper of a ridge on either side, degrees")
     deep_ridge_height_mm: float = Field(default=1.2, gt=0, le=50, description="ridge height of the deep family, mm")
     shallow_ridge_height_mm: float = Field(default=0.4, gt=0, le=50, description="ridge height of the other family, mm")
@@ -153,8 +153,8 @@ class LeadRoom:
     """What leads to one side keep.
 
     Attributes:
-        border_mm: of silicone around the pad. apart_mm: between middles of neighbours. radius_mm: of their bends.
-        edge_mm: from the outermost lead's middle to the silicone's edge.
+        border_mm: of silicone around the pad, in which they are straight. apart_mm: between middles of neighbours.
+        radius_mm: of their bends. edge_mm: from the outermost lead's middle to the silicone's edge.
     """
 
     border_mm: float
@@ -249,7 +249,9 @@ class FabricationSettings:
             width = max(mould.exit_width_mm, WELL_SLOT_MM if mould.conductive else 0)
             apart = max(apart, width + 2 * flare_mm + 2 * self.printer.line_mm)
         edge = max(apart / 2, foot / 2 + mould.min_silicone_mm)
-        return LeadRoom(mould.border_mm, apart, max(self.least_bend_mm, (foot + mould.min_silicone_mm) / 2), edge)
+        # a fibre may meet its lead at a corner, which the rule for bends only lets pass in a straight stretch
+        border = max(mould.border_mm, self.least_bend_mm / 2)
+        return LeadRoom(border, apart, max(self.least_bend_mm, (foot + mould.min_silicone_mm) / 2), edge)
 
     def require_consistent(self, layout: Layout) -> None:
         """Refuse settings that contradict each other or the pitch of the pad.

@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from design.common.errors import InputError
+from design.pad.courses.common_length import common_stretches
 from design.pad.courses.keep_out import keep_outs
-from design.settings import Layout, PadSettings, RulesSettings
+from design.pad.kernels.lying_beside import lying_beside
+from design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 from .differentiable import pchip_sample, span_samples
 
@@ -24,6 +26,7 @@ ORDER_PER_UNIT = 40
 BLUR = 0.1  # standard deviation of the mollified crossing count, grid units
 LEAST_CLEARANCE = 0.1  # from keep-outs, grid units, of which what comes nearer is a share
 FIBRES_AT_ONCE = 32  # that are sampled for their order
+COMMON = 0.2  # of what two tracks have in common: with all of it the search keeps fibres apart that may cross
 MOST_PAIRS = 10**8  # of samples that are compared at once: some GB
 
 
@@ -43,12 +46,17 @@ class SampledCurves:
     @property
     def share(self) -> Tensor:
         """(F, P) arc length that belongs to each sample, without gradient."""
-        step = self.arc.detach().diff(dim=1) / 2
-        return torch.nn.functional.pad(step, (1, 0)) + torch.nn.functional.pad(step, (0, 1))
+        return _shares(self.arc)
 
     def take(self, fibres: list[int]) -> "SampledCurves":
         """Those of some fibres."""
         return SampledCurves(self.place[fibres], self.slope[fibres], self.arc[fibres])
+
+
+def _shares(arc: Tensor) -> Tensor:
+    """(F, P) how much of arc lengths (F, P) belongs to each, without gradient."""
+    step = arc.detach().diff(dim=1) / 2
+    return torch.nn.functional.pad(step, (1, 0)) + torch.nn.functional.pad(step, (0, 1))
 
 
 def penalties(
@@ -90,6 +98,10 @@ def penalties(
             found["max_crossings"] = _too_many(count, rules.max_crossings / margin)
         if limit > 0:
             found["min_crossing_angle_deg"] = flat / (layout.fibres / 2)
+    if min(layout.counts) and rules.max_common_track_mm is not None:
+        found["max_common_track_mm"] = _common_tracks(
+            fibres, TRACK_WIDTH_MM / unit, rules.max_common_track_mm / margin / unit, layout
+        )
     if rules.border_mm > 0:
         found["border_mm"] = _hugging(fibres, rules.border_mm / unit)
     if pad.keep_out_mm:
@@ -101,18 +113,22 @@ def penalties(
 def _bend(fibres: SampledCurves, radius: float, window: float, around: float) -> Tensor:
     """How much more than window / radius a fibre turns within `window` of arc, as a share of that angle.
 
-    Where the pad is worn bent it turns by `around` more at right angles to that, as a fibre does that runs along x.
+    It goes on straight from both ends, by its leads, which it may meet at a corner.
+    Where the pad is worn bent it turns by `around` more at right angles to that, as a fibre does that runs along x;
+    leads are outside of the pad.
     """
-    turned = torch.atan(fibres.slope).diff(dim=1).abs().cumsum(dim=1)
-    turned = torch.nn.functional.pad(turned, (1, 0))
-    until = fibres.arc + window
-    after = torch.searchsorted(fibres.arc.detach(), until.detach()).clamp(1, until.shape[1] - 1)
-    a0, a1, t0, t1 = (x.gather(1, i) for x in (fibres.arc, turned) for i in (after - 1, after))
+    start, end = torch.zeros_like(fibres.arc[:, :1]), fibres.arc[:, -1:]
+    arc = torch.cat([start - window, start, fibres.arc, end, end + window], dim=1)
+    headings = torch.nn.functional.pad(torch.atan(fibres.slope), (2, 2))
+    turned = torch.nn.functional.pad(headings.diff(dim=1).abs().cumsum(dim=1), (1, 0))
+    until = arc + window
+    after = torch.searchsorted(arc.detach(), until.detach()).clamp(1, until.shape[1] - 1)
+    a0, a1, t0, t1 = (x.gather(1, i) for x in (arc, turned) for i in (after - 1, after))
     angle = t0 + ((until - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
     if around > 0:
-        angle = torch.sqrt(angle**2 + around**2)
+        angle = torch.sqrt(angle**2 + torch.nn.functional.pad(torch.full_like(fibres.arc, around), (2, 2)) ** 2)
     over = torch.relu(angle * radius / window - 1)
-    return (over * fibres.share).sum(dim=1).mean() / fibres.travelled
+    return (over * _shares(arc)).sum(dim=1).mean() / fibres.travelled
 
 
 def _gap(fibres: SampledCurves, gap: float, layout: Layout) -> Tensor:
@@ -150,6 +166,26 @@ def _near(place: Tensor, other: SampledCurves, distances: Tensor, gap: float) ->
     along = (away.detach() * tangent).sum(dim=-1, keepdim=True)
     bound = other.share[fibre, nearest][:, None]
     return torch.linalg.vector_norm(away - along.clamp(-bound, bound) * tangent + 1e-12, dim=-1)
+
+
+def _common_tracks(fibres: SampledCurves, width: float, length: float, layout: Layout) -> Tensor:
+    """How much nearer than `width` to fibres of the other family those are that lie longer than `length` beside them.
+
+    Looked at are two places of every such stretch, `length` / 2 before and behind its middle. They are few: autograd
+    would take longer to follow them than a kernel takes for their gradient.
+    """
+    place, slope, arc = (x.detach().numpy() for x in (fibres.place, fibres.slope, fibres.arc))
+    lines = np.concatenate([place[: layout.horizontals], place[layout.horizontals :, :, ::-1]])
+    total, gradient = 0.0, np.zeros_like(place)
+    for one, other in (layout.families, layout.families[::-1]):
+        shared = common_stretches([*lines[one]], [*lines[other]], width)
+        long = shared.length > length
+        middle = (shared.begin[long] + shared.end[long]) / 2
+        pairs = one.start + shared.line[long], other.start + shared.other[long]
+        total += lying_beside(place, slope, arc, *pairs, middle, length / 2, width, gradient)
+    weight = COMMON * length / 4 / len(arc) / fibres.travelled.item()  # the mean of two places, along either fibre
+    value = weight * (total - (gradient * place).sum())
+    return (torch.from_numpy(weight * gradient) * fibres.place).sum() + value
 
 
 def _closeness(near: Tensor, gap: float) -> Tensor:

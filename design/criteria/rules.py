@@ -12,11 +12,12 @@ import shapely
 from design.common.errors import instance
 from design.common.settings import or_default
 from design.pad.courses.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, traced_curve
+from design.pad.courses.common_length import common_stretches
 from design.pad.courses.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
 from design.pad.courses.keep_out import keep_outs
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
-from design.settings import Layout, PadSettings, RulesSettings
+from design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 _TOLERANCE_MM = 1e-3
 _REMEMBERED = 256
@@ -61,20 +62,24 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
 
     - `min_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left and
       right added up; the radius found is R / 2 divided by the greatest such angle. So a bend that keeps on is as wide
-      as R, while a kink of up to half a radian (29 degrees) passes where R / 2 around it is straight. Where the pad is
-      worn bent, the angle is that in space (`rolled_turns`).
+      as R, while a kink of up to half a radian (29 degrees) passes where R / 2 around it is straight. A fibre goes on
+      straight from its ends, by its leads: it may meet them at such a kink. Where the pad is worn bent, the angle is
+      that in space (`rolled_turns`).
     - `min_gap_mm` g: two fibres of a family keep the distance g; and so do any two points of one fibre that lie at
       least pi g / 2 apart along it, which is half a turn around a circle of diameter g.
     - `same_family_crossings`: the number of places at which fibres of one family meet, in the whole pad.
     - `max_crossings`: the number of places at which horizontals meet verticals, in the whole pad.
     - `min_crossing_angle_deg`: the angle, 0 to 90, between the tangents where a horizontal meets a vertical; 0 where
       they run on each other, and next to 0 where they touch.
+    - `max_common_track_mm`: the length of a stretch of a horizontal in which all of it is nearer than the width w of a
+      track, `TRACK_WIDTH_MM`, to one vertical, or of a vertical to one horizontal, whether they cross there or not;
+      2 w / sin(a) where they cross straight at the angle a.
     - `border_mm`: the distance of every fibre to the two sides of the pad that it runs along.
     - `keep_out_mm`: the distance of every fibre to the polygons `keep_out_mm` of `[pad]`; 0 in them.
     - `max_length_mm`: the arc length of a fibre.
 
     Distances are right to twice the 1e-3 mm to which curves are flattened, those of a fibre to itself to 2e-4 g if that
-    is more; bend radii below R to 0.5 %.
+    is more; bend radii below R to 0.5 %; what two tracks have in common to 0.01 mm.
     """
     pad, rules = instance("pad", pad, Morphology), instance("rules", rules, RulesSettings)
     lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.unit_mm)]
@@ -84,6 +89,7 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
         *_gaps(lines, pad.layout, rules.min_gap_mm),
         *_folds(pad, lines, rules.min_gap_mm),
         *_crossings(pad, rules),
+        *_common_tracks(lines, pad.layout, rules.max_common_track_mm),
         *_borders(pad, lines, rules.border_mm),
         *_keep_outs(pad, lines, size, rules.keep_out_mm),
         *_lengths(pad, rules.max_length_mm),
@@ -97,7 +103,7 @@ def tight_bends(pad: Morphology, limit: float, bent_radius_mm: float | None = No
     window = min(limit / 2, *pad.layout.size_mm)  # no fibre is shorter than the pad
     angle = window / limit
     spans, slopes = beziers(pad), slope_beziers(pad)
-    turned = np.abs(np.diff(extreme_headings(slopes))).sum(axis=1)
+    turned = np.abs(np.diff(extreme_headings(slopes), prepend=0, append=0)).sum(axis=1)  # leads have heading 0
     around = 0.0 if bent_radius_mm is None else window / bent_radius_mm  # most that it turns so, in a window
     found = []
     for fibre in map(int, np.flatnonzero(turned + around > angle)):
@@ -116,11 +122,17 @@ def _least_bend(
     # An end of the window that falls between two points is off by less than the turn from one to the other.
     curve = np.frombuffer(spans).reshape(-1, 4, 2), np.frombuffer(slopes).reshape(-1, 3)
     points, headings = traced_curve(*curve, step=max(window / limit / 200, _FINEST_TURN))
-    points = points * unit_mm
+    points, headings = _with_leads(points * unit_mm, headings, np.eye(2)[family] * window)
     across = family * np.pi / 2
     rolled = 0.0 if bent_radius_mm is None else rolled_turns(points, headings - across, bent_radius_mm)
     radius, place = bend_radius(points, headings, window, rolled)
     return radius, place / unit_mm
+
+
+def _with_leads(points: Array, headings: Array, lead: Array) -> tuple[Array, Array]:
+    """The points (n, 2) and headings (n,) of a fibre with a straight lead (2,) at either end, with a corner there."""
+    before, after = np.array([points[0] - lead, points[0]]), np.array([points[-1], points[-1] + lead])
+    return np.vstack([before, points, after]), np.pad(headings, 2)
 
 
 def _gaps(lines: list[Array], layout: Layout, limit: float) -> list[Violation]:
@@ -182,6 +194,25 @@ def _angles(pad: Morphology, across: list[Crossing], limit: float) -> list[Viola
             _pair(across[i]), Violation("min_crossing_angle_deg", _pair(across[i]), float(angles[i]), limit, place)
         )
     return [worst[pair] for pair in sorted(worst)]
+
+
+def _common_tracks(lines: list[Array], layout: Layout, limit: float | None) -> list[Violation]:
+    """The longest stretch of each pair of a horizontal and a vertical that have more than `limit` in common."""
+    if limit is None or not min(layout.counts):
+        return []
+    longest: dict[tuple[int, int], Violation] = {}
+    for one, other in (layout.families, layout.families[::-1]):
+        shared = common_stretches(lines[one], lines[other], TRACK_WIDTH_MM)
+        for i in np.flatnonzero(shared.length > limit).tolist():
+            fibre, length = one.start + int(shared.line[i]), float(shared.length[i])
+            pair = (
+                min(fibre, other.start + int(shared.other[i])) + 1,
+                max(fibre, other.start + int(shared.other[i])) + 1,
+            )
+            if pair not in longest or longest[pair].measured < length:
+                middle = shapely.LineString(lines[fibre]).interpolate(shared.begin[i] + length / 2)
+                longest[pair] = Violation("max_common_track_mm", pair, length, limit, (middle.x, middle.y))
+    return [longest[pair] for pair in sorted(longest)]
 
 
 def _borders(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:

@@ -7,7 +7,7 @@ from design.common.settings import Settings
 from .contact import MEASURED_REACH, PUBLISHED_CONTACT, Contact
 from .layout import DEFAULT_PITCH_MM, MOST_FIBRES, Counts, Layout, Pitch
 from .pad import PadSettings, Polygon, Rectangle, Sensed, between_fibres, sensed_rectangle
-from .rules import RulesSettings
+from .rules import TRACK_WIDTH_MM, RulesSettings
 from .search import Lost, Scatter, SearchSettings
 
 PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
@@ -15,6 +15,7 @@ PUBLISHED: Mapping[str, Settings] = {
     "pad": PUBLISHED_PAD,
     "contact": PUBLISHED_CONTACT,
     "search": PUBLISHED_SEARCH,
+    "rules": RulesSettings(max_common_track_mm=None),
 }
 """The world of the paper, by section, as far as it is another than the default."""
 
@@ -26,6 +27,7 @@ __all__ = [
     "PUBLISHED_CONTACT",
     "PUBLISHED_PAD",
     "PUBLISHED_SEARCH",
+    "TRACK_WIDTH_MM",
     "Contact",
     "Counts",
     "Layout",

@@ -6,6 +6,12 @@ from pydantic import Field
 
 from design.common.settings import Settings, none_as
 
+TRACK_WIDTH_MM = 0.4
+"""Width of a track where the mould does not say another."""
+MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
+"""Least limit on what two tracks have in common: two that cross straight and at a right angle have two widths."""
+
+MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *none_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *none_as("any")]
 
 
@@ -15,6 +21,10 @@ class RulesSettings(Settings):
     Attributes:
         max_crossings: greatest number of crossings of a horizontal with a vertical fibre, or None for any number
             ("any" in pad.toml). Every horizontal has to cross every vertical, so a limit below grid^2 cannot be met.
+        max_common_track_mm: greatest length in which a horizontal and a vertical fibre run nearer to each other than
+            the width of a track, 0.4 mm, or None for any ("any" in pad.toml). There the shallow track has no floor of
+            silicone, and the adhesive alone keeps the fibres apart. At the default straight fibres may cross at 23.6
+            degrees or more: they have 0.8 mm / sin(angle) in common.
     """
 
     enforce: bool = Field(
@@ -30,6 +40,9 @@ class RulesSettings(Settings):
     )
     min_crossing_angle_deg: float = Field(
         default=0.0, ge=0, le=90, description="least angle at which horizontals cross verticals, degrees"
+    )
+    max_common_track_mm: MaxCommon = Field(
+        default=2.0, description='length for which a horizontal may run on a vertical, within 0.4 mm, mm, or "any"'
     )
     border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
     keep_out_mm: float = Field(

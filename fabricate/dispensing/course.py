@@ -17,8 +17,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from design.pad.courses.bending import traced_curve
-from design.pad.courses.curves import beziers, slope_beziers
 from design.pad.knots import Array
 from fabricate.mould.plan import Plan
 from fabricate.report.fibre_layers import Layer, layers
@@ -28,8 +26,6 @@ TOLERANCE_MM = 0.005
 """How far the straight pieces of a course may lie from the curve: a tenth of what a fine gantry repeats."""
 _FLAT_SHARE, _THINNED_SHARE = 0.2, 0.8
 """How the tolerance is shared: most thins out the points."""
-_LEAD_MM = 1e-5
-"""To what the bends of leads are drawn, where it is looked how tight they are."""
 _TURN = 0.02
 """Between two points at which the heading is known a curve turns by no more, radians."""
 _STRAIGHT = 1e-6
@@ -123,14 +119,9 @@ class _Bends:
     diameter_mm: float
 
     @cached_property
-    def spans(self) -> Array:
-        """(F, N+1, 4, 2) Bezier control points, grid units."""
-        return beziers(self.plan.pad)
-
-    @cached_property
-    def slopes(self) -> Array:
-        """(F, N+1, 3) Bezier coefficients of the slopes."""
-        return slope_beziers(self.plan.pad)
+    def traced(self) -> list[tuple[Array, Array]]:
+        """Of every fibre and its leads points (n, 2), mm, and the heading at each, radians."""
+        return self.plan.traced(_TURN, self.plan.settings.mould.lead_mm)
 
     def least_radii(self, fibre: int, places: Array) -> Array:
         """(n - 1,) least bend radius, mm, between each two of n places (n, 2) along a fibre and its leads.
@@ -138,9 +129,9 @@ class _Bends:
         A fibre bends over no less than its own diameter: a radius is that length by the angle it turns there. A PCHIP
         curve is only C1, and the slope of its ends is not that of the leads: pointwise curvature says nothing.
         """
-        points, headings = self._traced(fibre, places[[0, -1]])
+        points, headings = self.traced[fibre]
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        turned = np.concatenate([[0.0], np.cumsum(np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi))])
+        turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(headings)))])
         corners = np.asarray(shapely.line_locate_point(shapely.LineString(points), shapely.points(places)))
         half = max(self.diameter_mm / 2, arc[-1] / _MOST_STATIONS)
         station = half * np.arange(math.ceil(arc[-1] / half) + 2)
@@ -149,29 +140,6 @@ class _Bends:
         last = np.ceil(corners[1:] / half).astype(int)
         most = np.maximum.reduceat(turns, np.column_stack([first, last + 1]).ravel())[::2]
         return np.divide(2 * half, most, out=np.full(len(most), np.inf), where=most > _STRAIGHT)
-
-    def _traced(self, fibre: int, ends: Array) -> tuple[Array, Array]:
-        """Points (n, 2) of a course between its leads' ends (2, 2), mm, and the heading at each, radians.
-
-        Where it turns in one place, that place stands there twice.
-        """
-        family = self.plan.family(fibre)
-        points, headings = traced_curve(self.spans[fibre], self.slopes[fibre], _TURN)
-        points = self.plan.pad.to_mm(points)
-        if family:
-            headings = np.pi / 2 - headings
-        leads = zip(self.plan.leads.pairs[fibre], ends, strict=True)
-        first, last = (np.vstack([lead.end_mm, lead.bends(_LEAD_MM), end]) for lead, end in leads)
-        parts = [_corners(first[::-1]), (points, headings), _corners(last)]
-        return np.vstack([places for places, _ in parts]), np.concatenate([heading for _, heading in parts])
-
-
-def _corners(way: Array) -> tuple[Array, Array]:
-    """Both ends (k, 2) of every step of a way, and its heading at each."""
-    steps = np.diff(way, axis=0)
-    long = np.linalg.norm(steps, axis=1) > 0
-    places = np.stack([way[:-1], way[1:]], axis=1)[long].reshape(-1, 2)
-    return places, np.repeat(np.arctan2(steps[long, 1], steps[long, 0]), 2)
 
 
 def _feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, largest_stretch: float) -> Array:

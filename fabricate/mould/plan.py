@@ -10,13 +10,16 @@ Lengths are those of the pad as it is used. Where the silicone shrinks, the moul
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from design.common.errors import InputError, instance
-from design.pad.courses.curves import Crossing, crossings, flatten, lengths
+from design.pad.courses.bending import traced_curve
+from design.pad.courses.common_length import common_stretches
+from design.pad.courses.curves import Crossing, beziers, crossings, flatten, lengths, slope_beziers
 from design.pad.courses.keep_out import keep_outs
 from design.pad.knots import Array
 from design.pad.morphology import Morphology
@@ -40,6 +43,22 @@ _BESIDE = 5
 """Further from a fibre's start than so many times its height a number is no longer seen to belong to it."""
 _CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
 """How the tolerance is shared: most thins out the outline, which sets the size of every file."""
+
+
+class CommonTrack(NamedTuple):
+    """A stretch of a track that lies over a deeper one: it has no floor of silicone there.
+
+    Attributes:
+        shallow: index of the fibre of the stretch.
+        deep: index of the fibre below it.
+        length_mm: how long the shallow one's centre line is nearer to the deep one's than a track is wide.
+        place_mm: the middle of it.
+    """
+
+    shallow: int
+    deep: int
+    length_mm: float
+    place_mm: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -105,6 +124,25 @@ class Plan:
             found.append(np.vstack([start.beyond(*past), before, self.pad.to_mm(curve), after, end.beyond(*past)]))
         return found
 
+    def traced(self, step: float, past_mm: float) -> list[tuple[Array, Array]]:
+        """Of every fibre and its leads points (n, 2), mm, and the exact headings (n,) there, radians, unwrapped.
+
+        Where it turns in one place, as it may where it meets a lead, that place stands there twice.
+
+        Args:
+            step: greatest turn from one point to the next, radians.
+            past_mm: how far past its tongues' ends it goes.
+        """
+        past = self.settings.mould.exit_mm + past_mm
+        found = []
+        for fibre, (spans, slopes) in enumerate(zip(beziers(self.pad), slope_beziers(self.pad), strict=True)):
+            points, headings = traced_curve(spans, slopes, step)
+            (before, coming), (after, going) = (lead.traced(step, past) for lead in self.leads.pairs[fibre])
+            headings = np.pi / 2 - headings if self.family(fibre) else headings
+            whole = np.concatenate([coming[::-1] + np.pi, headings, going])
+            found.append((np.vstack([before[::-1], self.pad.to_mm(points), after]), np.unwrap(whole)))
+        return found
+
     @cached_property
     def leads(self) -> Leads:
         """How every fibre goes on from its ends to the silicone's edge."""
@@ -141,6 +179,20 @@ class Plan:
     def clash_places_mm(self) -> Array:
         """(n, 2) where the clashes are."""
         return self.pad.to_mm(np.array([c.place for c in self.clashes]).reshape(-1, 2))
+
+    @cached_property
+    def common_tracks(self) -> list[CommonTrack]:
+        """Where tracks of different depths lie over each other, leads included; at every crossing, and alongside."""
+        found = []
+        for level in range(max(self.levels)):
+            shallow = [fibre for fibre, own in enumerate(self.levels) if own == level]
+            deep = [fibre for fibre, own in enumerate(self.levels) if own > level]
+            lines = [[shapely.get_coordinates(self.lines[fibre]) for fibre in fibres] for fibres in (shallow, deep)]
+            shared = common_stretches(lines[0], lines[1], self.settings.mould.ridge_width_mm)
+            for line, other, begin, end in zip(shared.line, shared.other, shared.begin, shared.end, strict=True):
+                middle = self.lines[shallow[line]].interpolate((begin + end) / 2)
+                found.append(CommonTrack(shallow[line], deep[other], float(end - begin), (middle.x, middle.y)))
+        return found
 
     def family(self, fibre: int) -> int:
         """0 for a horizontal fibre, 1 for a vertical one."""

@@ -126,6 +126,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
         "same_family_crossings": 0,
         "max_crossings": "any",
         "min_crossing_angle_deg": 0.0,
+        "max_common_track_mm": 2.0,
         "border_mm": 2.0,
         "keep_out_mm": 1.5,
         "max_length_mm": 500.0,

@@ -1,5 +1,6 @@
 """Whether ridges print and demould, and tracks let the fibres be laid: each check one finding with its places."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,8 +9,7 @@ from numpy.typing import NDArray
 from shapely import ops
 from shapely.geometry.base import BaseGeometry
 
-from design.criteria.rules import tight_bends
-from design.pad.courses.bending import traced_curve
+from design.pad.courses.bending import bend_radius, traced_curve
 from design.pad.courses.curves import beziers, flatten, slope_beziers
 from fabricate.checks.findings import Finding, Status, as_places, graded, verdict
 from fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
@@ -20,12 +20,19 @@ _SLENDER, _TOO_SLENDER = 5.0, 10.0
 """Ridges taller than so many times their width may break off in demoulding, or do not print upright at all."""
 _FINE_MM, _TURN = 3e-4, 0.05
 """Folds are looked for along fibres drawn so finely, at points between which they turn by so many radians at most."""
+_BEND_TURN, _BEND_SLACK = 2.5e-3, 1e-3
+"""Radians that fibres turn by at most between points at which bends are looked at; leads bend as tightly as allowed."""
+_KINK = 0.5
+"""Radians by which a fibre may turn in one place, as the rule for bends has it."""
 _NAMED = 8
 """More fibres than this are counted instead of named."""
 
 
 def check_tracks(plan: Plan) -> list[Finding]:
-    """The checks of ridges and tracks: of the mould as it is printed, and of the pad as it is used."""
+    """The checks of ridges and tracks: of the mould as it is printed, and of the pad as it is used.
+
+    What tracks have in common is only looked at where the rules have a limit.
+    """
     mould = plan.enlarged
     return [
         _ridge_width(mould),
@@ -34,10 +41,12 @@ def check_tracks(plan: Plan) -> list[Finding]:
         _slenderness(mould),
         _crossing_gap(plan),
         _same_family_crossings(plan),
+        *_common_tracks(plan),
         _silicone_wall(plan),
         _tray_wall(plan),
         _cover(plan),
         _fibre_bend(plan),
+        _lead_kinks(plan),
         _folds(mould),
         _numbers(mould),
     ]
@@ -112,6 +121,23 @@ def _same_family_crossings(plan: Plan) -> Finding:
     return Finding("same_family_crossings", status, len(places), 0, message, as_places(places))
 
 
+def _common_tracks(plan: Plan) -> list[Finding]:
+    """Where a track lies over a deeper one it has no floor: the adhesive alone keeps the fibres apart."""
+    limit = plan.settings.rules.max_common_track_mm
+    if limit is None:
+        return []
+    worst = max(plan.common_tracks, key=lambda each: each.length_mm, default=None)
+    if worst is None:
+        return [Finding("common_tracks", "pass", 0.0, limit, "no track lies over a deeper one")]
+    long = [each for each in plan.common_tracks if each.length_mm > limit]
+    message = (
+        f"tracks lie over deeper ones for {worst.length_mm:.2f} mm at most, fibre {worst.shallow + 1} over"
+        f" {worst.deep + 1} at ({worst.place_mm[0]:.1f}, {worst.place_mm[1]:.1f}) mm"
+    )
+    places = as_places(each.place_mm for each in long)
+    return [Finding("common_tracks", "warn" if long else "pass", worst.length_mm, limit, message, places)]
+
+
 def _silicone_wall(plan: Plan) -> Finding:
     """The thinnest silicone between tracks of equal depth, of two fibres or of one that turns back, and keep-outs.
 
@@ -180,14 +206,32 @@ def _cover(plan: Plan) -> Finding:
 
 
 def _fibre_bend(plan: Plan) -> Finding:
-    """A fibre cannot follow a bend tighter than it bears, or than the rules: it lifts out of its track or breaks."""
+    """A fibre cannot follow a bend tighter than it bears, or than the rules: it lifts out of its track or breaks.
+
+    Bends are measured as by the rules (`bend_radius`), on fibres with their leads.
+    """
     limit = plan.settings.least_bend_mm
-    tight = tight_bends(plan.pad, limit)
-    least = min((bend.measured for bend in tight), default=limit)
-    names = _listed("fibre", [bend.fibres[0] for bend in tight])
+    bends = [bend_radius(*traced, limit / 2) for traced in plan.traced(_BEND_TURN, limit / 2)] if limit else []
+    tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_SLACK)]
+    least = min((radius for _, radius, _ in tight), default=limit)
+    names = _listed("fibre", [fibre for fibre, _, _ in tight])
     message = f"{names} bent as tightly as {least:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
-    places = [bend.place_mm for bend in tight if bend.place_mm is not None]
-    return verdict("fibre_bend", not tight, least, limit, message, places)
+    return verdict("fibre_bend", not tight, least, limit, message, [place for _, _, place in tight])
+
+
+def _lead_kinks(plan: Plan) -> Finding:
+    """A fibre may meet its lead at a corner, of half a radian at most: what the rule for bends lets pass."""
+    limit = math.degrees(_KINK)
+    slopes = slope_beziers(plan.pad)
+    kinks = np.degrees(np.arctan(np.abs(np.stack([slopes[:, 0, 0], slopes[:, -1, -1]], axis=1))))
+    sharp = [(fibre, end) for fibre, end in zip(*np.nonzero(kinks > limit + 1e-9), strict=True)]
+    worst = float(kinks.max())
+    fibre = int(kinks.max(axis=1).argmax()) + 1
+    message = (
+        f"fibres meet their leads at corners of {worst:.1f} degrees at most, allowed are {limit:.1f}; fibre {fibre}"
+    )
+    places = as_places(plan.leads.pairs[fibre][end].end_mm for fibre, end in sharp)
+    return verdict("lead_kinks", not sharp, worst, limit, message, places)
 
 
 def _folds(plan: Plan) -> Finding:

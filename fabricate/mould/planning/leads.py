@@ -59,6 +59,26 @@ class Lead:
             points.append(cubic(span, np.arange(1, steps + 1) / steps))
         return np.vstack(points)
 
+    def traced(self, step: float, past_mm: float) -> tuple[Array, Array]:
+        """Points (n, 2) from the fibre's end to so far past the edge, mm, and the exact headings there, radians.
+
+        Args:
+            step: greatest turn from one point to the next, radians.
+            past_mm: how far past the edge.
+        """
+        points, directions = [], []
+        for span in self.spans:
+            sides = np.diff(span, axis=0)
+            first, last = (side / np.linalg.norm(side) for side in (sides[0], sides[-1]))
+            u = np.linspace(0, 1, 1 + max(1, int(np.ceil(np.arccos(np.clip(first @ last, -1, 1)) / step))))
+            points.append(cubic(span, u))
+            v = u[:, None]
+            directions.append((1 - v) ** 2 * sides[0] + 2 * v * (1 - v) * sides[1] + v**2 * sides[2])
+        points.append(np.array([self.turned_mm, self.beyond(past_mm)]))
+        directions.append(np.array([self.outward, self.outward]))
+        ahead = np.vstack(directions)
+        return np.vstack(points), np.arctan2(ahead[:, 1], ahead[:, 0])
+
     @cached_property
     def length_mm(self) -> float:
         """To the edge."""

@@ -33,6 +33,7 @@ def document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
         "fibre": what they are of. "fibres": one each, in the order of their numbers.
         "laying_order": the numbers laid in each step, deep first.
         "crossings": all of them, with the silicone left between the fibres.
+        "common_tracks": where a track lies over a deeper one for longer than at two crossings at right angles.
         "exits": of leads to one side, the numbers along it from left to right as the pad lies turned over.
     """
     ends = [(lead.turned_mm[0], number) for number, pair in enumerate(plan.leads.pairs, 1) for lead in pair]
@@ -44,6 +45,7 @@ def document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
         "fibres": _fibres(plan),
         "laying_order": [[fibre + 1 for fibre in layer.fibres] for layer in layers(plan)],
         "crossings": _crossings(plan),
+        "common_tracks": _common_tracks(plan),
         **({"exits": [number for _, number in sorted(ends, reverse=True)]} if one_side else {}),
     }
 
@@ -97,6 +99,21 @@ def _crossings(plan: Plan) -> dict[str, Any]:
         "columns": ["first", "second", "x_mm", "y_mm", "depth_first_mm", "depth_second_mm", "gap_mm"],
         "table": table,
     }
+
+
+def _common_tracks(plan: Plan) -> list[dict[str, Any]]:
+    """At a right angle tracks have two widths in common; the longest stretches first."""
+    least = 4 * plan.settings.mould.ridge_width_mm
+    long = [each for each in plan.common_tracks if each.length_mm > least]
+    return [
+        {
+            "shallow": each.shallow + 1,
+            "deep": each.deep + 1,
+            "length_mm": round(each.length_mm, 3),
+            "place_mm": [round(x, 3) for x in each.place_mm],
+        }
+        for each in sorted(long, key=lambda each: -each.length_mm)
+    ]
 
 
 def laying_page(document: Mapping[str, Any]) -> str:
@@ -212,9 +229,11 @@ def _crossing_places(document: Mapping[str, Any]) -> Iterator[str]:
     least = f"At least {crossings['gap_mm']:g} mm lie between two fibres." if crossings["gap_mm"] > 0 else "Some touch."
     yield f"{crossings['total']} crossings, {crossings['same_family']} of them within a family. {least}"
     yield ""
-    if crossings["total"] <= _LONGEST_TABLE:
+    if crossings["total"] <= _LONGEST_TABLE or document["common_tracks"]:
         yield "Places are from the middle of the pad. As it lies, x runs to the left and y away from you."
         yield ""
+    yield from _shared_places(document["common_tracks"])
+    if crossings["total"] <= _LONGEST_TABLE:
         rows = [
             (f"{number[one]} and {number[two]}", f"{x:.1f} mm", f"{y:.1f} mm", _depths(a, b), f"{gap:g} mm")
             for one, two, x, y, a, b, gap in crossings["table"]
@@ -226,6 +245,31 @@ def _crossing_places(document: Mapping[str, Any]) -> Iterator[str]:
     yield from table(("depths", "between the fibres", "crossings"), rows)
     yield ""
     yield "`fabrication.json` has the place of each."
+
+
+def _shared_places(shared: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Where the adhesive alone keeps fibres apart."""
+    if not shared:
+        return
+    yield (
+        "Here a track lies over a deeper one for longer than at two crossings at right angles. It has no floor of"
+        " silicone there: let the adhesive over the deeper fibre cure, and see that it covers it, before you lay the"
+        " upper one."
+    )
+    yield ""
+    rows = [
+        (
+            f"{each['shallow']} over {each['deep']}",
+            *(f"{x:.1f} mm" for x in each["place_mm"]),
+            f"{each['length_mm']:.1f} mm",
+        )
+        for each in shared
+    ]
+    yield from table(("tracks", "x", "y", "in common"), rows[:_LONGEST_TABLE])
+    if len(rows) > _LONGEST_TABLE:
+        yield ""
+        yield f"These are the {_LONGEST_TABLE} longest of {len(rows)}; `fabrication.json` has them all."
+    yield ""
 
 
 def _remarks(findings: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -7,13 +7,20 @@ from scipy.interpolate import PchipInterpolator
 
 from design import Morphology
 from design.criteria.differentiable import span_samples
-from design.criteria.penalties import penalties
+from design.criteria.penalties import COMMON, penalties
 from design.criteria.rules import check_rules
 from design.pad.contact import fibre_axes
 from design.pad.courses.curves import crossings, lengths
 from design.settings import PadSettings, RulesSettings
 
-NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=0, border_mm=0, max_length_mm=1e6)
+NONE = RulesSettings(
+    min_bend_radius_mm=0,
+    min_gap_mm=0,
+    same_family_crossings=0,
+    border_mm=0,
+    max_length_mm=1e6,
+    max_common_track_mm=None,
+)
 
 
 def axes(pad):
@@ -37,6 +44,14 @@ def bent(cross, travel=2.5, fibre=0, others=0.0):
     return Morphology(knots)
 
 
+def slanting(shift):
+    """A 4 x 4 grid with one vertical that crosses the straight horizontal 2 the more flatly the more it shifts."""
+    knots = Morphology.straight(4).knots
+    inner = knots[:, :1] + np.array([0.3, 0.7])[:, None] * (knots[:, -1:] - knots[:, :1])
+    inner[4] = [(1, 1.8), (1 + shift, 2.2)]
+    return Morphology(np.concatenate([knots[:, :1], inner, knots[:, -1:]], axis=1))
+
+
 def test_the_straight_grid_has_no_penalty():
     assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
 
@@ -51,6 +66,7 @@ def test_the_straight_grid_has_no_penalty():
         ({"max_length_mm": 60.0}, bent(2.8), bent(3.8)),
         ({"max_crossings": 10}, bent(1.1), bent(3.5, travel=4.5)),
         ({"min_crossing_angle_deg": 85.0}, bent(1.3), bent(1.9)),
+        ({"max_common_track_mm": 1.0}, slanting(2.0), slanting(3.0)),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
@@ -147,6 +163,14 @@ def test_a_grid_too_narrow_costs_by_a_closed_form(margin):
     assert passing["min_gap_mm"] == passing["same_family_crossings"] == 0
 
 
+def bump():
+    """A 4 x 4 grid with one fibre that bends up and down again, level at both ends, where it meets its leads."""
+    knots = np.repeat(Morphology.straight(4).knots[:, :1], 5, axis=1)
+    knots[:4, :, 0] = knots[4:, :, 1] = [0, 1, 2.5, 4, 5]
+    knots[0, 2, 1] = 2.6
+    return Morphology(knots)
+
+
 def dense(pad, fibre):
     """Arc length, heading and slope at many points along a fibre, by SciPy, and their travel coordinate."""
     axis = 0 if fibre < pad.grid else 1
@@ -158,19 +182,38 @@ def dense(pad, fibre):
     return arc, np.arctan(slope), slope, at
 
 
+@pytest.mark.parametrize("bent_radius_mm", [None, 30.0])
 @pytest.mark.parametrize("margin", [1.0, 1.3])
-def test_a_bend_costs_what_its_windows_turn_too_far(margin):
-    """Against the mean over the pad's fibres of the integral along each, in shares of the size of the pad."""
-    pad, limit_mm = bent(2.6), 20.0
+def test_a_bend_costs_what_its_windows_turn_too_far(margin, bent_radius_mm):
+    """Against the mean over the pad's fibres of the integral along each, in shares of the size of the pad.
+
+    A pad worn bent turns its fibres out of the plan as well, at right angles to how they turn in it.
+    """
+    pad, limit_mm = bump(), 20.0
+    around = limit_mm / 2 / (bent_radius_mm or np.inf)
     expected = 0.0
     for fibre in range(8):
         arc, heading, _, _ = dense(pad, fibre)
         turned = np.append(0, np.abs(np.diff(heading)).cumsum())
         window = limit_mm / pad.unit_mm / 2
-        over = (np.interp(arc + window, arc, turned) - turned) * margin * 2 - 1
+        over = np.hypot(np.interp(arc + window, arc, turned) - turned, around) * margin * 2 - 1
         expected += np.trapezoid(np.maximum(over, 0), arc) / (pad.grid + 1) / 8
-    rules = NONE.model_copy(update={"min_bend_radius_mm": limit_mm})
-    assert found(pad, rules, margin)["min_bend_radius_mm"] == pytest.approx(expected, rel=0.05)
+    rules, size = NONE.model_copy(update={"min_bend_radius_mm": limit_mm}), PadSettings(bent_radius_mm=bent_radius_mm)
+    assert expected > 0
+    assert penalties(*axes(pad), size, rules, margin)["min_bend_radius_mm"].item() == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(("rise", "costs"), [(0.5, False), (0.6, True)])
+@pytest.mark.parametrize(("fibre", "end"), [(0, 0), (0, -1), (5, 0), (5, -1)])
+def test_a_fibre_that_meets_its_lead_at_more_than_half_a_radian_costs(rise, costs, fibre, end):
+    """It climbs straight from its end on, for 4 mm, and leads go straight on."""
+    knots = np.repeat(Morphology.straight(4).knots[:, :1], 5, axis=1)
+    at = np.array([0, 0.4, 0.8, 1.4, 5])
+    knots[:4, :, 0] = knots[4:, :, 1] = 5 - at[::-1] if end else at
+    climb = rise * np.array([0, 0.4, 0.8, 0, 0])
+    knots[fibre, :, int(fibre < 4)] += climb[::-1] if end else climb
+    rules = NONE.model_copy(update={"min_bend_radius_mm": 1.0})
+    assert (found(Morphology(knots), rules)["min_bend_radius_mm"] > 0) == costs
 
 
 @pytest.mark.parametrize(("cross", "travel", "fibre"), [(1.9, 0.3, 0), (3.0, 4.6, 5)])
@@ -196,6 +239,34 @@ def test_a_slanting_crossing_costs_the_share_its_angle_falls_short():
     )
     rules = NONE.model_copy(update={"min_crossing_angle_deg": 30.0})
     assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(0, abs=0.01)
+
+
+def test_a_stretch_too_long_costs_by_how_near_it_is_at_two_places_as_far_apart_as_is_allowed():
+    """The horizontal is straight: half the limit from where they cross it is off by that times the sine."""
+    pad, limit = slanting(2.0), NONE.model_copy(update={"max_common_track_mm": 1.6})
+    sine = np.sin(np.arctan(0.4 / 3.0))  # half-way between turning points a PCHIP is half as steep again
+    for margin in (1.0, 1.2):
+        share = 1 - 0.8 / margin * sine / 0.4
+        expected = COMMON * share * 1.6 / margin / 11.25 / 8 / 5  # by its share of the length of all fibres
+        assert found(pad, limit, margin)["max_common_track_mm"] == pytest.approx(expected, rel=0.05)
+    assert found(pad, limit.model_copy(update={"max_common_track_mm": 7.0}))["max_common_track_mm"] == 0
+
+
+def test_the_gradient_of_a_stretch_too_long_is_that_of_finite_differences():
+    """The cross coordinates of either fibre turn it about where they cross."""
+    rules, size = NONE.model_copy(update={"max_common_track_mm": 1.6}), PadSettings()
+    travel, cross = axes(slanting(2.0))
+    penalties(travel, cross, size, rules)["max_common_track_mm"].backward()
+    assert cross.grad is not None
+    least = 0.02 * cross.grad.abs().max().item()  # the middle of a stretch moves a little as well
+    for fibre, knot in ((4, 1), (4, 2), (1, 1), (1, 2)):
+        step = torch.zeros_like(cross)
+        step[fibre, knot] = 1e-4
+        with torch.no_grad():
+            ahead, behind = (
+                penalties(travel, cross + sign * step, size, rules)["max_common_track_mm"].item() for sign in (1, -1)
+            )
+        assert (ahead - behind) / 2e-4 == pytest.approx(cross.grad[fibre, knot].item(), rel=0.1, abs=least)
 
 
 def test_crossings_of_a_family_beyond_those_allowed_are_counted():

@@ -6,10 +6,18 @@ from scipy.interpolate import PchipInterpolator
 
 from design import InputError, Morphology, Spec, crossings
 from design.criteria.rules import check_rules
-from design.pad.courses.curves import crossing_angles
-from design.settings import RulesSettings
+from design.pad.courses.common_length import common_stretches
+from design.pad.courses.curves import crossing_angles, flatten, slopes
+from design.settings import PUBLISHED, RulesSettings
 
-NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
+NONE = RulesSettings(
+    min_bend_radius_mm=0,
+    min_gap_mm=0,
+    same_family_crossings=10**6,
+    border_mm=0,
+    max_length_mm=1e6,
+    max_common_track_mm=None,
+)
 
 
 def only(**limits):
@@ -159,8 +167,9 @@ def test_a_sharp_bend_is_found_and_a_gentle_one_passes():
 
 
 def test_a_bend_is_placed_where_it_is():
-    knots = np.array([[0, 1], [1.0, 1.9], [2, 1.0]])
-    pad = Morphology(np.stack([knots, [[1, 0], [1, 1.0], [1, 2.0]]]), pitch_mm=2.0)
+    at = np.array([0, 0.1, 0.6, 0.9, 1.0, 1.1, 1.4, 1.9, 2])  # level at both ends, where it meets its leads
+    knots = np.column_stack([at, [1, 1, 1.2, 1.8, 1.9, 1.8, 1.2, 1, 1]])
+    pad = Morphology(np.stack([knots, np.column_stack([np.ones(9), at])]), pitch_mm=2.0)
     found = check_rules(pad, only(min_bend_radius_mm=2.0))
     assert [v.fibres for v in found] == [(1,)]
     assert found[0].place_mm == pytest.approx((0, 0.9 * 2), abs=0.01)
@@ -258,3 +267,74 @@ def test_flat_crossings_are_told_in_the_order_of_the_fibres():
     pairs = [v.fibres for v in found]
     assert pairs == sorted(pairs)
     assert [v.measured for v in found] != sorted(v.measured for v in found)
+
+
+def slanting(rise=0.12):
+    """A pad of 1 + 1 whose vertical crosses the straight horizontal flatly: it climbs twice `rise` in half the pad."""
+    level = np.column_stack([[0, 0.5, 1.5, 2], np.ones(4)])
+    return Morphology(np.stack([level, np.array([[1, 0], [0.5, 1 - rise], [1.5, 1 + rise], [1, 2]])]))
+
+
+def test_tracks_that_cross_flatly_are_found_with_what_they_have_in_common():
+    """Half-way up between two turning points a PCHIP is half as steep again as its chord."""
+    pad = slanting()
+    sine = np.sin(np.arctan(2 * 0.12 / 1.5))
+    (found,) = check_rules(pad, only(max_common_track_mm=2.0))
+    assert (found.rule, found.fibres, found.limit) == ("max_common_track_mm", (1, 2), 2.0)
+    assert found.measured == pytest.approx(0.8 / sine, rel=0.05)
+    assert found.place_mm == pytest.approx((0, 0), abs=1e-2)
+    assert check_rules(pad, only(max_common_track_mm=found.measured + 1e-3)) == []
+    assert check_rules(pad, only(max_common_track_mm=None)) == []
+    assert check_rules(Morphology.straight(4), only(max_common_track_mm=1.0)) == []
+
+
+def test_tracks_that_lie_along_each_other_without_crossing_are_found():
+    horizontal = [[0, 1], [0.3, 0.3], [0.4, 0.4], [0.7, 0.7], [0.9, 0.9], [1.5, 1.3], [2, 1]]
+    vertical = [[1, 0], [0.34, 0.31], [0.43, 0.4], [0.73, 0.7], [0.93, 0.9], [1.6, 1.0], [1, 2]]
+    pad = Morphology(np.array([horizontal, vertical]))
+    (found,) = check_rules(pad, only(max_common_track_mm=2.0))
+    assert found.measured > 5
+    place = np.array(found.place_mm)
+    assert min(np.hypot(*(pad.to_mm(c.place) - place)) for c in crossings(pad)) > found.measured / 2
+
+
+def test_a_pair_of_tracks_is_named_once_by_the_longest_stretch_of_either():
+    pad = Morphology.random(3, 9, seed=1)
+    found = check_rules(pad, only(max_common_track_mm=2.0))
+    lines = [pad.to_mm(line) for line in flatten(pad, 1e-4)]
+    longest = {}
+    for one, other in ((range(3), range(3, 6)), (range(3, 6), range(3))):
+        shared = common_stretches([lines[i] for i in one], [lines[i] for i in other], 0.4)
+        for i, j, length in zip(shared.line, shared.other, shared.length, strict=True):
+            pair = tuple(sorted((one[i] + 1, other[j] + 1)))
+            longest[pair] = max(longest.get(pair, 2.0), length)
+    assert {v.fibres: v.measured for v in found} == pytest.approx(
+        {pair: length for pair, length in sorted(longest.items()) if length > 2.0}, abs=0.01
+    )
+
+
+def test_any_length_in_common_is_written_and_read_as_a_word():
+    assert Spec({"rules": {"max_common_track_mm": "any"}}).section(RulesSettings).max_common_track_mm is None
+    assert PUBLISHED["rules"] == RulesSettings(max_common_track_mm=None)
+    with pytest.raises(InputError, match=r"\[rules\] max_common_track_mm: got 0.8"):
+        Spec({"rules": {"max_common_track_mm": 0.8}}).section(RulesSettings)
+
+
+@pytest.mark.parametrize(("rise", "breaks"), [(0.5, False), (0.6, True)])
+@pytest.mark.parametrize("family", [0, 1])
+@pytest.mark.parametrize("end", [0, -1])
+def test_a_fibre_may_meet_its_lead_at_half_a_radian(rise, breaks, family, end):
+    """A straight climb from the end on, which a PCHIP keeps to; leads go straight on along the fibre's axis."""
+    at = np.array([0, 0.4, 0.8, 1.4, 2.0])
+    cross = np.array([1, 1 + 0.4 * rise, 1 + 0.8 * rise, 1, 1])
+    climbing = np.column_stack([at, cross] if end == 0 else [2 - at[::-1], cross[::-1]])
+    level = np.column_stack([np.ones(5), at])
+    fibres = [climbing, level] if family == 0 else [level[:, ::-1], climbing[:, ::-1]]
+    pad = Morphology(np.stack(fibres))
+    angle = np.arctan(slopes(pad)[family, end])
+    found = check_rules(pad, only(min_bend_radius_mm=1.0))
+    assert (abs(angle) > 0.5) == breaks
+    assert [v.fibres for v in found] == ([(family + 1,)] if breaks else [])
+    if breaks:
+        assert found[0].measured == pytest.approx(0.5 / abs(angle), rel=0.02)
+        assert np.abs(found[0].place_mm).max() == pytest.approx(11.25, abs=0.3)

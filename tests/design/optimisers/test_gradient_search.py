@@ -96,8 +96,8 @@ def test_rules_that_cannot_be_met_end_with_what_resists(rules, resists, monkeypa
 
 @pytest.fixture(scope="module")
 def as_usual():
-    """What is found within the rules that hold unless others are asked for."""
-    return found_within(RulesSettings())
+    """What is found within the rules that hold unless others are asked for, with flat crossings."""
+    return found_within(RulesSettings(max_common_track_mm=None))
 
 
 def found_within(rules):

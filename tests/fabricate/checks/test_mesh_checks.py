@@ -9,7 +9,7 @@ from design.common.errors import InputError
 from fabricate.checks import mesh_checks
 from fabricate.checks.mesh_checks import SOUND, check_mesh, inspect_mesh, sound
 from fabricate.settings import PrinterSettings
-from tests.fabricate.checks.trays import CROSS, block, faults, inspected, line, near, prism, tray
+from tests.fabricate.checks.trays import CROSS, FLOOR, block, faults, inspected, line, near, prism, tray
 
 
 class TestSound:
@@ -221,6 +221,14 @@ class TestTight:
         leak = Manifold.cylinder(9, 1.0).translate((3, 3, -1))
         solid = Manifold.batch_boolean([tray(draft_deg=0), plate], OpType.Add) - leak
         assert inspected(solid)["tight"].status == status
+
+    def test_a_slot_in_the_foot_that_a_tray_stands_on_lets_nothing_out(self):
+        """What the lowest slab surrounds is below the floor; the same slot in the wall above it is a leak."""
+        foot = prism(shapely.box(-9, -9, 9, 9).difference(shapely.box(-7, -7, 7, 7)), -0.5, 0.1)
+        for low, high, status in ((-1.0, 0.0, "pass"), (FLOOR, FLOOR + 0.5, "fail")):
+            slot = prism(line((6, 2), (14, 2), width=3.0), low, high)
+            solid = Manifold.batch_boolean([tray(draft_deg=0), foot], OpType.Add) - slot
+            assert inspected(solid)["tight"].status == status
 
     def test_pockets_that_lead_nowhere(self):
         slot = prism(line((9, 2), (11, 2), width=3.0), 2.0, 9.0)

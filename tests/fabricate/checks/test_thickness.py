@@ -187,6 +187,17 @@ class TestWidth:
         found = inspected(tray(floor=floor), printer=PrinterSettings(layer_mm=layer))["floor_thickness"]
         assert (found.status, found.limit) == (status, pytest.approx(max(0.4, 2 * layer)))
 
+    @pytest.mark.parametrize(("lean_deg", "status"), [(0, "fail"), (8, "fail"), (12, "pass")])
+    def test_a_floor_is_level_to_ten_degrees(self, lean_deg, status):
+        """A groove from below, with a roof that leans to either side and leaves 0.3 mm of floor over its ridge."""
+        fall = 3 * math.tan(math.radians(lean_deg))
+        gable = shapely.Polygon([(-3, -1), (3, -1), (3, 1.7 - fall), (0, 1.7), (-3, 1.7 - fall)])
+        groove = prism(gable, -4, 4).rotate((90, 0, 0))
+        floor = inspected(tray(*CROSS) - groove)["floor_thickness"]
+        assert floor.status == status
+        if status == "fail":
+            assert floor.measured == pytest.approx(0.3, abs=0.02)
+
     def test_less_than_a_layer(self):
         assert faults(inspected(block(10, 10, 0.03))) == {"floor_thickness": "fail"}
 

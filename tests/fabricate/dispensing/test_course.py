@@ -8,6 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
+from design.settings import PadSettings, RulesSettings
 from fabricate.dispensing.course import Stroke, laying_steps
 from fabricate.mould.plan import Plan
 from fabricate.report.laying import guide
@@ -50,6 +51,30 @@ def test_no_bend_is_taken_faster_than_machine_and_fibre_can(stretch):
         slow += (stroke.feeds_mm_s < 6).sum()
         assert np.allclose(stroke.feeds_mm_s / 1.2, np.round(stroke.feeds_mm_s / 1.2))
     assert slow
+
+
+@pytest.mark.parametrize(
+    ("radius_mm", "acceleration", "stretch", "feed"),
+    [
+        (4.0, 9.5, math.inf, 6.0),  # sqrt(9.5 * 4) = 6.16 mm/s
+        (4.0, 26.0, math.inf, 10.0),
+        (2.0, 9.5, math.inf, 4.0),  # sqrt(9.5 * 2) = 4.36 mm/s
+        (4.0, 26.0, 0.07, 4.0),  # 1 - 0.3 / (2 * 4 * 0.07) = 0.464 of the feed
+        (4.0, 9.5, 0.11, 6.0),  # the fibre bears 6.59 mm/s
+    ],
+)
+def test_the_feed_in_a_bend_is_what_its_radius_allows(radius_mm, acceleration, stretch, feed):
+    """Leads to one side turn by quarters of a circle, of the least radius of the rules; all else here is straight."""
+    settings = replace(
+        with_dispenser(acceleration_mm_s2=acceleration, feed_mm_s=10.0),
+        pad=PadSettings(leads="one side"),
+        rules=RulesSettings(min_bend_radius_mm=radius_mm),
+    )
+    (horizontal,) = (each for each in strokes(Plan(Morphology.straight(2), settings), stretch) if each.fibre == 0)
+    assert (horizontal.feeds_mm_s.min(), horizontal.feeds_mm_s.max()) == (feed, 10.0)
+    slow_mm = horizontal.steps_mm[horizontal.feeds_mm_s == feed].sum()
+    ends_mm = 4 * 2 * 0.3  # of both quarters: beside them the needle has half a diameter to get slower in
+    assert slow_mm == pytest.approx(math.pi * radius_mm if feed < 10 else horizontal.steps_mm.sum(), abs=ends_mm)
 
 
 def test_bends_only_where_they_are_slow_a_fibre_down():

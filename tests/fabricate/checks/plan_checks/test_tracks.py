@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
 
 from design.pad.courses.curves import beziers, cubic
 from design.pad.morphology import Morphology
+from design.settings import RulesSettings
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.plan_checks import check, check_plan
@@ -138,12 +141,39 @@ class TestFibres:
         ("bears", "rule", "status", "limit"), [(20, 1, "fail", 20), (9, 1, "pass", 9), (9, 12, "pass", 12)]
     )
     def test_a_bend_tighter_than_the_fibre_bears(self, bears, rule, status, limit):
-        """Fibres that swing gently: their bends are of some 18 mm."""
-        knots = np.array([[0, 1], [0.5, 1.1], [1, 1], [1.5, 0.9], [2, 1]])
+        """Fibres that swing gently: their bends are of some 13 mm."""
+        knots = np.array([[0, 1], [0.1, 1.01], [0.5, 1.1], [1.5, 0.9], [1.9, 0.99], [2, 1]])
         pad = Morphology(np.stack([knots, knots[:, ::-1]]), 15.0)
         settings = with_settings(rules={"min_bend_radius_mm": float(rule)}, fibre={"least_bend_mm": float(bears)})
         finding = found(pad, "fibre_bend", settings)
         assert (finding.status, finding.limit) == (status, limit)
+
+    @pytest.mark.parametrize("leads", ["edges", "one side"])
+    @pytest.mark.parametrize(("rise", "status"), [(0.5, "pass"), (0.6, "fail")])
+    def test_corners_where_fibres_meet_their_leads(self, rise, status, leads):
+        """A straight climb from the left end of the horizontal on; leads begin straight."""
+        at = np.array([0, 0.4, 0.8, 1.4, 2])
+        climb = np.stack([at, 1 + rise * np.array([0, 0.4, 0.8, 0, 0])], axis=1)
+        pad = Morphology(np.stack([climb, np.stack([np.ones(5), at], axis=1)]), 11.25)
+        kinks, bends = (found(pad, name, with_settings(pad={"leads": leads})) for name in ("lead_kinks", "fibre_bend"))
+        angle = np.arctan(rise)
+        assert (kinks.status, bends.status) == (status, status)
+        assert kinks.measured == pytest.approx(np.degrees(angle))
+        assert kinks.limit == pytest.approx(np.degrees(0.5))
+        assert bends.measured == pytest.approx(min(0.5 / angle, 1.0), rel=2e-3)
+        if status == "fail":
+            assert len(kinks.places_mm) == len(bends.places_mm) == 1
+            assert kinks.places_mm[0] == pytest.approx((-11.25, 0))
+            assert bends.places_mm[0] == pytest.approx((-11.25, 0), abs=0.02)
+
+    def test_leads_to_one_side_bend_as_tightly_as_is_allowed(self):
+        one_side = with_settings(pad={"leads": "one side"}, rules={"min_bend_radius_mm": 3.0})
+        assert found(Morphology.straight(2), "fibre_bend", one_side).status == "pass"
+        tighter = replace(one_side, rules=RulesSettings(min_bend_radius_mm=3.1))
+        plan = Plan(Morphology.straight(2), tighter)
+        plan.__dict__["leads"] = Plan(Morphology.straight(2), one_side).leads  # planted: those of the other radius
+        finding = {each.name: each for each in check_plan(plan)}["fibre_bend"]
+        assert (finding.status, finding.measured) == ("fail", pytest.approx(3.0, rel=1e-3))
 
     @pytest.mark.parametrize(("deep", "status"), [(2.0, "pass"), (2.04, "warn"), (4.0, "warn"), (4.04, "fail")])
     def test_slender_ridges(self, deep, status):
@@ -187,6 +217,32 @@ class TestSilicone:
         """A peg 0.3 mm wide on a block: 0.006 and 0.015 mm² of it are thinner than 0.4 mm."""
         block, peg = shapely.box(0, 0, 10, 5), shapely.box(4, 5, 4.3, 5 + length)
         assert len(thinner(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
+
+    @pytest.mark.parametrize(
+        ("width", "length", "status"), [(0.2, 2.0, "pass"), (0.4, 2.0, "warn"), (0.4, None, "off")]
+    )
+    def test_tracks_that_lie_over_deeper_ones(self, width, length, status):
+        """Half-way between two turning points a PCHIP is half as steep again: they cross at 14.9 degrees."""
+        vertical = np.array([[1, 0], [0.5, 0.8], [1.5, 1.2], [1, 2]])
+        pad = Morphology(np.stack([np.stack([[0, 0.5, 1.5, 2], np.ones(4)], axis=1), vertical]), 20.0)
+        settings = with_settings(
+            {"ridge_width_mm": width}, {"nozzle_mm": width}, rules={"max_common_track_mm": length or "any"}
+        )
+        findings = {finding.name: finding for finding in check_plan(Plan(pad, settings))}
+        if status == "off":
+            assert "common_tracks" not in findings
+            return
+        finding = findings["common_tracks"]
+        assert (finding.status, finding.limit) == (status, 2.0)
+        assert finding.measured == pytest.approx(2 * width / np.sin(np.arctan(0.4 / 1.5)), rel=0.05)
+        assert "fibre 2 over 1 at (0.0, 0.0) mm" in finding.message.replace("-0.0", "0.0")
+        assert len(finding.places_mm) == (status == "warn")
+
+    def test_tracks_of_one_family_at_two_depths_lie_over_each_other_as_well(self):
+        plan = Plan(level_pad(1.51, 1.49))
+        over = {(each.shallow, each.deep): each.length_mm for each in plan.common_tracks}
+        assert over[0, 1] > 10 or over[1, 0] > 10
+        assert found(level_pad(1.51, 1.49), "common_tracks").status == "warn"
 
     def test_tracks_of_different_depths_may_come_near(self):
         """Two horizontals that cross lie at two depths, and their verticals far apart."""

@@ -127,6 +127,32 @@ def test_fibres_that_touch_are_told(settings: FabricationSettings, gap: float):
     assert crossings["same_family"] == 2
 
 
+def test_tracks_over_each_other_are_listed_from_twice_a_right_angled_crossing_on():
+    """Straight ones have 0.8 mm in common; a vertical that crosses at 25 degrees 1.9 mm, at 35 degrees 1.4 mm."""
+    assert guide.document(Plan(Morphology.straight(4)), 1.0)["common_tracks"] == []
+    assert "over a deeper one" not in guide.laying_page(whole(Plan(Morphology.straight(4))))
+    for angle_deg, listed in ((25, True), (35, False)):
+        shift = 0.2 / 3 / math.tan(math.radians(angle_deg))
+        vertical = [[1, 0], [1 - shift, 0.9], [1 + shift, 1.1], [1, 2]]
+        pad = Morphology(np.array([[[0, 1], [0.5, 1], [1.5, 1], [2, 1]], vertical]), 20.0)
+        document = whole(Plan(pad))
+        assert bool(document["common_tracks"]) == listed
+        if listed:
+            (shared,) = document["common_tracks"]
+            assert (shared["shallow"], shared["deep"]) == (2, 1)
+            assert shared["place_mm"] == pytest.approx([0, 0], abs=1e-3)
+            ((tracks, *_, length),) = rows(guide.laying_page(document), "tracks")
+            assert (tracks, length) == ("2 over 1", f"{shared['length_mm']:.1f} mm")
+
+
+def test_of_many_tracks_over_each_other_the_page_has_the_longest():
+    document = whole(Plan(Morphology.straight(4), with_settings({"ridge_width_mm": 0.5})))
+    one = {"shallow": 5, "deep": 1, "length_mm": 3.0, "place_mm": [0.0, 0.0]}
+    page = guide.laying_page(document | {"common_tracks": [one | {"length_mm": 90.0 - n} for n in range(30)]})
+    assert [row[-1] for row in rows(page, "tracks")] == [f"{90.0 - n:.1f} mm" for n in range(24)]
+    assert "the 24 longest of 30" in page
+
+
 @pytest.mark.parametrize("draft_deg", [0.0, 5.0])
 def test_adhesive_fills_the_tracks(draft_deg):
     plan = Plan(Morphology.straight(4), with_settings({"ridge_draft_deg": draft_deg}))

@@ -264,7 +264,8 @@ def test_our_own_plan_comes_back(tmp_path: Path) -> None:
 
 def test_the_command_writes_a_morphology_and_tells_of_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("pad.toml").write_text("[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n")
+    settings = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_bend_radius_mm = 0\n"
+    Path("pad.toml").write_text(settings)
     svg(tmp_path, *paths())
     ended = CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
     assert ended.exit_code == 0, ended.output
@@ -275,9 +276,7 @@ def test_the_command_writes_a_morphology_and_tells_of_rules(tmp_path: Path, monk
     pad = Morphology.load(tmp_path / "out/plan/morphology.json")
     assert pad.provenance["command"] == "padforge design import"
     assert list(pad.provenance["inputs"]) == ["plan.svg"]
-    Path("pad.toml").write_text(
-        "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmax_length_mm = 38\n"
-    )
+    Path("pad.toml").write_text(settings + "max_length_mm = 38\n")
     assert CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False).exit_code == 1
 
 
