@@ -95,22 +95,26 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(loss_shares(search.lost)), fibres))
-    masks = [torch.tensor(loss_masks(fibres, k, MAX_SETS)) for k in levels]
+    masks = [loss_masks(fibres, k, MAX_SETS) for k in levels]
     scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
     errors = []
     for window in judged_windows(size.sensed):
         presses = window_presses(size, window, JUDGED, rng)
+        if not presses.free.any():
+            continue
         near, far = (
             torch.tensor(relative_stretch(pad, positions, contact).T / scale)
             for positions in (presses.positions, presses.far)
         )
         touched = torch.cat([near, far], dim=1).any(dim=1)  # on a large pad most fibres are far from all the presses
         # and most sets of failed fibres are alike to what is left
-        sets = [mask[:, touched].unique(dim=0, return_inverse=True) for mask in masks]
-        partners = confusable(near[touched], far[touched], torch.cat([few for few, _ in sets]))
+        sets = [np.unique(mask[:, touched], axis=0, return_inverse=True) for mask in masks]
+        alive = [torch.tensor(few) for few, _ in sets]
+        partners = confusable(near[touched], far[touched], torch.cat(alive))
         responses = torch.cat([near, far[:, partners]], dim=1)[touched]
         given = responses, presses.joined(partners), torch.tensor(presses.step), torch.tensor(presses.free)
-        errors.append([expected_error(*given, few, search.response_scatter)[rows].mean().item() for few, rows in sets])
+        found = [expected_error(*given, few, search.response_scatter).numpy() for few in alive]
+        errors.append([float(level[rows].mean()) for level, (_, rows) in zip(found, sets, strict=True)])
     return np.mean(errors, axis=0).tolist()
 
 

@@ -64,7 +64,8 @@ class GradientSearch:
         pad, search, rules = problem.pad, problem.search, problem.rules
         self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
         if state is None:
-            course = first_course(pad, rules, search.knots, problem.origin, start, self.rng)
+            gentle = bool(problem.contacts[0].reach)
+            course = first_course(pad, rules, search.knots, problem.origin, start, self.rng, gentle)
             self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
             self._optimiser = self._adam()
         else:
@@ -179,6 +180,8 @@ class GradientSearch:
         slope = pchip_slopes(travel, cross)
         length = arc_lengths(travel, cross, slope)[:, None]
         presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
+        while not presses.free.any():  # it lies in a keep-out
+            presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
         shares = loss_shares(search.lost)
         masks, _ = draw_losses(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))

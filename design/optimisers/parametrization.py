@@ -11,8 +11,8 @@ from design.pad.morphology import Morphology
 from design.settings import Layout, PadSettings, RulesSettings
 
 KNOTS_PER_TURN = 3  # before, at and after: a turn of given radius needs its shoulders
-STRAIGHT_START = 3  # the last of the default's: zigzags more often lead to the better pad
-AMPLITUDE = 0.1
+OTHER_START = 3  # the last of the default's
+MOVED = 0.1  # standard deviation of knots that are moved off a straight course or an origin, grid units
 WIDEST_BORDER = 0.45  # of the pad's side: a wider border leaves no room, which the rule check then says
 
 
@@ -77,22 +77,36 @@ def border_of(pad: PadSettings, rules: RulesSettings) -> float:
 
 
 def first_course(
-    pad: PadSettings, rules: RulesSettings, knots: int, origin: Morphology | None, start: int, rng: np.random.Generator
+    pad: PadSettings,
+    rules: RulesSettings,
+    knots: int,
+    origin: Morphology | None,
+    start: int,
+    rng: np.random.Generator,
+    gentle: bool = True,
 ) -> Array:
-    """Knots (F, N+2, 2) a start of the search begins with.
+    """Draw the knots (F, N+2, 2) that a start of the search begins with.
 
-    Without an origin each start has its own zigzag, but start 3, which has straight fibres. With one, start 0 has its
-    very course, later ones have it with knots moved by a tenth of a grid unit or so. So are those of straight fibres:
-    where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no gradient to follow. Both pass by
-    keep-outs.
+    Without an origin most starts have straight fibres with knots moved by a tenth of a grid unit or so: where slopes
+    are 0 to both sides of a knot, PCHIP keeps them there and has no gradient to follow. Start 3 has a zigzag; where
+    `gentle` does not hold, as under a contact that is felt alike up to its edge, it is the other way round. With an
+    origin, start 0 has its very course, later ones have it with knots moved. All pass by keep-outs.
+
+    Args:
+        pad, rules: to be kept to.
+        knots: N, inside of each fibre.
+        origin: to start from.
+        start: number of the start.
+        rng: of the start.
+        gentle: whether fibres that are hardly curved mostly lead to the better pad.
     """
     layout = pad.layout
-    if origin is None and start != STRAIGHT_START:
+    if origin is None and (start == OTHER_START) == gentle:
         return passing(_zigzag(layout, rules, knots, rng), pad, rules)
     refined = straight_course(pad, rules, knots) if origin is None else refine(origin.knots, knots, layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
         return refined
-    inner = refined[:, 1:-1] + AMPLITUDE * rng.standard_normal(refined[:, 1:-1].shape)
+    inner = refined[:, 1:-1] + MOVED * rng.standard_normal(refined[:, 1:-1].shape)
     return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
 
 
