@@ -88,12 +88,15 @@ def design(
     from design.common.computing import cluster
     from design.common.files import claimed
     from design.optimisers.search import SearchRun
+    from design.pad.twin import Twin
     from design.report.files import run_search, search_lines
 
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with claimed(out), cluster(scheduler) as executor:
         how = SearchRun(resume=resume, time_budget=time_budget, executor=executor)
         document, result = run_search(load_spec(spec), out, overrides, origin, how, twin, force=force)
+    if twin is not None and (left := Twin.load(twin).left_out()):
+        click.echo(f"{twin}: {left}", err=True)
     show_result(document, search_lines(result, out), as_json)
     context.exit(INTERRUPTED if result.stopped == "interrupted" else 1 if result.violations else 0)
 

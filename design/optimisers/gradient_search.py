@@ -36,7 +36,7 @@ from .parametrization import Fibres, border_of, first_course
 from .problem import SearchProblem
 
 LOUDER = 2.0  # scatter of the first step as a multiple of the last one's
-RATE = 0.02
+RATE = 0.04
 PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
 MARGIN = 1.05  # on the limits of the rules
 NOTED_STEPS = 10  # between entries of the history

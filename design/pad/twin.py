@@ -28,6 +28,8 @@ MOST_LOOKS = 1e3
 MOST_CHANNELS = 1024
 LONGEST = 0.02
 """Longest element by which a laid fibre is summed, grid units."""
+EVEN = 0.02
+"""Standard deviation of the logarithm of a fibre's sensitivity that is none."""
 MOST_ELEMENTS = 2**23
 """Of all fibres: 256 + 256 of them, as many as a recording may have, are 6.6 million."""
 
@@ -205,6 +207,14 @@ class Twin:
         """The measured contact."""
         points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
         return Contact(reach=tuple(points), length="euclidean")
+
+    def left_out(self) -> str | None:
+        """Say what of the measured pad no other pad is designed for, or simulated with; None if there is nothing."""
+        parts = ["that the angle between fibre and press counts"] if self.angle_weight is not None else []
+        uneven = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
+        if uneven and max(uneven) > EVEN:
+            parts.append(f"that fibres answer unevenly along themselves (by {np.mean(uneven):.0%})")
+        return f"left out of another pad than the one measured: {' and '.join(parts)}" if parts else None
 
     def laid_stretch(self, places_mm: ArrayLike) -> Array:
         """(Q, F) relative stretch of the fibres as laid by presses at (Q, 2) mm as the arm counts.

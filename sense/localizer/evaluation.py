@@ -75,7 +75,7 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
             "r90_mm": whole.r90_mm.tolist(),
             **_measures_told(whole, measures),
         },
-        "provenance": dict(localizer.provenance),
+        "provenance": {**localizer.provenance, "recording_kind": recording.source.get("kind")},
     }
 
 

@@ -73,8 +73,9 @@ def calibrate_into(
 def calibration_lines(document: Mapping[str, Any]) -> list[str]:
     """The errors of a calibration document as tables for people: of places, and of depth and force if learnt."""
     names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
+    of = " of a simulated pad" if document["provenance"].get("recording_kind") == "simulated" else ""
     return [
-        f"error in mm on {document['test_presses']} presses (split: {document['split']})",
+        f"error in mm on {document['test_presses']} presses{of} (split: {document['split']})",
         "lost  sets   mean    std    max median    p95  in r50  in r90",
         *(
             f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "

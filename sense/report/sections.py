@@ -80,12 +80,14 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     rows = document["errors"]
     first, last = rows[0], rows[-1]
     idle = [f"{share:.0%}" for share in document["idle_share"]]
+    simulated = document["provenance"].get("recording_kind") == "simulated"
+    of = "simulated presses" if simulated else "presses"
     held = {"random": "drawn at random", "chronological": "the last ones"}.get(document["split"], document["split"])
     section = PageSection(
         "Calibration",
         [
             paragraph(
-                f"Errors on {document['test_presses']} presses never trained on ({held})."
+                f"Errors on {document['test_presses']} {of} never trained on ({held})."
                 f"{' One network serves every loss.' if len(rows) > 1 else ''} With every place come two radii that"
                 " ought to hold it in 50 % and in 90 % of cases."
             ),
@@ -112,8 +114,8 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
             table(["fibre", *map(str, range(1, len(idle) + 1))], [["idle", *idle]]),
         ],
         [
-            (f"{first['mean_mm']:.2f} mm", "mean error, " + _lost(first["lost"])),
-            *([(f"{last['mean_mm']:.2f} mm", "mean error, " + _lost(last["lost"]))] if len(rows) > 1 else []),
+            (f"{first['mean_mm']:.2f} mm", f"mean error on {of}, " + _lost(first["lost"])),
+            *([(f"{last['mean_mm']:.2f} mm", f"mean error on {of}, " + _lost(last["lost"]))] if len(rows) > 1 else []),
         ],
     )
     return [section, *([] if (folder / "fibre_loss.json").exists() else fibre_loss_sections(folder, document))]
