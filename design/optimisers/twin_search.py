@@ -99,9 +99,14 @@ def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("usual", "straig
     return min(fair, key=lambda name: float(np.log(ratios[name]).mean()))
 
 
+def state_folders(keep_in: Path) -> dict[str, Path]:
+    """Return where each of the searches keeps its states: beside each other, as none may lie in another's."""
+    return {name: keep_in.with_name(f"{keep_in.name}-{name}".replace(" ", "-")) for name in SHARES}
+
+
 def _part(run: SearchRun, name: str) -> SearchRun:
     """How one of the searches runs."""
-    keep_in: Path | None = run.keep_in and run.keep_in / name.replace(" ", "-")
+    keep_in = None if run.keep_in is None else state_folders(run.keep_in)[name]
     budget = None if run.time_budget is None else SHARES[name] * run.time_budget
     return replace(run, keep_in=keep_in, time_budget=budget, report=_named(run.report, name))
 

@@ -13,7 +13,7 @@ from design.common.files import as_written, check_replaceable, provenance, read_
 from design.common.profiling import stage
 from design.criteria.rules import Violation, check_rules
 from design.optimisers.search import SearchResult, SearchRun, search
-from design.optimisers.twin_search import search_for_twin
+from design.optimisers.twin_search import search_for_twin, state_folders
 from design.pad.morphology import Morphology
 from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -101,7 +101,9 @@ def run_search(
         write_json(together / "design.json", document)
     written(result)
     if not result.stopped:
-        Checkpoints(out / "search", {}).clear()
+        keep_in = out / "search"
+        for folder in (keep_in, *(state_folders(keep_in).values() if twin else ())):
+            Checkpoints(folder, {}).clear()
     return document, result
 
 

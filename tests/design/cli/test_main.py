@@ -12,7 +12,8 @@ from design.cli.main import design
 from design.common.files import sha256
 from design.common.settings import commented_toml
 from design.criteria.score import AMBIGUITY_NOISE, ambiguities
-from design.evaluation.expected_error import error_terms, expected_errors
+from design.evaluation.expected_error import error_terms, expected_errors, straight_full_scale
+from design.optimisers.twin_search import state_folders
 from design.pad.twin import Frame, TwinChannel
 from design.report.files import found_before
 from design.report.twin_settings import settings_for_twin
@@ -28,16 +29,15 @@ def test_straight_fibres_are_told_beside_what_was_found(tmp_path, monkeypatch):
     document = json.loads((tmp_path / "out/pad/design.json").read_text())
     pad, asked = Morphology.straight(2), {"lost": 1, "size": PadSettings(grid=2)}
     straight = [
-        *expected_errors(pad, Contact(), noise=SearchSettings().noise, **asked),
+        *expected_errors(pad, Contact(), SearchSettings(lost=1), asked["size"]),
         *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
     ]
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
     assert set(document["straight"]) == {name for name in document["terms"] if "_lost_" in name}
-    for line, name in ((1, "expected error"), (3, "ambiguity")):
-        found = [value for term, value in document["terms"].items() if term.startswith(name.replace(" ", "_"))]
-        assert told[line].startswith(f"  {name} {found[0]:#.3g} / {found[1]:#.3g} ")
-        plain = straight[line - 1 : line + 1]
-        assert told[line + 1].split() == f"{plain[0]:#.3g} / {plain[1]:#.3g} with straight fibres".split()
+    found = [11.25 * value for term, value in document["terms"].items() if term.startswith("expected_error")]
+    assert told[1].startswith(f"  expected error {found[0]:.2f} / {found[1]:.2f} mm with 0 / 1 fibres failed")
+    assert told[2].split() == f"{11.25 * straight[0]:.2f} / {11.25 * straight[1]:.2f} mm with straight fibres".split()
+    assert any("straight fibres: nothing better" in line or "no better than straight" in line for line in told[3:])
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +69,16 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(tmp_path, monkeypatch, 
     used = document["provenance"]["settings"]
     known = Twin.load(twin)
     assert Contact.model_validate_json(json.dumps(used["contact"])) == known.contact()
-    assert used["search"]["noise"] == 0.03
+    scale = straight_full_scale(Morphology.straight(2, 10.0).layout, known.contact(), "beyond")
+    assert used["search"]["noise"] == pytest.approx(0.02 / (0.1 * scale))
+    assert (used["search"]["scatter"], used["search"]["scatter_common"]) == (0.0, 0.0)
+    assert document["found_by"] in ("twin", "from usual", "usual", "straight fibres")
     assert (used["pad"]["grid"], used["pad"]["pitch_mm"], used["pad"]["sensed_mm"]) == (2, 10, [18, 30])
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
     asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
-    expected = error_terms(expected_errors(pad, known.contact(), noise=0.03, **asked))
+    settings = SearchSettings(lost=1, noise=used["search"]["noise"], scatter=0.0, scatter_common=0.0)
+    expected = error_terms(expected_errors(pad, known.contact(), settings, asked["size"]))
     assert document["terms"] == pytest.approx(score(pad, known.contact(), **asked) | expected, rel=1e-9)
     scored = CliRunner().invoke(design, ["score", "out/pad/morphology.json", "--twin", str(twin)])
     assert json.loads(scored.output)["terms"] == pytest.approx(document["terms"], rel=1e-9)
@@ -97,13 +101,13 @@ def test_a_search_for_a_twin_is_resumed(tmp_path, monkeypatch, twin):
 
     spec = settings_for_twin(Spec.load(Path("pad.toml")), twin)
     pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
-    straight, run = Morphology.straight(pad.layout), SearchRun(killed, Path("out/pad/search"))
+    begun = state_folders(Path("out/pad/search"))["twin"]
     with pytest.raises(KilledError):
-        search(pad, contact, settings, origin=straight, run=run)
-    with pytest.raises(InputError, match="begun with contact reach"):
-        designed("--resume", spec=long + "[pad]\ngrid = 2\npitch_mm = 10.0\nsensed_mm = [18.0, 30.0]\n")
+        search(pad, contact, settings, run=SearchRun(killed, begun))
+    assert list(begun.glob("start_*.npz"))
     _, resumed = designed("--twin", twin, "--resume", spec=long)
     assert resumed["terms"] == whole["terms"]
+    assert not list(Path("out/pad").glob("search*"))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +127,7 @@ def test_settings_that_contradict_a_twin_are_refused(stated, said, tmp_path, mon
 def test_defaults_that_are_written_out_contradict_no_twin(tmp_path, monkeypatch, twin):
     monkeypatch.chdir(tmp_path)
     stated = QUICK_TWIN + commented_toml({"contact": Contact})
-    assert designed("--twin", twin, spec=stated)[1]["provenance"]["settings"]["search"]["noise"] == 0.03
+    assert designed("--twin", twin, spec=stated)[1]["provenance"]["settings"]["search"]["scatter"] == 0.0
 
 
 def test_what_is_no_twin_is_refused(tmp_path, monkeypatch):

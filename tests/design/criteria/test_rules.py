@@ -337,4 +337,5 @@ def test_a_fibre_may_meet_its_lead_at_half_a_radian(rise, breaks, family, end):
     assert [v.fibres for v in found] == ([(family + 1,)] if breaks else [])
     if breaks:
         assert found[0].measured == pytest.approx(0.5 / abs(angle), rel=0.02)
+        assert found[0].place_mm is not None
         assert np.abs(found[0].place_mm).max() == pytest.approx(11.25, abs=0.3)

@@ -3,10 +3,11 @@
 import math
 
 from design import Contact, Morphology
-from design.evaluation.contacts_believed import contacts_in_question, errors_by_contact
-from design.settings import PUBLISHED_CONTACT
+from design.evaluation.contacts_believed import beside_straight, contacts_in_question, errors_by_contact
+from design.settings import PUBLISHED_CONTACT, PadSettings, Scatter
 
 PAD = Morphology.random(2, knots=2, seed=1)
+ASKED = PadSettings(grid=2), Scatter(0.02, 0.05, 0.36)
 
 
 def test_the_contact_believed_comes_first_and_none_twice() -> None:
@@ -24,7 +25,7 @@ def test_the_contact_believed_comes_first_and_none_twice() -> None:
 
 def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press() -> None:
     contacts = {"wide": Contact(), "narrow": Contact(radius=0.2)}
-    found = errors_by_contact(PAD, contacts, seed=4)
+    found = errors_by_contact(beside_straight(PAD), contacts, *ASKED, seed=4)
     assert [(each.contact, each.pad) for each in found] == [
         (contact, pad) for contact in contacts for pad in ("designed", "straight")
     ]
@@ -34,9 +35,11 @@ def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press
         assert each.errors[0].mean < each.errors[3].mean
     wide, narrow = found[1].errors, found[3].errors
     assert wide[0].mean < 0.5 * narrow[0].mean
-    assert errors_by_contact(PAD, {"narrow": contacts["narrow"]}, seed=4) == found[2:]
+    assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
 
 
 def test_a_pad_of_two_fibres_loses_one_at_most() -> None:
-    (designed, _) = errors_by_contact(Morphology.straight(1), {"as believed": Contact()})
+    (designed, _) = errors_by_contact(
+        beside_straight(Morphology.straight(1)), {"as believed": Contact()}, PadSettings(grid=1), ASKED[1]
+    )
     assert [error.lost for error in designed.errors] == [0, 1]

@@ -100,7 +100,7 @@ def test_the_rest_of_a_large_pad_is_looked_at_coarsely_and_of_a_small_one_there_
 
 
 def test_presses_in_a_keep_out_do_not_count():
-    corner = [[-30.0, -30.0], [-30.0, 0.0], [0.0, 0.0], [0.0, -30.0]]
+    corner = ((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0))
     size = PadSettings(grid=4, keep_out_mm=(corner,))
     presses = window_presses(size, size.sensed, SIDE, np.random.default_rng(0))
     assert presses.free.mean() == pytest.approx(0.75, abs=0.05)

@@ -21,7 +21,7 @@ def test_the_search_bench_has_every_way_budget_and_seed(monkeypatch, taken):
 
     def searched(pad, contact, settings, rules, run):
         asked.append((settings.method, settings.generations + settings.steps, settings.seed, rules.enforce))
-        return SearchResult(Pad.straight(pad.grid), {}, [], {})
+        return SearchResult(Pad.straight(pad.grid), {}, [], "start 1", {})
 
     levels = [LossError(k, 1, mean, 0, mean) for k, mean in enumerate([0.1, 0.2, 0.3, 0.8])]
     monkeypatch.setattr(search, "search", searched)

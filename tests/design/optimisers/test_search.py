@@ -208,11 +208,12 @@ def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
         RulesSettings(enforce=False),
         SMALL.model_copy(update={"steps": 1, "starts": 1, "generations": 1, "noise": 0.11}),
     )
-    monkeypatch.setattr(sys.modules["design.optimisers.search"], "_candidates", lambda *_: [worse])
+    monkeypatch.setattr(sys.modules["design.optimisers.search"], "_found", lambda *_: [("start 1", worse)])
     contact = Contact(reach=((0, 1), (5.6, 0.7), (11.2, 0.2), (18, 0)), length="manhattan")
-    plain = expected_errors(straight, contact, quick.lost, quick.noise, PadSettings())
-    assert np.all(np.array(plain) < expected_errors(worse, contact, quick.lost, quick.noise, PadSettings()))
+    plain = expected_errors(straight, contact, quick, PadSettings())
+    assert np.all(np.array(plain) < expected_errors(worse, contact, quick, PadSettings()))
     found = search(contact=contact, settings=quick, rules=free)
+    assert found.found_by == "straight fibres"
     assert found.morphology.knots.shape == worse.knots.shape
     np.testing.assert_array_equal(found.morphology.knots[:4, :, 1], straight.knots[:4, :1, 1] + np.zeros(5))
     confused = ambiguities(straight, contact, quick.lost, AMBIGUITY_NOISE, PadSettings())
@@ -228,7 +229,7 @@ def test_the_terms_of_what_is_found_are_its_scores():
     settings = SearchSettings(knots=3, starts=1, steps=5, lost=1, noise=0.03)
     found = search(pad, contact, settings, QUICK)
     expected, plain = (
-        error_terms(expected_errors(each, contact, 1, 0.03, pad)) for each in (found.morphology, Morphology.straight(2))
+        error_terms(expected_errors(each, contact, settings, pad)) for each in (found.morphology, Morphology.straight(2))
     )
     assert found.terms == score(found.morphology, contact, 1, 0.05, QUICK, pad) | expected
     confused = ambiguity_terms(ambiguities(Morphology.straight(2), contact, 1, 0.05, pad))
@@ -237,9 +238,9 @@ def test_the_terms_of_what_is_found_are_its_scores():
 
 def test_a_search_for_the_least_expected_error_finds_less_than_straight_fibres_have():
     """The wide reach is that of a built pad; what is found is judged by what is searched for."""
-    settings = SearchSettings(knots=5, starts=1, steps=50, lost=(0, 0, 1), noise=0.02)
+    settings = SearchSettings(knots=5, starts=1, steps=50, lost=(0, 0, 1))
     found = search(PadSettings(grid=3), None, settings, RulesSettings(enforce=False))
-    errors = expected_errors(found.morphology, Contact(), (0, 0, 1), 0.02, PadSettings(grid=3))
+    errors = expected_errors(found.morphology, Contact(), settings, PadSettings(grid=3))
     assert [found.terms[f"expected_error_lost_{lost}"] for lost in range(3)] == errors
     assert errors[2] < 0.97 * found.straight["expected_error_lost_2"]
 

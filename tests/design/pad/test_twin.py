@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from design import InputError, Morphology, Twin, signals
+from design import InputError, Morphology, Twin
+from design.pad.contact import relative_stretch
 from design.pad.courses.curves import flatten
 from design.pad.twin import Frame, TwinChannel, TwinReadings
 
@@ -40,19 +41,19 @@ def test_a_file_brings_a_twin_back(twin, tmp_path):
             each.presses,
         )
         assert back.contact() == each.contact()
-        assert back.laid_signals(PLACES) == pytest.approx(each.laid_signals(PLACES), abs=1e-3)
-    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/1"
+        assert back.laid_stretch(PLACES) == pytest.approx(each.laid_stretch(PLACES), abs=1e-3)
+    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/2"
 
 
 def test_fibres_that_lie_as_planned_answer_as_the_contact_model_has_it(twin):
-    exact = signals(PAD, PAD.to_grid(twin.frame.to_plan(PLACES)), twin.contact())
-    assert twin.laid_signals(PLACES)[:, :3] == pytest.approx(exact[:, :3], abs=1e-3)
-    assert not twin.laid_signals(PLACES)[:, 3].any()
+    exact = relative_stretch(PAD, PAD.to_grid(twin.frame.to_plan(PLACES)), twin.contact())
+    assert twin.laid_stretch(PLACES)[:, :3] == pytest.approx(exact[:, :3], abs=1e-3)
+    assert not twin.laid_stretch(PLACES)[:, 3].any()
 
 
 def test_a_piece_that_counts_twice_answers_twice(twin):
     double = replace(twin, sensitivity=tuple(None if x is None else np.full(len(x) - 1, 2.0) for x in twin.laid_mm))
-    assert double.laid_signals(PLACES) == pytest.approx(2 * twin.laid_signals(PLACES))
+    assert double.laid_stretch(PLACES) == pytest.approx(2 * twin.laid_stretch(PLACES))
 
 
 def test_the_angle_adds_under_the_fibre_and_takes_beside_it(twin):
@@ -60,8 +61,8 @@ def test_the_angle_adds_under_the_fibre_and_takes_beside_it(twin):
     plain = replace(twin, laid_mm=(straight, None, None, None), frame=Frame())
     angled = replace(plain, angle_weight=0.5 * WEIGHT)
     over, beside = np.array([[0.0, 0.0], [0.0, 12.0]])
-    assert angled.laid_signals([over])[0, 0] > plain.laid_signals([over])[0, 0]
-    assert angled.laid_signals([beside])[0, 0] < plain.laid_signals([beside])[0, 0]
+    assert angled.laid_stretch([over])[0, 0] > plain.laid_stretch([over])[0, 0]
+    assert angled.laid_stretch([beside])[0, 0] < plain.laid_stretch([beside])[0, 0]
 
 
 def test_a_frame_mirrors_turns_scales_and_shifts():
@@ -97,7 +98,7 @@ def test_what_does_not_fit_together_is_refused(twin, change, said):
     ("damage", "said"),
     [
         (lambda text: text[: len(text) // 2], "not"),
-        (lambda text: text.replace("padforge-twin/1", "padforge-design/1"), "padforge-twin/1"),
+        (lambda text: text.replace("padforge-twin/2", "padforge-design/1"), "padforge-twin/2"),
         (lambda text: text.replace('"gain_v"', '"gain"', 1), "no valid twin"),
         (lambda text: text.replace('"knots"', '"nots"', 1), "no valid morphology"),
         (lambda text: text.replace('"scale": 0.95', '"scale": -1'), "scale"),
@@ -148,4 +149,4 @@ def test_courses_that_are_far_longer_than_a_pad_are_refused(twin, tmp_path):
 @pytest.mark.parametrize("places_mm", [[[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]])
 def test_places_that_are_none_are_refused_in_one_line(twin, places_mm):
     with pytest.raises(InputError, match="places_mm"):
-        twin.laid_signals(places_mm)
+        twin.laid_stretch(places_mm)

@@ -25,7 +25,7 @@ def test_pads_are_searched_for_with_so_many_knots_by_either_method(monkeypatch: 
 
     def remembered(pad: PadSettings, contact: Contact, settings: SearchSettings) -> SearchResult:
         asked.append((pad.grid, settings.method, settings.knots, settings.seed))
-        return SearchResult(Morphology.straight(pad.grid), {}, [], {})
+        return SearchResult(Morphology.straight(pad.grid), {}, [], "start 1", {})
 
     monkeypatch.setattr("design.optimisers.search.search", remembered)
     names = ("optimised", "optimised-5", "genetic-1@2", "optimised-30@3")

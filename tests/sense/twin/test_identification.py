@@ -55,7 +55,7 @@ def test_gains_and_noise_are_those_of_the_pad(printed: Twin, found: Identificati
 
 def test_the_twin_answers_as_was_measured(found: Identification) -> None:
     twin, presses = found.twin(), found.held_out
-    signals = twin.laid_signals(presses.places_mm)
+    signals = twin.laid_stretch(presses.places_mm)
     columns = [(twin.channels[channel].gain_v, twin.channels[channel].fibre) for channel in found.live]
     told = np.column_stack([gain * signals[:, fibre] for gain, fibre in columns])
     fitted = found.fit.pad.predict(presses.places_mm) - found.fit.pad.own[:, 1]

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from design import Contact, InputError, Morphology, Twin, signals
+from design import Contact, InputError, Morphology, Twin
+from design.pad.contact import relative_stretch
 from design.pad.twin import Frame, TwinChannel, TwinReadings
 from sense import Recording, RigSettings, simulate
 from sense.recordings.simulation.simulated_pad import measured
@@ -46,7 +47,7 @@ def test_responses_have_the_sizes_and_signs_of_the_twin_on_the_channels_it_names
     twin = twin_of(Frame(turn_deg=5, shift_mm=(2, -1), scale=0.9))
     recording = simulate(twin, RigSettings(presses=200, hysteresis=0, **STILL))
     expected = np.zeros((200, 4))
-    expected[:, [0, 2, 3]] = GAINS * twin.laid_signals(recording.presses_mm)[:, [3, 0, 1]]
+    expected[:, [0, 2, 3]] = GAINS * twin.laid_stretch(recording.presses_mm)[:, [3, 0, 1]]
     found = responses(recording)
     assert found == pytest.approx(expected, abs=4e-3)  # creep of the press before, and steps of the converter
     assert np.corrcoef(found[:, 0], expected[:, 0])[0, 1] > 0.999
@@ -102,7 +103,7 @@ def test_it_is_pressed_where_the_printed_pad_was() -> None:
 def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin() -> None:
     twin, other = twin_of(Frame(mirrored=True, shift_mm=(3, 3))), Morphology.random(3, knots=2, seed=1, pitch_mm=9)
     recording = simulate(other, RigSettings(presses=100, hysteresis=0, creep=0, **STILL), like=twin)
-    expected = -0.05 * signals(other, other.to_grid(recording.presses_mm), twin.contact())
+    expected = -0.05 * relative_stretch(other, other.to_grid(recording.presses_mm), twin.contact())
     assert responses(recording) == pytest.approx(expected, abs=1e-3)
     assert recording.source["contact"] == twin.contact().model_dump(mode="json")
     assert recording.source["twin"]["presses"] == 900

@@ -1,0 +1,54 @@
+"""Which pad a search for a twin hands back: never one that locates less well than plain pads do."""
+
+import numpy as np
+import pytest
+
+from design.optimisers import twin_search
+from design.optimisers.search import SearchRun
+from design.optimisers.twin_search import choose, search_for_twin
+from design.pad.morphology import Morphology
+from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+
+PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
+
+
+@pytest.mark.parametrize(
+    ("twin", "expected"),
+    [
+        ([0.9, 0.9, 1.0, 1.5], "twin"),  # better everywhere
+        ([0.92, 1.02, 1.0, 1.0], "twin"),  # within what networks tell
+        ([1.2, 0.5, 0.5, 0.5], "usual"),  # far better with fibres failed, but a third worse with all alive
+        ([2.0, 2.0, 2.0, 3.5], "usual"),
+    ],
+)
+def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
+    assert choose(PLAIN | {"twin": np.array(twin)}) == expected
+
+
+def test_choose_takes_the_least_bad_where_each_is_worse_somewhere():
+    errors = {"usual": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
+    assert choose(errors) == "twin"
+
+
+def test_search_for_twin_hands_back_straight_fibres_where_networks_find_by_them_best(monkeypatch):
+    """Networks that are told of one press a place: what a criterion promises does not count."""
+
+    def judged(pads, contacts, size, scatter, seed, subsets):
+        assert set(pads) == {"usual", "straight fibres", "twin", "from usual"}
+        for name in pads:
+            errors = [LossError(k, 1, 1.0 if name == "straight fibres" else 2.0, 0.0, 2.0) for k in range(2)]
+            yield ContactErrors("", name, tuple(errors))
+
+    from design.evaluation.contacts_believed import ContactErrors
+    from design.evaluation.localisation_error import LossError
+
+    monkeypatch.setattr(twin_search, "errors_by_contact", lambda *asked: list(judged(*asked)))
+    quick = SearchSettings(knots=3, starts=1, steps=2, lost=1)
+    pad, contact = PadSettings(grid=2), Contact(reach=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
+    steps = []
+    run = SearchRun(report=lambda name, done, total, objective: steps.append(name))
+    found = search_for_twin(pad, contact, quick, RulesSettings(), quick, run=run)
+    assert found.found_by == "straight fibres"
+    assert found.morphology == Morphology.straight(pad.layout)
+    assert found.terms["expected_error_lost_0"] == found.straight["expected_error_lost_0"]
+    assert {name.split(",")[0] for name in steps} == {"usual", "twin", "from usual"}
