@@ -72,7 +72,7 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
                 paragraph(
                     "What a press does to a fibre is believed, not known, until a printed pad is identified. Here the"
                     " pad, and straight fibres of the same pad, are simulated under other contacts as well: mean error"
-                    " in mm of the published network, a small one, trained afresh under each on one reading of each"
+                    " in mm of a small network, trained afresh under each on one reading of each"
                     f" fibre that scatters by {float(scatter['share']):.0%} of itself and {float(scatter['floor']):.1%}"
                     " of full scale. Where rows differ, simulated errors tell of the contact as much as of the pad;"
                     " where straight fibres are ahead, optimising has not paid there."
