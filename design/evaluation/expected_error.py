@@ -48,8 +48,9 @@ COARSE, BESIDE = 0.7, 1.0
 """Step of the lattice over the rest of the pad, and how far beside the window it begins, grid units."""
 MAX_PARTNERS, ALIKE = 36, 2.0
 """Most presses of it that are learnt from besides, and how near they answer, widths of the kernel."""
-LATTICES, MAX_SETS = 4, 32
-"""Lattices, and sets of failed fibres of a size, by which a finished pad is judged."""
+LATTICES, MAX_SETS, MIN_SETS = 4, 32, 8
+"""Lattices, and sets of failed fibres of a size, by which a finished pad is judged; where it takes more windows, fewer
+sets do for each, down to the last."""
 WIDTH, RIDGE = 0.8, 1e-2
 """Width of the kernel, full scales, and the ridge."""
 BY_NOISE, BY_LEARNING = 0.85, 0.47
@@ -95,10 +96,11 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(loss_shares(search.lost)), fibres))
-    masks = [loss_masks(fibres, k, MAX_SETS) for k in levels]
+    windows = list(judged_windows(size.sensed))
+    masks = [loss_masks(fibres, k, max(MAX_SETS * LATTICES // len(windows), MIN_SETS)) for k in levels]
     scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
     errors = []
-    for window in judged_windows(size.sensed):
+    for window in windows:
         presses = window_presses(size, window, JUDGED, rng)
         if not presses.free.any():
             continue

@@ -68,7 +68,9 @@ class SearchSettings(Settings):
     presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
     levels: int = Field(default=LEVELS, ge=1, le=MOST_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
-    lost: Lost = Field(default=3, description="design for up to this many failed fibres, or weights of 0, 1, ... lost")
+    lost: Lost = Field(
+        default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
+    )
     noise: float = Field(
         default=0.02,
         ge=1e-9,

@@ -229,7 +229,8 @@ def test_the_terms_of_what_is_found_are_its_scores():
     settings = SearchSettings(knots=3, starts=1, steps=5, lost=1, noise=0.03)
     found = search(pad, contact, settings, QUICK)
     expected, plain = (
-        error_terms(expected_errors(each, contact, settings, pad)) for each in (found.morphology, Morphology.straight(2))
+        error_terms(expected_errors(each, contact, settings, pad))
+        for each in (found.morphology, Morphology.straight(2))
     )
     assert found.terms == score(found.morphology, contact, 1, 0.05, QUICK, pad) | expected
     confused = ambiguity_terms(ambiguities(Morphology.straight(2), contact, 1, 0.05, pad))

@@ -29,7 +29,8 @@ def test_share_common_and_floor_of_the_scatter_are_found(printed: Twin, share, c
     noise_v = (volts - exact.volts).std(axis=0)
     found = response_scatter(pad, Responses(exact.places_mm, volts, exact.there), noise_v)
     assert found.share == pytest.approx(share, abs=0.03)
-    assert found.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35)
+    # a floor far below what grows is hidden by it, but never mistaken for much
+    assert found.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35, abs=0.25 * noise_v.mean())
     if share:
         assert found.common == pytest.approx(common, abs=0.15)
 
