@@ -34,6 +34,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from design.common.computing import one_torch_thread
 from design.criteria.fibre_loss import loss_masks, loss_shares
 from design.pad.contact import lattice, relative_stretch
 from design.pad.courses.keep_out import outside
@@ -82,6 +83,7 @@ class Presses(NamedTuple):
         return torch.tensor(np.concatenate([self.positions, self.far[partners.cpu().numpy()]]))
 
 
+@one_torch_thread()
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
     """Return the expected error with 0, 1, ... fibres failed, by this module's formula, always on the same presses.
 

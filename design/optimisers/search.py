@@ -148,7 +148,6 @@ def search(
     return replace(result, history=history, seconds=seconds, stopped=stop.reason)
 
 
-@one_torch_thread()
 def score_result(
     morphology: Morphology,
     found_by: str,
