@@ -28,7 +28,7 @@ from sense.studies.drift.study import (
 from sense.studies.study import Study, run, study_lines
 
 PAD = Morphology.random(2, knots=3, seed=5)
-STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0, scatter=0)
+STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0)
 CYCLES = 5
 BEGUN, LIFTED = 40 * np.arange(CYCLES) + 20, 40 * np.arange(1, CYCLES + 1)
 
@@ -139,11 +139,14 @@ def test_every_filter_goes_with_every_scheme(document: dict[str, Any]) -> None:
 
 
 def test_under_strong_drift_taking_the_rest_off_wins(document: dict[str, Any]) -> None:
+    """In the mean over filters: two networks of 8 neurons on presses that scatter may be off by a fifth with one."""
     for key in ("mean_mm", "mean_last_mm"):
-        bare = errors(document, "winding", "none", key)
-        # long fibres respond less than short ones: with so few presses and neurons no more than a quarter is gained
-        assert max(errors(document, "winding", "rest taken off", key)) < 0.8 * min(bare)
-        assert max(errors(document, "winding", "slow rest taken off", key)) < min(bare)
+        bare, rest, slow = (
+            np.mean(errors(document, "winding", scheme, key))
+            for scheme in ("none", "rest taken off", "slow rest taken off")
+        )
+        assert rest < 0.7 * bare
+        assert slow < bare
 
 
 @pytest.mark.usefixtures("two_filters")
