@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
 import os
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -13,6 +14,10 @@ from tests.helpers.effort import EVERY_DAY
 # a worker a core leaves nothing for the threads that numpy would take besides; to be said before it is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # as padforge has it, also where tests load onnxruntime first
+
+# a shell has what runs behind it ignore Ctrl-C, and programs that tests start would inherit that: they never ended
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.load_profile(EVERY_DAY)
 

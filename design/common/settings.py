@@ -1,5 +1,6 @@
 """`pad.toml`: reading, validating and writing settings. Which sections there are is for those who own them to say."""
 
+import math
 import sys
 import tomllib
 from collections.abc import Collection, Mapping
@@ -18,6 +19,8 @@ MOST_DOTS = 200
 """In a line: keys of very many parts take the reader of TOML time that grows with their square."""
 MAX_DEPTH = 6
 """Of lists and tables in a table; no setting has more, and a list may hold itself."""
+MAX_ITEMS = 2**17
+"""Of an array; one of more is no setting, and a broadcast one may be larger than any memory once it is a list."""
 
 
 class Settings(BaseModel):
@@ -56,10 +59,14 @@ def as_python(value: Any, depth: int = MAX_DEPTH) -> object:
     Args:
         value: that of a key, or a whole table.
         depth: levels of lists and tables within which they are replaced.
+
+    Returns:
+        The value; an array of more than MAX_ITEMS as it is, which no model takes.
     """
     numpy = sys.modules.get("numpy")  # whoever has such values has loaded it, and nobody else waits for it
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
-        return value.tolist()
+        # an axis of length 0 counts as 1: lists would be made for the others all the same
+        return value if math.prod(max(length, 1) for length in value.shape) > MAX_ITEMS else value.tolist()
     if depth and isinstance(value, list | tuple):
         items = [as_python(item, depth - 1) for item in value]
         return items if isinstance(value, list) else tuple(items)

@@ -319,6 +319,18 @@ def test_values_of_numpy_that_are_no_such_number_are_refused_as_pythons_are(grid
         PadSettings(grid=grid)
 
 
+@pytest.mark.parametrize("shape", [(2**9, 2**9), (2**40, 2), (2**18, 0)])
+@pytest.mark.parametrize(
+    ("model", "key"), [(PadSettings, "pitch_mm"), (PadSettings, "keep_out_mm"), (Contact, "reach"), (Contact, "radius")]
+)
+def test_arrays_larger_than_any_setting_are_refused_before_they_are_lists(model, key, shape):
+    """A broadcast array takes no memory; as a list it would take all there is."""
+    array = np.broadcast_to(1.0, shape)
+    with pytest.raises(InputError, match=rf"^\[{model.section()}\] {key}: got array") as told:
+        model(**{key: array})
+    assert len(str(told.value).splitlines()) == 1
+
+
 def test_a_list_that_holds_itself_is_refused():
     endless = []
     endless.append(endless)

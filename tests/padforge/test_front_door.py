@@ -94,8 +94,8 @@ def test_init_writes_the_world_of_the_paper_if_asked(tmp_path):
     spec = Spec.load(tmp_path / "pad.toml")
     assert spec.section(PadSettings) == PadSettings(sensed_mm="fibres")
     assert spec.section(Contact) == Contact(radius=0.6, sides=30, weight="uniform", length="manhattan", reach=())
-    assert spec.section(SearchSettings) == SearchSettings(noise=0.005)
-    assert spec.section(RulesSettings) == RulesSettings()
+    assert spec.section(SearchSettings) == SearchSettings(noise=0.005, scatter=0.0)
+    assert spec.section(RulesSettings) == RulesSettings(max_common_track_mm=None)
     assert called("init", "other.toml", "--preset", "mine", cwd=tmp_path).code == 2
     assert "published" in called("init", "--help", cwd=tmp_path).out
 

@@ -81,7 +81,7 @@ def test_errors_are_told_under_other_contacts_than_the_one_believed(chain):
     assert {row["pad"] for row in document["rows"]} == {"designed", "straight"}
     assert len(document["rows"]) == 8
     assert all(len(row["errors_mm"]) == 4 and 0 < min(row["errors_mm"]) < 20 for row in document["rows"])
-    assert result.out.count("\ncontact: the pad errs by ") == 1
+    assert result.out.count("\ncontact: a small network on one reading of each fibre errs by ") == 1
 
 
 def test_the_report_is_one_page_with_its_pictures(chain):

@@ -40,9 +40,12 @@ def localizer(calibrated: tuple[Localizer, dict]) -> Localizer:
 
 @pytest.fixture(scope="session")
 def deep_recording() -> Recording:
-    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it."""
+    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter.
+
+    How strongly it responds is what tells of the depth.
+    """
     depths = tuple(np.random.default_rng(4).uniform(0.5, 5, 400).tolist())
-    rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths)
+    rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths, scatter=0)
     recording = simulate(Morphology.random(2, knots=3, seed=5), rig)
     return replace(recording, forces_n=3.0 * recording.depths_mm)
 

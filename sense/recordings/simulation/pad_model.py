@@ -168,8 +168,9 @@ def read_pad(
         (Q readings, C) V.
     """
     presses, channels = answers.shape
-    answers = answers * press_gains(presses, channels, rig, rng)
+    # the divider draws first, as in `LivePad`: with the same seed fibres rest where they do there
     model = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
+    answers = answers * press_gains(presses, channels, rig, rng)
     if noise_v is not None:
         own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
         answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)

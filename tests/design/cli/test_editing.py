@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -64,14 +65,21 @@ def pad(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
-    program = Program(tmp_path, "pad.json")
+@contextmanager
+def at_work(folder: Path, *arguments: str) -> Iterator[Program]:
+    """The command, which is gone afterwards whatever fails meanwhile."""
+    program = Program(folder, *arguments)
     try:
         yield program
     finally:
         program.process.kill()
         program.process.communicate()
+
+
+@pytest.fixture
+def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
+    with at_work(tmp_path, "pad.json") as program:
+        yield program
 
 
 def test_what_is_hostile_is_refused_and_the_pad_is_as_it_was(program: Program, tmp_path: Path, pad: Path) -> None:
@@ -115,11 +123,11 @@ def test_it_saves_beside_the_pad_and_tells_what_is_not_kept(program: Program, tm
 
 
 def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None:
-    program = Program(tmp_path, "pad.json", "--out", "pad.json")
-    assert program.said.endswith("saves to pad.json in place of what it has\n")
-    program.ask(do="add", fibre=1)
-    assert program.post("/save", b"{}")[0] == 200
-    code, said = program.end()
+    with at_work(tmp_path, "pad.json", "--out", "pad.json") as program:
+        assert program.said.endswith("saves to pad.json in place of what it has\n")
+        program.ask(do="add", fibre=1)
+        assert program.post("/save", b"{}")[0] == 200
+        code, said = program.end()
     assert (code, "not kept" in said) == (130, False)
     assert Morphology.load(pad).knots.shape == (4, 6, 2)
 

@@ -69,7 +69,8 @@ def contacts_document() -> dict:
     errors = {("as believed", "designed"): [0.5, 0.75], ("as believed", "straight"): [1.0, 1.5]}
     errors |= {("published disc, K = 0.6", "designed"): [4.0, 6.0], ("published disc, K = 0.6", "straight"): [3.0, 5.0]}
     rows = [{"contact": contact, "pad": pad, "errors_mm": each} for (contact, pad), each in errors.items()]
-    return {"format": "padforge-contacts/1", "noise": 0.02, "rows": rows, "provenance": provenance("padforge run")}
+    scatter = {"floor": 0.02, "share": 0.18, "common": 0.36}
+    return {"format": "padforge-contacts/1", "scatter": scatter, "rows": rows, "provenance": provenance("padforge run")}
 
 
 def study_document() -> dict:

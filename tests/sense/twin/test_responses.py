@@ -23,14 +23,17 @@ def known_information(twin: Twin, places_mm: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def noisy(printed: Twin) -> Twin:
-    """As noisy as pads are that were built, which is more than what the response model smooths away."""
-    channels = tuple(replace(channel, noise_v=4 * channel.noise_v) for channel in printed.channels)
+    """As noisy as pads are that were built, which is more than what the response model smooths away.
+
+    Where channels of less noise smooth the slopes, information comes out too low, where they have more too high.
+    """
+    channels = tuple(replace(channel, noise_v=3 * channel.noise_v) for channel in printed.channels)
     return replace(printed, channels=channels, readings=QUIET)
 
 
 @pytest.fixture(scope="module")
 def recording(noisy: Twin) -> Recording:
-    return simulate(noisy, RigSettings(presses=1000, creep=0))
+    return simulate(noisy, RigSettings(presses=1000, creep=0, seed=1))
 
 
 def test_where_all_of_a_press_deviates_alike_it_tells_what_its_answer_tells(noisy: Twin, recording: Recording) -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from design import Morphology
 from design.common.errors import InputError
+from design.settings import Counts
 from sense import Recording, RigSettings, import_mat, simulate
 from sense.recordings.processing.kernels import level_tracking
 from sense.recordings.processing.press_detection import (
@@ -90,10 +91,10 @@ def test_found_presses_stand_for_commanded_ones(published: Path) -> None:
         (4, RigSettings(presses=100, rate_hz=100, readings_per_press=200)),
         (4, RigSettings(presses=50, rate_hz=1000, readings_per_press=2000)),
         (1, RigSettings(presses=200)),
-        (256, RigSettings(presses=40)),
+        ((2, 254), RigSettings(presses=40)),  # of fibres across 256 pitches nothing would show
     ],
 )
-def test_presses_of_simulated_pads_are_found(grid: int, rig: RigSettings) -> None:
+def test_presses_of_simulated_pads_are_found(grid: Counts, rig: RigSettings) -> None:
     recording = simulate(Morphology.straight(grid), rig)
     found, false, touches, releases = score(find_presses(recording.readings, recording.times_s), recording)
     assert found >= 0.985
