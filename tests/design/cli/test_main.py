@@ -1,6 +1,7 @@
 """Commands of design: where their results go."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 from design.evaluation.expected_error import error_terms, expected_errors, straight_full_scale
 from design.optimisers.twin_search import state_folders
 from design.pad.twin import Frame, TwinChannel
-from design.report.files import found_before
+from design.report.files import found_before, search_lines
 from design.report.twin_settings import settings_for_twin
 from design.settings import PadSettings, SearchSettings
 
@@ -38,6 +39,23 @@ def test_straight_fibres_are_told_beside_what_was_found(tmp_path, monkeypatch):
     assert told[1].startswith(f"  expected error {found[0]:.2f} / {found[1]:.2f} mm with 0 / 1 fibres failed")
     assert told[2].split() == f"{11.25 * straight[0]:.2f} / {11.25 * straight[1]:.2f} mm with straight fibres".split()
     assert any("straight fibres: nothing better" in line or "no better than straight" in line for line in told[3:])
+
+
+def test_straight_fibres_that_a_short_search_hands_back_are_called_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pad.toml").write_text(QUICK.replace("steps = 3", "steps = 1"))
+    told = CliRunner().invoke(design, [], catch_exceptions=False).output.splitlines()
+    assert json.loads(Path("out/pad/design.json").read_text())["found_by"] == "straight fibres"
+    result = found_before(Path("out/pad"))
+    assert result is not None
+    assert result.found_by == "straight fibres"
+    assert search_lines(result, Path("out/pad"))[1:] == told[1:]
+    assert told[3:] == [
+        "  these are straight fibres: nothing better was found; more steps or time may find it",
+        "  all rules hold",
+    ]
+    searched = search_lines(replace(result, found_by="start 1"), Path("out/pad"))
+    assert searched[3] == "  no better than straight fibres, as far as such figures tell, with 0, 1 failed"
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +191,7 @@ def test_what_a_search_has_found_is_read_again_or_told_to_be_damaged(tmp_path, m
     found = found_before(tmp_path / "pad")
     assert found is not None
     assert (found.terms, found.straight) == (document["terms"], document["straight"])
+    assert found.found_by == document["found_by"]
     Path("pad/design.json").write_text(json.dumps(document | {key: value}))
     with pytest.raises(InputError, match="not as padforge writes it"):
         found_before(tmp_path / "pad")

@@ -6,10 +6,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design import Morphology, signals
+from design import Morphology
 from design.criteria.ambiguity import ambiguity, full_scale, sharpness
 from design.criteria.fibre_loss import draw_losses, loss_shares, lost_subsets
 from design.criteria.score import ambiguities
+from design.pad.contact import relative_stretch
 from design.settings import PUBLISHED_CONTACT, PadSettings
 
 PAIR = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
@@ -84,8 +85,9 @@ def test_losses_are_all_of_a_size_or_as_many_different_ones_as_wanted():
     assert {a for loss in some for a in loss} == set(range(8))
 
 
-def test_shares_of_losses_are_equal_or_as_weighted():
-    assert loss_shares(3) == (0.25,) * 4
+def test_shares_of_losses_are_half_for_none_and_equal_or_as_weighted():
+    assert loss_shares(3) == (3 / 6, 1 / 6, 1 / 6, 1 / 6)
+    assert loss_shares(1) == (0.5, 0.5)
     assert loss_shares(0) == (1.0,)
     assert loss_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
 
@@ -106,7 +108,7 @@ def test_the_score_holds_the_ambiguity_of_every_number_of_losses():
     size = PadSettings(grid=2)
     line = np.linspace(0.5, 2.5, 20)
     presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    found = torch.tensor(signals(pad, presses, contact).T)
+    found = torch.tensor(relative_stretch(pad, presses, contact).T)
     sigma = noise * found.amax(dim=1).mean().item()
     expected = []
     for masks in (np.ones((1, 4)), 1 - np.eye(4)):

@@ -6,11 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from design import Morphology
+from design import Contact, Morphology
 from design.criteria.rules import check_rules
-from design.optimisers.parametrization import Fibres, border_of, first_course
+from design.optimisers.gradient_search import GradientSearch
+from design.optimisers.parametrization import OTHER_START, Fibres, border_of, first_course
+from design.optimisers.problem import SearchProblem
 from design.pad.courses.curves import refine
-from design.settings import PadSettings, RulesSettings
+from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 
 @given(st.integers(1, 5), st.integers(1, 9), st.integers(0, 99))
@@ -57,13 +59,22 @@ def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 
-def test_one_of_the_random_starts_has_straight_fibres():
+@pytest.mark.parametrize("gentle", [True, False])
+def test_starts_have_nearly_straight_fibres_but_for_a_zigzag_or_the_other_way_round(gentle):
     """Within a tenth of a grid unit or so, and clear of the slopes without a gradient of fibres that are quite so."""
     pad, rules = PadSettings(), RulesSettings()
-    courses = [first_course(pad, rules, 21, None, start, np.random.default_rng(start)) for start in range(5)]
+    courses = [first_course(pad, rules, 21, None, start, np.random.default_rng(start), gentle) for start in range(5)]
     off = [np.abs(course[:4, :, 1] - np.arange(1, 5)[:, None]) for course in courses]
-    assert [each.max() < 0.5 for each in off] == [False, False, False, True, False]
-    assert (off[3][:, 1:-1] > 0).all()
+    straight = [each for each in off if each.max() < 0.5]
+    assert [each.max() < 0.5 for each in off] == [(start == OTHER_START) != gentle for start in range(5)]
+    assert all((each[:, 1:-1] > 0).all() for each in straight)
+
+
+@pytest.mark.parametrize(("contact", "gentle"), [(Contact(), True), (PUBLISHED_CONTACT, False)])
+def test_starts_are_gentle_under_a_measured_contact(contact, gentle):
+    problem = SearchProblem(PadSettings(), (contact,), SearchSettings(), RulesSettings())
+    knots = GradientSearch(problem, 0).fibres.knots()
+    assert (np.abs(knots[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 0.5) == gentle
 
 
 def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
