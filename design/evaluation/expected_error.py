@@ -112,7 +112,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         )
         touched = torch.cat([near, far], dim=1).any(dim=1)  # on a large pad most fibres are far from all the presses
         # and most sets of failed fibres are alike to what is left
-        sets = [np.unique(mask[:, touched], axis=0, return_inverse=True) for mask in masks]
+        sets = [np.unique(mask[:, touched.numpy()], axis=0, return_inverse=True) for mask in masks]
         alive = [torch.tensor(few) for few, _ in sets]
         partners = confusable(near[touched], far[touched], torch.cat(alive))
         responses = torch.cat([near, far[:, partners]], dim=1)[touched]

@@ -126,7 +126,8 @@ def test_a_remade_pad_is_followed_with_any_fibre_lost(
 def test_an_unchanged_pad_is_not_spoilt(localizer: Localizer, recording: Recording) -> None:
     now, document = recalibrate(localizer, known_only(recording, NEW))
     assert "corrected" not in document["changes"]
-    assert document["gain_mm"] >= 0
+    # adapting is kept unless new presses speak against it by a standard error
+    assert document["gain_mm"] >= -document["standard_error_mm"]
     assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
     if not document["changes"]:
         assert document["before"] == document["after"]
