@@ -18,6 +18,8 @@ MOST_DOTS = 200
 """In a line: keys of very many parts take the reader of TOML time that grows with their square."""
 MAX_DEPTH = 6
 """Of lists and tables in a table; no setting has more, and a list may hold itself."""
+MAX_ARRAY = 2**18
+"""Numbers of an array that becomes a list; no setting has more, and a list takes many times the memory."""
 
 
 class Settings(BaseModel):
@@ -54,12 +56,12 @@ def as_python(value: Any, depth: int = MAX_DEPTH) -> object:
     """Return a value with Python's numbers and lists in place of NumPy's scalars and arrays.
 
     Args:
-        value: that of a key, or a whole table.
+        value: that of a key, or a whole table; an array of more than MAX_ARRAY numbers is left as it is.
         depth: levels of lists and tables within which they are replaced.
     """
     numpy = sys.modules.get("numpy")  # whoever has such values has loaded it, and nobody else waits for it
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
-        return value.tolist()
+        return value.tolist() if value.size <= MAX_ARRAY else value
     if depth and isinstance(value, list | tuple):
         items = [as_python(item, depth - 1) for item in value]
         return items if isinstance(value, list) else tuple(items)

@@ -72,7 +72,8 @@ class Contact(Settings):
         if not isinstance(given, Mapping):
             return given
         reach = given.get("reach", () if _SHAPE & given.keys() else MEASURED_REACH)
-        return {"reach": reach, "length": "euclidean" if reach else "manhattan", **given}
+        shape = isinstance(reach, list | tuple) and not reach
+        return {"reach": reach, "length": "manhattan" if shape else "euclidean", **given}
 
     @field_validator("reach")
     @classmethod

@@ -319,6 +319,13 @@ def test_values_of_numpy_that_are_no_such_number_are_refused_as_pythons_are(grid
         PadSettings(grid=grid)
 
 
+@pytest.mark.parametrize(("model", "key"), [(Contact, "length"), (Contact, "reach"), (SearchSettings, "lost")])
+def test_an_array_that_no_memory_holds_as_a_list_is_refused(model, key):
+    with pytest.raises(InputError, match=rf"^\[{model.section()}\] {key}.*: got array") as raised:
+        model(**{key: np.broadcast_to(1.0, (2**40, 2))})
+    assert len(str(raised.value).splitlines()) == 1
+
+
 def test_a_list_that_holds_itself_is_refused():
     endless = []
     endless.append(endless)
