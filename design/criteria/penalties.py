@@ -95,7 +95,8 @@ def penalties(
         limit = math.radians(margin * rules.min_crossing_angle_deg)
         count, flat = _crossings(fibres, limit, layout)
         if rules.max_crossings is not None:
-            found["max_crossings"] = _too_many(count, rules.max_crossings / margin)
+            # every horizontal crosses every vertical: no margin may ask for fewer than that
+            found["max_crossings"] = _too_many(count, max(rules.max_crossings / margin, math.prod(layout.counts)))
         if limit > 0:
             found["min_crossing_angle_deg"] = flat / (layout.fibres / 2)
     if min(layout.counts) and rules.max_common_track_mm is not None:
