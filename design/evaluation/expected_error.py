@@ -47,8 +47,9 @@ SEARCHED, JUDGED, WINDOW = 12, 14, 5.0
 With 10 in place of 12 a search errs more under a small contact; 14 take a seventh to a third more time for 1 to 2 %."""
 COARSE, BESIDE = 0.7, 1.0
 """Step of the lattice over the rest of the pad, and how far beside the window it begins, grid units."""
-MAX_PARTNERS, ALIKE = 36, 2.0
-"""Most presses of it that are learnt from besides, and how near they answer, widths of the kernel."""
+MAX_PARTNERS, ALIKE = 36, 1.0
+"""Most presses of it that are learnt from besides, and how near they answer, widths of the kernel: along a strip, where
+some fibres answer all presses of a row alike, a network tells them apart by the others."""
 LATTICES, MAX_SETS, MIN_SETS = 4, 32, 8
 """Lattices, and sets of failed fibres of a size, by which a finished pad is judged; where it takes more windows, fewer
 sets do for each, down to the last."""
@@ -100,8 +101,8 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     levels = range(min(len(loss_shares(search.lost)), fibres))
     windows = list(judged_windows(size.sensed))
     masks = [loss_masks(fibres, k, max(MAX_SETS * LATTICES // len(windows), MIN_SETS)) for k in levels]
-    scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
-    errors = []
+    scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
+    errors: list[list[float]] = []
     for window in windows:
         presses = window_presses(size, window, JUDGED, rng)
         if not presses.free.any():
@@ -113,12 +114,16 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         touched = torch.cat([near, far], dim=1).any(dim=1)  # on a large pad most fibres are far from all the presses
         # and most sets of failed fibres are alike to what is left
         sets = [np.unique(mask[:, touched.numpy()], axis=0, return_inverse=True) for mask in masks]
-        alive = [torch.tensor(few) for few, _ in sets]
-        partners = confusable(near[touched], far[touched], torch.cat(alive))
-        responses = torch.cat([near, far[:, partners]], dim=1)[touched]
-        given = responses, presses.joined(partners), torch.tensor(presses.step), torch.tensor(presses.free)
-        found = [expected_error(*given, few, search.response_scatter).numpy() for few in alive]
-        errors.append([float(level[rows].mean()) for level, (_, rows) in zip(found, sets, strict=True)])
+        weighed = [weights[touched, None] * responses[touched] for responses in (near, far)]
+        step, free = torch.tensor(presses.step), torch.tensor(presses.free)
+        errors.append([])
+        for few, rows in sets:
+            alive = torch.tensor(few)
+            partners = confusable(weighed[0], weighed[1], alive)
+            responses, positions = torch.cat([near, far[:, partners]], dim=1)[touched], presses.joined(partners)
+            given = responses, positions, step, free, alive, search.response_scatter
+            found = expected_error(*given, weights[touched])
+            errors[-1].append(float(found.numpy()[rows].mean()))
     return np.mean(errors, axis=0).tolist()
 
 
@@ -132,6 +137,15 @@ def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> 
     presses = lattice(sensed_rectangle(layout, sensed_mm), FULL_SCALE_SIDE)
     largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
     return float(largest[largest > 0].mean()) if largest.any() else 1.0
+
+
+def kernel_weights(layout: Layout) -> Tensor:
+    """Return by what the responses (F,) of fibres are weighed where they are compared: each by its own full scale.
+
+    The fibres of a strip's long family show little beside those across it, and a network scales its inputs.
+    """
+    along = torch.tensor(np.repeat(layout.extent, layout.counts), dtype=torch.float64)
+    return along * (1 / along).mean()
 
 
 def judged_windows(rectangle: Rectangle) -> Iterator[Rectangle]:
@@ -172,8 +186,8 @@ def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
     """Return which presses (P,) of `far` answer most like some press of a window, under any of some losses.
 
     Args:
-        near: (F, Q) responses of the window.
-        far: (F, N) responses over the rest of the pad.
+        near: (F, Q) responses of the window, weighed as they are compared.
+        far: (F, N) those over the rest of the pad.
         masks: (L, F), 1 for a fibre that works.
 
     Returns:
@@ -190,7 +204,13 @@ def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
 
 
 def expected_error(
-    responses: Tensor, positions: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter
+    responses: Tensor,
+    positions: Tensor,
+    step: Tensor,
+    free: Tensor,
+    masks: Tensor,
+    scatter: Scatter,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Return the expected error of the module's formula for each of some losses, with gradient by the responses.
 
@@ -202,6 +222,7 @@ def expected_error(
         free: (Q,) which presses of the lattice count; others lie in a keep-out.
         masks: (L, F), 1 for a fibre that works, 0 for a failed one.
         scatter: of responses; its floor is above 0.
+        weights: (F,) of responses in the kernel; all 1 if None.
 
     Returns:
         (L,) grid units.
@@ -211,7 +232,8 @@ def expected_error(
     bound = _bound(responses[:, :count], apart, free, masks, scatter)
     learnt = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(where))])
     middle = where[:count].mean(dim=0)
-    left_out = _LeaveOneOut.apply(responses[:, learnt] / WIDTH, where[learnt] - middle, masks, int(free.sum()))
+    compared = responses if weights is None else responses * weights[:, None].to(responses)
+    left_out = _LeaveOneOut.apply(compared[:, learnt] / WIDTH, where[learnt] - middle, masks, int(free.sum()))
     return BY_NOISE * bound + BY_LEARNING * left_out
 
 

@@ -24,6 +24,7 @@ from design.evaluation.expected_error import (
     confusable,
     drawn_window,
     expected_error,
+    kernel_weights,
     over_losses,
     straight_full_scale,
     window_presses,
@@ -186,6 +187,7 @@ class GradientSearch:
         masks, _ = draw_losses(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
         masks, scatter = masks.float(), search.response_scatter.scaled(louder)
+        weights = kernel_weights(pad.layout).float().to(search.device)
         total = torch.zeros((), device=search.device)
         for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
             signals_at = partial(
@@ -202,10 +204,11 @@ class GradientSearch:
                 return (signals_at(positions) / (scale * length)).float().to(search.device)
 
             with torch.no_grad():
-                partners = confusable(responses(presses.positions), responses(presses.far), masks)
+                near, far = (weights[:, None] * responses(each) for each in (presses.positions, presses.far))
+                partners = confusable(near, far, masks)
             positions = presses.joined(partners)
             given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
-            total = total + over_losses(expected_error(*given), masks, shares)
+            total = total + over_losses(expected_error(*given, weights), masks, shares)
             if search.sharpness > 0:
                 in_order = signals_at(boustrophedon(pad.sensed, SEARCHED))
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))

@@ -15,6 +15,7 @@ from design.evaluation.expected_error import (
     expected_error,
     expected_errors,
     judged_windows,
+    kernel_weights,
     over_losses,
     straight_full_scale,
     window_presses,
@@ -248,6 +249,22 @@ def test_straight_fibres_err_no_less_with_fibres_failed(counts):
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
     found = expected_errors(Morphology.straight(size.layout), Contact(), SearchSettings(), size)
     assert found == sorted(found)
+
+
+def test_fibres_of_a_strip_are_compared_each_by_its_own_full_scale():
+    """Those along a strip show a third of those across it; a localizer scales its inputs, and is no worse for it."""
+    size = PadSettings(horizontals=3, verticals=12)
+    weights = kernel_weights(size.layout)
+    stretch = relative_stretch(Morphology.straight(size.layout), lattice(size.sensed, 40), Contact())
+    full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, Contact(), "beyond")
+    assert (weights.numpy() * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
+    assert kernel_weights(PadSettings(grid=4).layout).numpy() == pytest.approx(np.ones(8))
+    search = SearchSettings(lost=0)
+    strip, square = (
+        expected_errors(Morphology.straight(each.layout), Contact(), search, each)[0]
+        for each in (size, PadSettings(grid=4))
+    )
+    assert strip < 1.3 * square
 
 
 def test_responses_are_shares_of_the_length_in_full_scales_of_straight_fibres():
