@@ -8,6 +8,7 @@ from pydantic_core import PydanticCustomError
 
 from design.common.errors import InputError
 from design.common.settings import Settings, as_tuple, none_as
+from design.settings import Scatter
 
 Features = Literal["full", "causal", "early", "published"]
 Method = Literal["masked", "published"]
@@ -125,6 +126,11 @@ class RigSettings(Settings):
     def plan_file(self) -> Path | None:
         """The file of places that `plan` names, None where it is a kind of plan."""
         return None if self.plan in PLANS else Path(self.plan)
+
+    @property
+    def response_scatter(self) -> Scatter:
+        """How answers of the simulated pad scatter beside the noise of readings."""
+        return Scatter(0.0, self.scatter, self.scatter_common)
 
     def inputs(self, fibres: int) -> tuple[int, ...]:
         """(fibres,) input of the board that each fibre of a pad is on.

@@ -13,10 +13,12 @@ from design.pad.contact import note_reach, press_shape
 from design.pad.kernels.exact_gradient import signals_gradient
 from design.pad.kernels.exact_signals import exact_signals
 from design.pad.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
-from design.pad.kernels.press import Ends, family_strays
+from design.pad.kernels.press import Ends, Law, family_strays
 from design.settings import Contact
 
 Array = NDArray[np.float64]
+PressShape = tuple[tuple[Array, Array], Array, Law]
+"""Chains, extents and law of a press, as `press_shape` gives them."""
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
@@ -103,8 +105,11 @@ def press_signals(
     Returns:
         (F, Q), with the default weight and length in grid units.
     """
-    kind = MeasuredSignals if contact.reach else ExactSignals
-    return kind.apply(travel, cross, slope, presses, contact, ends, unit_mm)  # pyright: ignore[reportReturnType]
+    given, shape = (travel, cross, slope, presses, ends), press_shape(contact, unit_mm)
+    if contact.reach:
+        spaced = shape, spacing_of(contact.profile_points(unit_mm))
+        return MeasuredSignals.apply(*given, spaced)  # pyright: ignore[reportReturnType]
+    return ExactSignals.apply(*given, shape)  # pyright: ignore[reportReturnType]
 
 
 class ExactSignals(torch.autograd.Function):
@@ -112,18 +117,10 @@ class ExactSignals(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        travel: Tensor,
-        cross: Tensor,
-        slope: Tensor,
-        presses: Array,
-        contact: Contact,
-        ends: Ends,
-        unit_mm: float,
+        ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, ends: Ends, shape: PressShape
     ) -> Tensor:
         """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        shape = press_shape(contact, unit_mm)
         strays, none = family_strays(v[None], ends), np.empty(0, np.int64)
         ctx.inputs = (t, v, d, strays[0], ends, presses, shape)
         out = np.zeros(len(presses) * len(t))
@@ -138,7 +135,7 @@ class ExactSignals(torch.autograd.Function):
         """Gradient by travel, cross and slope."""
         t, v, d, strays, ends, presses, shape = ctx.inputs
         found = signals_gradient(t, v, d, strays, ends, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
-        return (*torch.from_numpy(found), None, None, None, None)
+        return (*torch.from_numpy(found), None, None, None)
 
 
 class MeasuredSignals(torch.autograd.Function):
@@ -151,14 +148,12 @@ class MeasuredSignals(torch.autograd.Function):
         cross: Tensor,
         slope: Tensor,
         presses: Array,
-        contact: Contact,
         ends: Ends,
-        unit_mm: float,
+        spaced: Any,
     ) -> Tensor:
         """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        _, extents, law = press_shape(contact, unit_mm)
-        spacing = spacing_of(contact.profile_points(unit_mm))
+        (_, extents, law), spacing = spaced
         elements = fibre_elements(t, v, d, ends.horizontals, presses, law.radius, spacing, law.length)
         ctx.inputs = (t, v, d, elements, presses, law)
         out = np.empty((len(presses), len(t)))
@@ -173,4 +168,4 @@ class MeasuredSignals(torch.autograd.Function):
         t, v, d, elements, presses, law = ctx.inputs
         up = np.ascontiguousarray(upstream[0].numpy().T)
         found = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
-        return (*torch.from_numpy(found), None, None, None, None)
+        return (*torch.from_numpy(found), None, None, None)

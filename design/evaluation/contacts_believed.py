@@ -84,9 +84,7 @@ def _sets(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter
 
     def responses(positions: Array) -> Array:
         found = relative_stretch(pad, positions, contact) / scale
-        own, common = rng.standard_normal(found.shape), rng.standard_normal((len(found), 1))
-        gain = 1 + scatter.share * (np.sqrt(1 - scatter.common) * own + np.sqrt(scatter.common) * common)
-        return found * gain + scatter.floor * rng.standard_normal(found.shape)
+        return found * scatter.gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
 
     learned, fresh = (
         positions[outside(positions, size)]

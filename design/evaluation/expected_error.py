@@ -22,11 +22,11 @@ of one vector. That it depends on the position, which tells a few per cent more,
 
 Presses are compared on a fine lattice over a window of the pad; where the pad is larger, presses of a coarse lattice
 over the rest of it that answer like some press of the window are learnt from as well, so that places far apart may not
-look alike. The cost of a window grows with the pad's area, by which there are more presses to look at.
+look alike. The cost of a window grows with the pad's area, by which there are more presses to look at, up to MAX_FAR.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +47,8 @@ SEARCHED, JUDGED, WINDOW = 12, 14, 5.0
 With 10 in place of 12 a search errs more under a small contact; 14 take a seventh to a third more time for 1 to 2 %."""
 COARSE, BESIDE = 0.7, 1.0
 """Step of the lattice over the rest of the pad, and how far beside the window it begins, grid units."""
+MAX_FAR, MAX_WINDOWS = 2048, 16
+"""Most presses of it that are looked at, and most windows by which a pad is judged; a larger pad has a draw of them."""
 MAX_PARTNERS, ALIKE = 36, 1.0
 """Most presses of it that are learnt from besides, and how near they answer, widths of the kernel: along a strip, where
 some fibres answer all presses of a row alike, a network tells them apart by the others."""
@@ -99,7 +101,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(loss_shares(search.lost)), fibres))
-    windows = list(judged_windows(size.sensed))
+    windows = judged_windows(size.sensed)
     masks = [loss_masks(fibres, k, max(MAX_SETS * LATTICES // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
     errors: list[list[float]] = []
@@ -134,8 +136,14 @@ def error_terms(errors: Sequence[float]) -> dict[str, float]:
 
 def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> float:
     """Return the mean over straight fibres of their largest relative stretch, to which responses are scaled."""
-    presses = lattice(sensed_rectangle(layout, sensed_mm), FULL_SCALE_SIDE)
+    low, high = np.array(sensed_rectangle(layout, sensed_mm))
+    size = np.minimum(high - low, WINDOW)
+    corner = low + (high - low - size) / 2
+    presses = lattice((tuple(corner.tolist()), tuple((corner + size).tolist())), FULL_SCALE_SIDE)
     largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
+    if (size < high - low).any():  # fibres beside the presses are as those of their family among them
+        for rows in layout.families:
+            largest[rows] = largest[rows].max(initial=0.0)
     return float(largest[largest > 0].mean()) if largest.any() else 1.0
 
 
@@ -148,15 +156,16 @@ def kernel_weights(layout: Layout) -> Tensor:
     return along * (1 / along).mean()
 
 
-def judged_windows(rectangle: Rectangle) -> Iterator[Rectangle]:
-    """Yield the windows by which a pad is judged: they tile what is pressed, and LATTICES at least are taken in all."""
+def judged_windows(rectangle: Rectangle) -> list[Rectangle]:
+    """Return the windows that judge a pad, LATTICES or more: they tile what is pressed; of a huge pad a draw."""
     low, high = np.array(rectangle)
     counts = np.ceil((high - low) / WINDOW - 1e-9).astype(int).clip(1)
     size = (high - low) / counts
-    for _ in range(math.ceil(LATTICES / counts.prod())):
-        for tile in np.ndindex(*counts.tolist()):
-            corner = low + size * tile
-            yield tuple(corner.tolist()), tuple((corner + size).tolist())
+    tiles = np.stack(np.unravel_index(np.arange(counts.prod()), counts), axis=1)
+    if len(tiles) > MAX_WINDOWS:
+        tiles = np.random.default_rng(0).permutation(tiles)[:MAX_WINDOWS]
+    corners = low + size * np.tile(tiles, (math.ceil(LATTICES / len(tiles)), 1))
+    return [(tuple(corner.tolist()), tuple((corner + size).tolist())) for corner in corners]
 
 
 def drawn_window(rectangle: Rectangle, rng: np.random.Generator) -> Rectangle:
@@ -178,6 +187,8 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
     if ((high - low) < (most - least) - 2 * BESIDE).any():
         grid = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
         far = least + (most - least) * (grid + rng.random(2)) / counts
+        if len(far) > MAX_FAR:
+            far = far[rng.choice(len(far), MAX_FAR, replace=False)]
         far = far[((far < low - BESIDE) | (far > high + BESIDE)).any(axis=1) & outside(far, size)]
     return Presses(positions, (high - low) / side, outside(positions, size), far)
 
@@ -195,10 +206,13 @@ def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
     """
     if not far.shape[1]:
         return torch.empty(0, dtype=torch.int64)
-    window, beyond = (x.detach().float().T / WIDTH for x in (near, far))
+    # where no press of the window is felt, the far one's responses alone are apart: on a large pad by most fibres
+    felt = near.any(dim=1)
+    window, beyond, elsewhere = (x.detach().float().T / WIDTH for x in (near[felt], far[felt], far[~felt]))
     least = torch.full((far.shape[1],), torch.inf, device=far.device)
     for mask in masks.float().unique(dim=0):
-        least = torch.minimum(least, torch.cdist(beyond * mask, window * mask).amin(dim=1))
+        within = torch.cdist(beyond * mask[felt], window * mask[felt]).amin(dim=1)
+        least = torch.minimum(least, torch.hypot(within, (elsewhere.square() @ mask[~felt]).sqrt()))
     best = least.topk(min(MAX_PARTNERS, len(least)), largest=False)
     return best.indices[best.values < ALIKE].sort().values
 

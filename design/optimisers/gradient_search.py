@@ -63,8 +63,8 @@ class GradientSearch:
         self.step, self.objective, self.done = 0, math.inf, False
         self._history: list[tuple[int, float]] = []
         pad, search, rules = problem.pad, problem.search, problem.rules
-        self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
         if state is None:
+            self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
             gentle = bool(problem.contacts[0].reach)
             course = first_course(pad, rules, search.knots, problem.origin, start, self.rng, gentle)
             self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
@@ -99,6 +99,7 @@ class GradientSearch:
             "spans": self.fibres.spans.detach().numpy().copy(),
             "cross": self.fibres.cross.detach().numpy().copy(),
             "fixed": np.array([self.fibres.floor, self.fibres.border]),
+            "scales": np.array(self.scales),
             "progress": np.array([self.step, self.objective]),
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
@@ -110,6 +111,7 @@ class GradientSearch:
 
     def _restore(self, state: State) -> None:
         floor, border = state["fixed"].tolist()
+        self.scales = state["scales"].tolist()
         self.fibres = Fibres(
             self.problem.pad.layout, torch.tensor(state["spans"]), torch.tensor(state["cross"]), floor, border
         )
@@ -203,10 +205,11 @@ class GradientSearch:
             ) -> Tensor:
                 return (signals_at(positions) / (scale * length)).float().to(search.device)
 
-            with torch.no_grad():
-                near, far = (weights[:, None] * responses(each) for each in (presses.positions, presses.far))
-                partners = confusable(near, far, masks)
-            positions = presses.joined(partners)
+            positions = torch.from_numpy(presses.positions)
+            if len(presses.far):
+                with torch.no_grad():
+                    near, far = (weights[:, None] * responses(each) for each in (presses.positions, presses.far))
+                    positions = presses.joined(confusable(near, far, masks))
             given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
             total = total + over_losses(expected_error(*given, weights), masks, shares)
             if search.sharpness > 0:

@@ -106,7 +106,7 @@ def _changes(text: str) -> list[tuple[str, str, Any]]:
 def compare(pads: Sequence[Variant], out: Path, run: SearchRun, seed: int | None, making: Making) -> dict[str, Any]:
     """Design every variant in a folder of its own in `out`, judge all alike, and write comparison.json and .png.
 
-    A pad is judged by the published network on signals under noise, by its own contact and sensed area, beside straight
+    A pad is judged by a small network on responses that scatter, by its own contact and sensed area, beside straight
     fibres of the same layout (`errors_by_contact`).
 
     Args:

@@ -1,12 +1,17 @@
 """`[search]`: how the fibres are found."""
 
-from typing import Annotated, Literal, NamedTuple
+import math
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, field_validator
 
 from design.common.settings import Settings, as_tuple
 
 from .contact import PUBLISHED_CONTACT, Contact
+
+if TYPE_CHECKING:  # settings alone take no NumPy
+    import numpy as np
+    from numpy.typing import NDArray
 
 Share = Annotated[float, Field(ge=0, le=1e6)]
 
@@ -37,6 +42,11 @@ class Scatter(NamedTuple):
     floor: float
     share: float = 0.0
     common: float = 0.0
+
+    def gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
+        """Draw by what each response (presses, fibres) is more or less than usual, about 1."""
+        own, common = rng.standard_normal(shape), rng.standard_normal((shape[0], 1))
+        return 1 + self.share * (math.sqrt(1 - self.common) * own + math.sqrt(self.common) * common)
 
     def scaled(self, factor: float) -> "Scatter":
         """Return the same scatter, louder by a factor."""

@@ -113,15 +113,7 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
     return [
         f"twin of {document['presses']} presses -> {out / 'twin.json'}",
         "channel fibre gain (mV/%)  noise (mV)  explained  beside its plan (mm)",
-        *(
-            f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 10:10.1f} {row['noise_v'] * 1e3:11.2f} "
-            + (
-                f"{row['explained']:10.2f} {row['aside_mm']:10.2f} +- {row['unsure_mm']:.2f}"
-                if "aside_mm" in row
-                else ""
-            )
-            for row in document["channels"]
-        ),
+        *map(_line, document["channels"]),
         f"explained {document['explained']:.3f} of what presses held out show; on the plan as it is"
         f" {document['explained_on_plan']:.3f}; noise {document['noise']:.1%} of full scale",
         f"laid {_side(document)}, turned {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm,"

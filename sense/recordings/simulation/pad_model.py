@@ -170,18 +170,12 @@ def read_pad(
     presses, channels = answers.shape
     # the divider draws first, as in `LivePad`: with the same seed fibres rest where they do there
     model = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
-    answers = answers * press_gains(presses, channels, rig, rng)
+    answers = answers * rig.response_scatter.gains((presses, channels), rng)
     if noise_v is not None:
         own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
         answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)
     indented = indentation(cycle, rng.uniform(*DELAY_S, (presses, 2)))
     return model(strain(depths_mm[:, None] / FULL_DEPTH_MM * answers, indented))
-
-
-def press_gains(presses: int, fibres: int, rig: RigSettings, rng: np.random.Generator) -> Array:
-    """Draw by what each fibre answers each press more or less than usual, (Q, C) about 1, partly alike for all."""
-    own, common = rng.standard_normal((presses, fibres)), rng.standard_normal((presses, 1))
-    return 1 + rig.scatter * (np.sqrt(1 - rig.scatter_common) * own + np.sqrt(rig.scatter_common) * common)
 
 
 def held_share(cycle: Cycle, rig: RigSettings) -> float:
@@ -254,7 +248,7 @@ class LivePad:
         strained = np.zeros((len(places_mm), len(self._pad.knots)))
         for row, touched in enumerate(depths_mm > 0):
             if touched and not self._touched:
-                self._gains = press_gains(1, len(self._gains), self._rig, self._rng)[0]
+                self._gains = self._rig.response_scatter.gains((1, len(self._gains)), self._rng)[0]
             self._touched = bool(touched)
             if touched:
                 strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(places_mm[row])

@@ -222,6 +222,34 @@ def test_a_press_far_off_that_answers_alike_makes_an_error_and_others_do_not():
     assert confused > 5 * apart
 
 
+def test_partners_are_those_that_all_differences_of_responses_tell():
+    """An oracle that forms every difference, of fibres that no press of the window touches too."""
+    rng = np.random.default_rng(3)
+    near, far = rng.uniform(0, 1, (6, 20)), 0.4 * rng.uniform(0, 1, (6, 200))
+    near[4:] = 0.0
+    masks = np.array([[1.0, 1, 1, 1, 1, 1], [1, 0, 1, 1, 0, 1]])
+    distances = [
+        np.sqrt((m[:, None, None] * (far[:, :, None] - near[:, None]) ** 2).sum(axis=0)).min(axis=1) for m in masks
+    ]
+    least = np.min(distances, axis=0) / WIDTH
+    expected = np.sort(np.argsort(least)[: module.MAX_PARTNERS])
+    found = confusable(*(torch.tensor(each) for each in (near, far, masks))).tolist()
+    assert found == [index for index in expected.tolist() if least[index] < module.ALIKE]
+    assert 0 < len(found) <= module.MAX_PARTNERS
+
+
+def test_judging_a_huge_pad_looks_at_a_draw_of_windows_and_of_presses():
+    size = PadSettings(grid=96)
+    windows = judged_windows(size.sensed)
+    assert len(windows) == len(set(windows)) == module.MAX_WINDOWS
+    presses = window_presses(size, windows[0], SIDE, np.random.default_rng(0))
+    assert 0.9 * module.MAX_FAR < len(presses.far) <= module.MAX_FAR
+    assert np.ptp(presses.far, axis=0).min() > 90
+    # a straight fibre's largest response does not depend on how many others there are, but for its length
+    small, large = (straight_full_scale(PadSettings(grid=grid).layout, Contact(), "beyond") for grid in (4, 96))
+    assert large * 97 == pytest.approx(small * 5, rel=0.02)
+
+
 def test_a_press_counts_as_alike_where_it_is_so_without_a_failed_fibre():
     near, far = torch.tensor([[0.1], [0.9]]), torch.tensor([[0.1], [9.0]])
     assert confusable(near, far, torch.tensor([[1.0, 1.0]])).tolist() == []

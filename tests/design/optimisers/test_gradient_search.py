@@ -83,10 +83,10 @@ def as_usual():
 
 @one_torch_thread()
 def found_within(rules):
-    """By steps alone, the best of three starts: with so few steps straight fibres are as good, and break no rule."""
-    settings = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 90, "lost": 1, "knots": 6})
+    """By steps alone, the better of two starts: with so few steps straight fibres are as good, and break no rule."""
+    settings = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 60, "lost": 1, "knots": 6})
     problem = SearchProblem(PadSettings(grid=2, sensed_mm="fibres"), (PUBLISHED_CONTACT,), settings, rules)
-    starts = [gradient_search.GradientSearch(problem, number) for number in range(3)]
+    starts = [gradient_search.GradientSearch(problem, number) for number in (0, 1)]
     for start in starts:
         start.advance(1000)
         assert start.done
