@@ -1,4 +1,7 @@
-"""Fixtures shared by all tests."""
+"""The two tiers, how tests are shared out among workers, and fixtures for all.
+
+`pytest -n auto` runs what answers at once; tests marked `slow` wait for `pytest -n auto -m slow`.
+"""
 
 import os
 import signal
@@ -6,10 +9,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+import hypothesis
 import pytest
-from hypothesis import settings
-
-from tests.helpers.effort import EVERY_DAY
 
 # a worker a core leaves nothing for the threads that numpy would take besides; to be said before it is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -19,7 +20,8 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # as padforge has it, also 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.load_profile(EVERY_DAY)
+hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("padforge")
 
 coverage = sys.modules.get("coverage")
 if coverage is not None and coverage.Coverage.current() is not None:
@@ -29,7 +31,8 @@ if coverage is not None and coverage.Coverage.current() is not None:
     fresh = tempfile.TemporaryDirectory(prefix="padforge-coverage-")
     config.JIT_COVERAGE, config.CACHE_DIR = 1, fresh.name  # pyright: ignore[reportAttributeAccessIssue]
 
-RIG = Path(__file__).parent / "sense" / "rig"
+from tests.helpers.once import Once  # noqa: E402
+
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
 
 
@@ -39,9 +42,24 @@ def pytest_xdist_auto_num_workers() -> int:
     return 1 + (len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1)
 
 
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Workers get whole groups of tests; kernels are compiled by one process, not by each worker again."""
+    if config.getoption("numprocesses", None) and config.option.dist == "load":
+        config.option.dist = "loadgroup"
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Rigs first: they wait for clocks and need few compiled kernels, which another process compiles meanwhile."""
-    items.sort(key=lambda item: RIG not in item.path.parents or item.path.parent.name == "planning")
+    """The tests of a file go to one worker, which makes what they share; a test may be marked for another group."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """Makes what is dear once for all workers."""
+    return Once(tmp_path_factory.getbasetemp())
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ def test_whatever_a_killed_command_leaves_is_whole_and_the_next_one_goes_on_from
     """A search a few times a day; every command, and more often, under stress."""
     stress = few(1).max_examples > 1
     more = ("10", "0") if stress else ("2", "0", "design")
-    command = [sys.executable, "-m", "tests.helpers.kill_rounds", str(tmp_path / "rounds"), *more]
+    command = [sys.executable, "-m", "tools.kill_rounds", str(tmp_path / "rounds"), *more]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "FAILED" not in ended.stdout

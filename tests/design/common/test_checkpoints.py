@@ -10,7 +10,7 @@ import pytest
 
 from design.common.checkpoints import Checkpoints
 from design.common.errors import InputError
-from tests.helpers.kills import killed
+from tools.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
 

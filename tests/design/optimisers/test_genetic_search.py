@@ -7,7 +7,6 @@ from design.criteria.published_objective import published_objective, published_p
 from design.optimisers.genetic_search import GeneticSearch
 from design.optimisers.problem import SearchProblem
 from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
-from tests.helpers.effort import LONG
 
 PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
@@ -95,7 +94,7 @@ def test_the_smallest_pads_with_the_smallest_populations_are_bred_too(grid):
     assert found.pitch_mm == 20
 
 
-@pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), pytest.param(20, 0.1040, marks=LONG)])
+@pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), pytest.param(20, 0.1040, marks=pytest.mark.slow)])
 def test_a_whole_search_reaches_the_published_objective(knots, bar):
     breeding = GeneticSearch(
         SearchProblem(PadSettings(), (CONTACT,), SearchSettings(method="genetic", knots=knots), RulesSettings())

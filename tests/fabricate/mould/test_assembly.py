@@ -25,7 +25,6 @@ from fabricate.mould.plan import Plan
 from fabricate.mould.prisms import Body, Prism
 from fabricate.settings import WELL_MM
 from tests.fabricate.planted import with_settings
-from tests.helpers.effort import LONG
 
 EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}
 
@@ -81,7 +80,7 @@ def test_published_moulds_are_closed(published, name):
     assert_one_closed_body(as_read(mould_body(plan)))
 
 
-@LONG
+@pytest.mark.slow
 def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
     assert_both_ways_agree(mould_body(Plan(Morphology.load(published / "1para.mat"))))
 
@@ -90,7 +89,7 @@ def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
     ("grid", "knots", "seed"),
     [
         *((1, 1, 0), (2, 3, 1), (2, 10, 2), (2, 30, 1032), (5, 2, 4)),
-        *(pytest.param(*dense, marks=LONG) for dense in ((4, 10, 2), (4, 30, 1032), (9, 4, 4))),
+        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((4, 10, 2), (4, 30, 1032), (9, 4, 4))),
     ],
 )
 def test_random_moulds_are_closed(grid, knots, seed):
@@ -223,7 +222,7 @@ def test_lid_has_the_holes_that_fit_the_pins():
 
 @pytest.mark.parametrize(
     ("tapered", "knots", "layer_mm"),
-    [(5.0, 1, 0.3), (17.0, 2, 0.3), *(pytest.param(draft, 4, 0.1, marks=LONG) for draft in (5.0, 17.0))],
+    [(5.0, 1, 0.3), (17.0, 2, 0.3), *(pytest.param(draft, 4, 0.1, marks=pytest.mark.slow) for draft in (5.0, 17.0))],
 )
 def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})

@@ -10,7 +10,7 @@ import pytest
 
 from design.common.files import read_json
 from sense.health.trained_model import ModelFiles, files_of, one_cycle
-from tests.helpers.kills import killed
+from tools.kills import killed
 
 
 def test_the_rate_rises_once_and_ends_at_nothing() -> None:

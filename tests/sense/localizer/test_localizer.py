@@ -14,7 +14,7 @@ from sense import Localizer, Recording
 from sense.localizer.features import SIZES
 from sense.localizer.localizer import joined
 from sense.localizer.normalization import Scaled
-from tests.helpers.kills import killed
+from tools.kills import killed
 
 
 def test_a_masked_fibre_changes_nothing(localizer: Localizer, recording: Recording) -> None:

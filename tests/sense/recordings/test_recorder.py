@@ -17,7 +17,7 @@ from sense.recordings.press_journal import read_journal
 from sense.recordings.recorder import JOURNAL, READINGS, START, STATES, Recorder
 from sense.recordings.recording import Recording
 from tests.helpers.effort import few
-from tests.helpers.kills import killed
+from tools.kills import killed
 
 FIBRES = 3
 

@@ -14,7 +14,7 @@ import pytest
 
 from design.common.files import atomic, unchanged, write_json
 from design.pad.morphology import Morphology
-from tests.helpers.effort import LONG, few
+from tests.helpers.effort import few
 from tests.stress.door import CHEAP, contents, require_whole_file
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")
@@ -96,9 +96,9 @@ def litter(folder: Path) -> list[str]:
     ("name", "limit"),
     [
         ("fabricate", 2000),
-        pytest.param("record", 0, marks=LONG),  # `tests/stress/sense/cli` has it, in no process of its own
+        pytest.param("record", 0, marks=pytest.mark.slow),  # `tests/stress/sense/cli` has it, in no process of its own
         *(
-            pytest.param(name, limit, marks=LONG)
+            pytest.param(name, limit, marks=pytest.mark.slow)
             for name in ("design", "picture", "show", "report")
             for limit in (0, 2000)
         ),
@@ -119,7 +119,13 @@ def test_a_full_disk_leaves_old_files_and_no_litter(room: Path, name: str, limit
 
 @pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write everywhere")
 @pytest.mark.parametrize(
-    "name", ["fabricate", "init", pytest.param("design", marks=LONG), pytest.param("record", marks=LONG)]
+    "name",
+    [
+        "fabricate",
+        "init",
+        pytest.param("design", marks=pytest.mark.slow),
+        pytest.param("record", marks=pytest.mark.slow),
+    ],
 )
 def test_a_closed_folder_is_one_line(room: Path, name: str):
     (room / "pad").chmod(0o555)
@@ -152,7 +158,10 @@ def test_an_end_while_writing_leaves_one_mould(room: Path, ending: signal.Signal
         assert litter(room) == [], err
 
 
-@pytest.mark.parametrize("name", ["fabricate", pytest.param("design", marks=LONG), pytest.param("genetic", marks=LONG)])
+@pytest.mark.parametrize(
+    "name",
+    ["fabricate", pytest.param("design", marks=pytest.mark.slow), pytest.param("genetic", marks=pytest.mark.slow)],
+)
 def test_two_at_once_leave_one_result(room: Path, name: str):
     children = [start(room, *COMMANDS[name]) for _ in range(2)]
     for child in children:

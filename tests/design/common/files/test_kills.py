@@ -21,7 +21,7 @@ from design.common.files import (
     write_text,
 )
 from design.common.files.folders import EXCHANGE
-from tests.helpers.kills import killed
+from tools.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
 

@@ -17,7 +17,7 @@ from design import Contact, InputError, Morphology, signals, signals_quantized, 
 from design.pad.contact import signals_and_spans
 from design.pad.knots import assemble
 from design.settings import PUBLISHED_CONTACT
-from tests.helpers.effort import LONG, few
+from tests.helpers.effort import few
 
 WEIGHTS: tuple[Literal["uniform", "inverse_square", "inverse"], ...] = ("uniform", "inverse_square", "inverse")
 LENGTHS: tuple[Literal["manhattan", "euclidean"], ...] = ("manhattan", "euclidean")
@@ -76,7 +76,7 @@ def oracle(pad, press, contact, fibre):
 
 @pytest.mark.parametrize("weight", WEIGHTS)
 @pytest.mark.parametrize("length", LENGTHS)
-@pytest.mark.parametrize("sides", [None, 3, 30, *(pytest.param(sides, marks=LONG) for sides in (4, 7, 64))])
+@pytest.mark.parametrize("sides", [None, 3, 30, *(pytest.param(sides, marks=pytest.mark.slow) for sides in (4, 7, 64))])
 def test_exact_signals_equal_the_oracle(weight, length, sides):
     contact = Contact(radius=0.7, sides=sides, weight=weight, length=length)
     plain = weight == "uniform" and length == "manhattan"

@@ -14,7 +14,6 @@ from fabricate.checks.plan_checks.tracks import thinner
 from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
-from tests.helpers.effort import LONG
 
 
 def found(pad: Morphology, name: str, settings: FabricationSettings = DEFAULTS) -> Finding:
@@ -36,7 +35,7 @@ def test_published_pad_that_was_built_shows_its_crossings(published):
     ("grid", "knots", "seed"),
     [
         *((4, 1, 1006), (4, 5, 1001), (2, 20, 1003), (2, 30, 1032)),
-        *(pytest.param(4, *dense, marks=LONG) for dense in ((20, 1003), (30, 1032))),
+        *(pytest.param(4, *dense, marks=pytest.mark.slow) for dense in ((20, 1003), (30, 1032))),
     ],
 )
 def test_tangled_pads_are_measured_and_sound(grid, knots, seed):

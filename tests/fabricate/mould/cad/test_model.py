@@ -26,7 +26,7 @@ from fabricate.mould.cad.step_file import write_step
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
 from tests.fabricate.planted import level_pad, mild_pad, winding_pad, with_settings
-from tests.helpers.effort import LONG, few
+from tests.helpers.effort import few
 
 PLAIN: dict[str, object] = {"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0}
 SOFT = winding_pad((0.3, 1.0), (0.6, 1.5), (0.9, 1.35), (1.3, 0.6), (1.7, 1.0))
@@ -152,7 +152,7 @@ def test_any_pad(seed, grid, knots):
     judged(Plan(Morphology.random(grid, knots, seed)))
 
 
-@LONG
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("grid", "knots", "seed"), [(4, 20, 0), (5, 8, 0), (4, 20, 4), (3, 20, 9), (5, 20, 10), (4, 20, 41)]
 )
@@ -160,7 +160,9 @@ def test_dense_pads(grid, knots, seed):
     judged(Plan(Morphology.random(grid, knots, seed)))
 
 
-@pytest.mark.parametrize("name", ["1para", pytest.param("5para_dis", marks=LONG), pytest.param("20para", marks=LONG)])
+@pytest.mark.parametrize(
+    "name", ["1para", pytest.param("5para_dis", marks=pytest.mark.slow), pytest.param("20para", marks=pytest.mark.slow)]
+)
 def test_published_pads(published, name):
     judged(Plan(Morphology.load(published / f"{name}.mat")))
 

@@ -23,7 +23,6 @@ from sense.rig.emulators.whole_rig import emulated, emulated_rig
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
 from sense.settings import RigSettings
-from tests.helpers.effort import LONG
 
 pytest.importorskip("rtde_control")
 
@@ -166,7 +165,7 @@ FAULTS = {
     "names",
     [
         ("protective", "drop", "freeze", "stall", "unplug"),
-        pytest.param(("emergency", "restart"), marks=LONG),
+        pytest.param(("emergency", "restart"), marks=pytest.mark.slow),
     ],
     ids=" ".join,
 )

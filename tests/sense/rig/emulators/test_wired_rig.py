@@ -25,7 +25,6 @@ from sense.rig.operation import look_over, record
 from sense.rig.planning.setup import Setup
 from sense.rig.session.press_loop import Session
 from sense.settings import RigSettings
-from tests.helpers.effort import LONG
 
 pytest.importorskip("rtde_control")
 pytestmark = pytest.mark.usefixtures("own_address")
@@ -140,7 +139,7 @@ FAULTS: dict[str, tuple[str, Callable[[LineRig], object], Callable[[LineRig], ob
 
 
 @pytest.mark.parametrize(
-    "names", [("reset", "unplug"), pytest.param(("other columns", "stall"), marks=LONG)], ids=" ".join
+    "names", [("reset", "unplug"), pytest.param(("other columns", "stall"), marks=pytest.mark.slow)], ids=" ".join
 )
 def test_a_line_board_that_fails_among_damaged_lines_loses_no_press_and_gives_no_wrong_reading(
     rig: LineRig, tmp_path: Path, names: tuple[str, ...]

@@ -14,7 +14,6 @@ from sense.rig.arms.ur5 import link as ur5_link
 from sense.rig.arms.ur5.driver import UR5
 from sense.rig.emulators.ur.emulator import HOME, UrEmulator
 from sense.rig.safety import wait_until_still
-from tests.helpers.effort import LONG
 from tests.sense.rig.arms.ur5.arms import (
     LIMITS,
     LONGEST_CALL_S,
@@ -56,7 +55,7 @@ FAULTS: dict[str, tuple[Callable[[UrEmulator], object], str, float, Callable[[Ur
     ("series", "name"),
     [
         ("e", "protective stop"),
-        *(pytest.param("e", name, marks=LONG) for name in ("links closed", "stream frozen")),
+        *(pytest.param("e", name, marks=pytest.mark.slow) for name in ("links closed", "stream frozen")),
         *(("cb3", name) for name in FAULTS),
     ],
 )
@@ -119,7 +118,7 @@ while True:
 
 
 @pytest.mark.parametrize(
-    ("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), pytest.param("e", "SIGKILL", marks=LONG)]
+    ("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), pytest.param("e", "SIGKILL", marks=pytest.mark.slow)]
 )
 def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)

@@ -26,7 +26,6 @@ from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
 from sense.rig.session.retreat import HEIGHT_MM
 from sense.settings import RigSettings
-from tests.helpers.effort import LONG
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
@@ -139,7 +138,9 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("names", [("busy", "unplug"), pytest.param(("halt", "restart"), marks=LONG)], ids=" ".join)
+@pytest.mark.parametrize(
+    "names", [("busy", "unplug"), pytest.param(("halt", "restart"), marks=pytest.mark.slow)], ids=" ".join
+)
 def test_faults_in_mid_run_are_told_and_lose_nothing(rig: Rig, tmp_path: Path, names: tuple[str, ...]) -> None:
     """One after the other in one recording, which is resumed after each."""
     run = tmp_path / "run"
@@ -164,7 +165,7 @@ def test_a_fault_of_the_board_stops_and_lifts_the_probe(rig: Rig, tmp_path: Path
     assert tip[2] == pytest.approx((RIG.contact_mm or 0) + HEIGHT_MM, abs=0.05)
 
 
-@LONG
+@pytest.mark.slow
 def test_five_hundred_presses(rig: Rig, tmp_path: Path) -> None:
     run, plan = tmp_path / "run", planned(PAD, RIG.model_copy(update={"presses": 500}), np.random.default_rng(0))
     for presses, (name, (disturb, cause, cure)) in enumerate(FAULTS.items(), start=1):

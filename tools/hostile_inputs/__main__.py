@@ -1,6 +1,6 @@
 """Hostile inputs: command lines, files and calls with something wrong, each in a process of its own, under limits.
 
-`python -m tests.helpers.hostile_inputs FOLDER ROUNDS SEED [FIRST]` makes good files in FOLDER, which is new, and tries
+`python -m tools.hostile_inputs FOLDER ROUNDS SEED [FIRST]` makes good files in FOLDER, which is new, and tries
 so many inputs, from number FIRST on. Each must end in results, or in one line with nothing changed: no traceback, no
 file torn or left over, at most 1 GiB of memory and 10 s of computing. Told are counts by kind and outcome, the most
 memory and time, and every violation with the number of its input; with FIRST that number, one round repeats it. The
@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 import padforge
-from tests.helpers.effort import on_one_thread
+from tools.threads import on_one_thread
 
 from . import calls, command_lines, spoilt_files
 from .judging import MOST_CPU_S, MOST_MEMORY, outcome, suspect, violations
@@ -165,7 +165,7 @@ class Campaign:
         hostile, _ = self._made(number)
         words = ["-m", "padforge", *hostile.words]
         if not hostile.words:
-            script = "import numpy as np; from tests.helpers.hostile_inputs import calls; "
+            script = "import numpy as np; from tools.hostile_inputs import calls; "
             script += f"rng = np.random.default_rng([{self._seed}, {number}]); rng.choice(3, p={[*SHARES.values()]}); "
             words = ["-c", script + "calls.drawn(rng)[0]()"]
         return fresh(words, self.workplace.folder).memory

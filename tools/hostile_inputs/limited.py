@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.helpers.kills import forked
+from tools.kills import forked
 
 MIB = 2**20
 ROOT = Path(__file__).resolve().parents[3]

@@ -1,6 +1,6 @@
 """Kills commands again and again, at random moments or between file operations, and looks at what they leave.
 
-`python -m tests.helpers.kill_rounds FOLDER ROUNDS SEED [COMMAND]...` prints lines for each command. A round begins
+`python -m tools.kill_rounds FOLDER ROUNDS SEED [COMMAND]...` prints lines for each command. A round begins
 with the results of an earlier run in place, or with none, kills the command that replaces them, and runs it again:
 files that belong together must be all old or all new, the second run must end well, and nothing else must be left.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 from design.common.errors import InputError
 from design.common.files import read_json, settle, sha256
 from sense.recordings.recording import Recording
-from tests.helpers.kills import KILLED, forked, kill_at
+from tools.kills import KILLED, forked, kill_at
 
 SETTINGS = """
 [pad]

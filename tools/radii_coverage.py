@@ -1,6 +1,6 @@
 """How often presses lie within the radii that a localizer tells, on test presses of many simulated recordings.
 
-`python -m tests.helpers.radii_coverage RECORDINGS SEED` prints a line per recording, and at the end the means over all
+`python -m tools.radii_coverage RECORDINGS SEED` prints a line per recording, and at the end the means over all
 recordings with their standard errors: the share of presses within the radii of 50 and 90 %, by number of lost fibres.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from design import Morphology
 from sense import LocalizerSettings, RigSettings, calibrate, simulate
-from tests.helpers.effort import on_one_thread
+from tools.threads import on_one_thread
 
 PRESSES = (300, 3000)
 GRIDS = (2, 3, 4, 5)

@@ -11,10 +11,10 @@ import h5py
 import numpy as np
 import scipy.io
 
-from tests.helpers.kills import killed
 from tests.sense.recordings.formats.ros.foreign import array, pose, write_bag
 from tests.stress.damage import published
 from tests.stress.door import CHEAP, SPECIAL, Ended, call, contents, fill
+from tools.kills import killed
 
 LAB = "time=time_s,fibres=fibre*,x=x_mm,y=y_mm"
 """How a table of another program is named, `lab.csv`."""
