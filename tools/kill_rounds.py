@@ -1,12 +1,14 @@
 """Kills commands again and again, at random moments or between file operations, and looks at what they leave.
 
-`python -m tools.kill_rounds FOLDER ROUNDS SEED [COMMAND]...` prints lines for each command. A round begins
-with the results of an earlier run in place, or with none, kills the command that replaces them, and runs it again:
-files that belong together must be all old or all new, the second run must end well, and nothing else must be left.
+`python -m tools.kill_rounds FOLDER SECONDS [SEED [COMMAND]...]` makes pads in FOLDER, which is new, kills three commands
+that the seed draws, or those that are named, in turn for so long, and prints a line for each. A round begins with the
+results of an earlier run in place, or with none, kills the command that replaces them, and runs it again: files that
+belong together must be all old or all new, the second run must end well, and nothing else must be left.
 """
 
 import os
 import random
+import secrets
 import shutil
 import signal
 import sys
@@ -15,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 
 from design.common.errors import InputError
@@ -167,20 +170,21 @@ class Rounds:
 
     def __init__(self, where: Path, origin: Path, command: Command) -> None:
         self._where, self._origin, self._command = where, origin, command
+        where.mkdir()
         self._new: dict[bool, dict[str, str]] = {}
         self.seconds: dict[bool, float] = {}
         self.operations: dict[bool, int] = {}
         for old in {command.old, False}:
             folder = self._folder(f"unbroken-{old}", old)
-            begin, count = time.monotonic(), Path(f"{folder}.operations")
+            begin, counts = time.monotonic(), Path(f"{folder}.operations")
 
-            def counted(folder: Path = folder, count: Path = count) -> None:
-                file = count.open("wb", buffering=0)
+            def counted(folder: Path = folder, counts: Path = counts) -> None:
+                file = counts.open("wb", buffering=0)
                 kill_at(10**9, folder, lambda: file.write(b"."))
 
             assert ended(started(command.words.split(), folder, counted)) == 0, Path(f"{folder}.err").read_text()
             self.seconds[old] = time.monotonic() - begin
-            self.operations[old] = count.stat().st_size
+            self.operations[old] = counts.stat().st_size
             assert not litter(folder), litter(folder)
             self._new[old] = results(folder)
 
@@ -237,29 +241,33 @@ def made(where: Path, names: Sequence[str]) -> Path:
     return origin
 
 
-def main(where: Path, rounds: int, seed: int, names: Sequence[str]) -> None:
-    """Kill each command so many times at random moments, and a quarter as often between file operations."""
-    names = names or list(COMMANDS)
+def main(where: Path, seconds: float, seed: int, names: Sequence[str]) -> None:
+    """Kill commands in turn, at random moments and, every fourth time, between file operations, for so long."""
+    rng = random.Random(seed)
+    names = names or rng.sample(sorted(COMMANDS), 3)
+    print(f"kills of {', '.join(names)} for {seconds:g} s, seed {seed}", flush=True)
     for name in _OF_DESIGN + (_OF_OTHERS if {*names} != {"design"} else ()):
         import_module(name)
     where.mkdir(parents=True)
-    rng = random.Random(seed)
     origin, failed = made(where, names), 0
-    for name in names:
-        begun = Rounds(where, origin, COMMANDS[name])
-        for between in (False, True):
-            found: Counter[str] = Counter()
-            for number in range(max(rounds // 4, 1) if between else rounds):
-                try:
-                    found[begun.round(rng, between)] += 1
-                except (AssertionError, InputError) as error:
-                    failed += 1
-                    print(f"FAILED {name} {number} {between}: {str(error)[:1500]}", flush=True)
-                    shutil.copytree(where / "round", where / f"failed-{name}-{number}-{between}", symlinks=True)
-            how = f"between {max(begun.operations.values())} file operations" if between else "at random moments"
-            print(f"{name}: {found.total()} kills {how}: {dict(sorted(found.items()))}", flush=True)
+    begun = {name: Rounds(where / name, origin, COMMANDS[name]) for name in names}
+    found: dict[str, Counter[str]] = {name: Counter() for name in names}
+    end = time.monotonic() + seconds
+    for number in count():
+        name, between = names[number % len(names)], number // len(names) % 4 == 3
+        try:
+            found[name][begun[name].round(rng, between)] += 1
+        except (AssertionError, InputError) as error:
+            failed += 1
+            print(f"FAILED {name} {number} {between}: {str(error)[:1500]}", flush=True)
+            shutil.copytree(where / name / "round", where / f"failed-{name}-{number}-{between}", symlinks=True)
+        if time.monotonic() > end:
+            break
+    for name, outcomes in found.items():
+        print(f"{name}: {outcomes.total()} kills: {dict(sorted(outcomes.items()))}", flush=True)
     sys.exit(failed)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve(), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
+    where, seconds, *more = sys.argv[1:]
+    main(Path(where).resolve(), float(seconds), int(more[0]) if more else secrets.randbelow(2**32), more[1:])

@@ -24,7 +24,7 @@ import pytest
 from sense.health import fibre_prediction
 from tests.docs.pages import BLOCK, ROOT, relative
 from tests.helpers.effort import few
-from tests.stress.door import call
+from tests.helpers.door import call
 
 TUTORIALS = [ROOT / "docs" / f"tutorial-{stage}.md" for stage in ("design", "fabricate", "sense", "study", "twin")]
 REWRITE = "REWRITE_DOCS" in os.environ
@@ -161,7 +161,7 @@ def answer(counter: Path) -> None:
     here, *words = (counter / "asked").read_text(encoding="utf-8").splitlines()
     (counter / "asked").unlink()
     with chdir(here), patch.object(fibre_prediction, "MOST_STEPS", fibre_prediction.MOST_STEPS // SHORTER):
-        ended = call(*words, limit_s=300)
+        ended = call(*words)
     (counter / "err").write_text(ended.err, encoding="utf-8")
     (counter / "out").write_text(ended.out, encoding="utf-8")
     (counter / "ending").write_text(f"{ended.code}\n", encoding="utf-8")

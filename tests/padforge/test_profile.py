@@ -145,6 +145,7 @@ def test_calibration_tells_its_stages():
     assert {"train", "evaluate"} <= set(profile.seconds)
 
 
+@pytest.mark.slow
 def test_the_command_line_profiles_on_stderr_and_loads_what_it_needs(tmp_path):
     (tmp_path / "pad.toml").write_text("[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nlost = 0\n")
     command = [sys.executable, "-m", "padforge", "design", "--profile", "--json"]

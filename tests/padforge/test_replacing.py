@@ -1,5 +1,6 @@
-"""Commands that would leave results of a pad beside another one: refused ahead, in one line, unless by --force."""
+"""What commands never take away: a pad that others were made from, recordings, files of others, folders half done."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -7,7 +8,8 @@ import pytest
 
 from design.common.files import sha256, write_json
 from design.pad.morphology import Morphology
-from tests.padforge.program import called
+from sense.recordings.recorder import Recorder
+from tests.helpers.door import called, refused
 
 SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nlost = 1\n[rules]\nenforce = false\n"
 DESIGN = "design --out pad"
@@ -27,8 +29,8 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(designed: Path, tmp_path: Path) -> Path:
-    """A designed pad and what was made from it, and a drawing of another one."""
+def pad(designed: Path, tmp_path: Path) -> Path:
+    """A folder with a designed pad and what was made from it, and a drawing of another one."""
     folder = shutil.copytree(designed, tmp_path / "work")
     digest = {"morphology.json": sha256(folder / "pad" / "morphology.json")}
     for name in ("fabrication.json", "recording/start.json", "twin.json"):
@@ -51,59 +53,124 @@ def contents(folder: Path) -> dict[str, bytes]:
         f"{DESIGN} --from pad/morphology.json",
         "design import plan.svg --out pad",
         "design edit other.json --out pad/morphology.json",
-        "run --seed 1 --out pad",
     ],
 )
-def test_a_pad_that_others_were_made_from_is_kept(folder: Path, words: str) -> None:
-    before = contents(folder)
-    if words.startswith("run"):
-        shutil.rmtree(folder / "pad" / "recording")
-        before = contents(folder)
-    ended = called(*words.split(), cwd=folder)
+def test_a_pad_that_others_were_made_from_is_kept(pad: Path, words: str) -> None:
+    before = contents(pad)
+    ended = called(*words.split(), cwd=pad)
     assert (ended.code, ended.err.count("\n")) == (2, 1), ended
-    assert "pad/morphology.json: " in ended.err
-    assert "twin.json" in ended.err
-    if not words.startswith("run"):  # which makes these again
-        assert "calibration.json" in ended.err
-        assert "fabrication.json, recording" in ended.err
-    assert "another --out, or replace it with --force" in ended.err
-    assert contents(folder) == before
+    for said in ("pad/morphology.json: calibration.json", "fabrication.json, recording", "twin.json", "--force"):
+        assert said in ended.err
+    assert contents(pad) == before
+
+
+def test_a_run_replaces_what_it_makes_again_and_keeps_the_rest(pad: Path) -> None:
+    shutil.rmtree(pad / "pad" / "recording")
+    said = refused("run", "--seed", "1", "--out", "pad", cwd=pad)
+    assert "twin.json" in said
+    assert "fabrication.json" not in said
 
 
 @pytest.mark.parametrize("words", [f"{DESIGN} --seed 1", "design import plan.svg --out pad"])
-def test_by_force_it_is_replaced(folder: Path, words: str) -> None:
-    before = sha256(folder / "pad" / "morphology.json")
-    assert called(*words.split(), "--force", cwd=folder).code in (0, 1)
-    assert sha256(folder / "pad" / "morphology.json") != before
+def test_by_force_it_is_replaced(pad: Path, words: str) -> None:
+    before = sha256(pad / "pad" / "morphology.json")
+    assert called(*words.split(), "--force", cwd=pad).code in (0, 1)
+    assert sha256(pad / "pad" / "morphology.json") != before
 
 
-def test_the_same_pad_again_replaces_nothing(folder: Path) -> None:
-    before = contents(folder / "pad")
+def test_the_same_pad_again_replaces_nothing(pad: Path) -> None:
+    before = contents(pad / "pad")
     for again in (DESIGN, f"{DESIGN} --resume"):
-        assert called(*again.split(), cwd=folder).code == 0
-        assert {**contents(folder / "pad"), "design.json": b""} == {**before, "design.json": b""}  # times are in it
+        assert called(*again.split(), cwd=pad).code == 0
+        assert {**contents(pad / "pad"), "design.json": b""} == {**before, "design.json": b""}  # times are in it
 
 
-def test_a_search_that_ends_elsewhere_is_kept_to_be_gone_on_with(folder: Path) -> None:
+def test_a_search_that_ends_elsewhere_is_kept_to_be_gone_on_with(pad: Path) -> None:
     """As on another machine: that it is another pad shows only at its end."""
-    path = folder / "pad" / "morphology.json"
+    path = pad / "pad" / "morphology.json"
     path.write_text(path.read_text() + "\n")
-    made_from(folder / "pad" / "twin.json", **{"morphology.json": sha256(path)})
-    before = contents(folder / "pad")
-    assert "twin.json was made from it" in called(*DESIGN.split(), cwd=folder).err
-    after = contents(folder / "pad")
+    made_from(pad / "pad" / "twin.json", **{"morphology.json": sha256(path)})
+    before = contents(pad / "pad")
+    assert "twin.json was made from it" in called(*DESIGN.split(), cwd=pad).err
+    after = contents(pad / "pad")
     assert {name: after[name] for name in before} == before
     assert {name.partition("/")[0] for name in after.keys() - before.keys()} == {"search"}
-    assert called(*DESIGN.split(), "--resume", "--force", cwd=folder).code == 0
-    assert not (folder / "pad" / "search").exists()
+    assert called(*DESIGN.split(), "--resume", "--force", cwd=pad).code == 0
+    assert not (pad / "pad" / "search").exists()
 
 
-def test_a_run_keeps_a_localizer_of_other_presses(folder: Path) -> None:
-    shutil.rmtree(folder / "pad")
-    (folder / "pad").mkdir()
-    for told in ({}, {"recording_kind": "ur5"}):
-        write_json(folder / "pad" / "localizer.json", {"format": "padforge-localizer/2", "provenance": told})
-        ended = called("run", "--out", "pad", cwd=folder)
-        assert (ended.code, ended.err.count("\n")) == (2, 1), ended
-        assert f"of kind {told.get('recording_kind')!r}, not a simulated one" in ended.err
-    assert [path.name for path in (folder / "pad").iterdir()] == ["localizer.json"]
+@pytest.mark.parametrize("told", [{}, {"recording_kind": "ur5"}])
+def test_a_run_keeps_a_localizer_of_other_presses(tmp_path: Path, told: dict[str, str]) -> None:
+    (tmp_path / "pad").mkdir()
+    write_json(tmp_path / "pad" / "localizer.json", {"format": "padforge-localizer/2", "provenance": told})
+    said = refused("run", "--out", "pad", cwd=tmp_path)
+    assert f"of kind {told.get('recording_kind')!r}, not a simulated one" in said
+
+
+def test_a_run_keeps_a_recording_that_cannot_give_way(folder: Path) -> None:
+    """Of a real pad, at work, with files of others in it, behind a link, or none at all."""
+    recording = folder / "out" / "pad" / "recording"
+    kept = contents(recording)
+    with Recorder.resume(recording):
+        assert "another program is recording into it" in refused("run", cwd=folder)
+    start = json.loads((recording / "start.json").read_text())
+    for kind in ("published", "ur5"):
+        write_json(recording / "start.json", start | {"source": start["source"] | {"kind": kind}})
+        assert "choose another --out" in refused("run", cwd=folder)
+    (recording / "start.json").write_bytes(kept["start.json"])
+    (recording / "notes.txt").write_text("of the day")
+    assert "holds notes.txt, which is no part of a recording" in refused("run", cwd=folder)
+    (recording / "notes.txt").unlink()
+    journal = recording / "journal.ndjson"
+    elsewhere = journal.rename(folder / "journal")
+    journal.mkdir()
+    (journal / "thesis").touch()
+    assert "holds journal.ndjson, which is no part of a recording" in refused("run", cwd=folder)
+    shutil.rmtree(journal)
+    journal.symlink_to(elsewhere)
+    assert "holds journal.ndjson, which is no part of a recording" in refused("run", cwd=folder)
+    journal.unlink()
+    recording.rename(folder / "recording")
+    recording.symlink_to(folder / "recording")
+    assert "is a link" in refused("run", cwd=folder)
+    recording.unlink()
+    recording.touch()
+    assert "is no folder" in refused("run", cwd=folder)
+    assert (folder / "recording" / "readings.bin").read_bytes() == kept["readings.bin"]
+
+
+EXCHANGE = ".unfinished-exchange"
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that somebody else has packed, with `pad`, in which files were about to be exchanged elsewhere."""
+    folder = tmp_path_factory.mktemp("unpacked")
+    for name in ("pad", f"pad/{EXCHANGE}", "other"):
+        (folder / name).mkdir()
+        Morphology.straight(2).save(folder / name / "morphology.json")
+    (folder / "pad" / "recording.csv").write_text("time_s,fibre_1_v\n0,0\n1,0\n")
+    (folder / "pad" / "thesis.txt").write_text("mine")
+    (folder / "pad" / EXCHANGE / ".unfinished-gone").write_text('["thesis.txt"]')
+    (folder / "pad" / EXCHANGE / ".unfinished-note").write_text('[["morphology.json"], ["thesis.txt"]]')
+    (folder / "pad" / EXCHANGE / ".unfinished-seal").write_text("1 2 3 4")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"design {name} pad/morphology.json" for name in ("show", "check", "score", "edit")),
+        "design --from pad/morphology.json --out other",
+        "fabricate check pad/morphology.json",
+        "fabricate pad/morphology.json --out other",
+        *(f"sense {name} --model pad pad/recording.csv" for name in ("locate", "evaluate", "health")),
+        "sense import pad/recording.csv --out other/recording",
+        "sense identify other/recording --morphology pad/morphology.json",
+        *("run --out pad", "design --out pad", "report pad"),
+        "fabricate other/morphology.json --out pad",
+        "design show other/morphology.json --out pad/plan.svg",
+    ],
+)
+def test_no_command_carries_out_what_was_begun_elsewhere(unpacked: Path, words: str) -> None:
+    assert f"{EXCHANGE}: begun in another folder" in refused(*words.split(), cwd=unpacked)

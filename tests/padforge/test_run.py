@@ -1,65 +1,52 @@
-"""The whole chain on a small pad."""
+"""The whole chain on a small pad, broken off, gone on with, and in a time that is given to all of it."""
 
-import hashlib
 import json
 import math
 import os
 import shutil
 import signal
-import sys
 import threading
+import time
+from pathlib import Path
 
 import pytest
 import trimesh
 from safetensors.numpy import load_file
 
-import padforge as front_door
-from tests.padforge.program import called, padforge
+import padforge.running
+import sense.cli.calibration
+from design.common.checkpoints import Checkpoints
+from design.common.files import sha256
+from tests.helpers.door import called, refused, started
+from tests.padforge.conftest import SMALL
 
-SMALL = """
-[pad]
-grid = 2
-[search]
-knots = 2
-starts = 1
-steps = 10
-lost = 1
-[rig]
-presses = 80
-[localizer]
-members = 1
-hidden = 16
-epochs = 4
-lost = 1
-"""
+ALL = "fibres, mould, recording, contacts, calibration"
+VOLATILE = ("design.json", "run.json", "report.html")
+"""With seconds in them, and digests of these."""
 
 
-@pytest.fixture(scope="module")
-def chain(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("chain")
-    (folder / "pad.toml").write_text(SMALL)
-    return folder, called("run", cwd=folder, limit_s=300)
+def digests(folder: Path, *without: str) -> dict[str, str]:
+    return {path.name: sha256(path) for path in (folder / "out" / "pad").iterdir() if path.name not in without}
 
 
-def test_run_makes_everything(chain):
-    folder, result = chain
-    assert result.code == 0, result.out + result.err
-    out = folder / "out" / "pad"
-    names = {path.name for path in out.iterdir()}
-    assert names >= {
-        *("morphology.json", "design.json", "design.svg", "design.png"),
-        *(
-            "mould.stl",
-            "mould.step",
-            "tracks.svg",
-            "mould.png",
-            "tracks.png",
-            "laying.md",
-            "orientation.svg",
-            "fabrication.json",
-        ),
-        *("recording", "localizer.safetensors", "localizer.json", "calibration.json", "contacts.json"),
-        *("error_map.png", "error_by_loss.png", "report.html"),
+def resumed(folder: Path, *more: str) -> str:
+    """Go on; what is said to be kept of the earlier run."""
+    ended = called("run", "--resume", *more, cwd=folder)
+    assert ended.code == 0, ended
+    kept = [line for line in ended.err.splitlines() if "kept as an earlier run has made it" in line]
+    return kept[0].partition("made it: ")[2] if kept else ""
+
+
+def breaks(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_run_makes_everything(finished: tuple[Path, str]) -> None:
+    out = finished[0] / "out" / "pad"
+    assert {path.name for path in out.iterdir()} >= {
+        *("morphology.json", "design.json", "design.svg", "design.png", "mould.stl", "mould.step", "tracks.svg"),
+        *("mould.png", "tracks.png", "laying.md", "orientation.svg", "fabrication.json", "recording", "contacts.json"),
+        *("localizer.safetensors", "localizer.json", "calibration.json", "error_map.png", "error_by_loss.png"),
     }
     mesh = trimesh.load_mesh(out / "mould.stl")
     assert mesh.is_watertight
@@ -67,49 +54,134 @@ def test_run_makes_everything(chain):
     walls = 2 * (2 + 2 + 6 * math.tan(math.radians(2)))  # exits, walls and their lean
     assert mesh.extents[:2] == pytest.approx([3 * 11.25 + walls] * 2, abs=1e-3)
     assert load_file(out / "localizer.safetensors")
-    errors = json.loads((out / "calibration.json").read_text())["errors"]
-    assert [row["lost"] for row in errors] == [0, 1]
+    assert [row["lost"] for row in json.loads((out / "calibration.json").read_text())["errors"]] == [0, 1]
     for name in ("design", "fabrication", "calibration", "morphology", "localizer"):
         document = json.loads((out / f"{name}.json").read_text())
         assert document["format"] == f"padforge-{name}/{2 if name == 'localizer' else 1}"
         assert set(document["provenance"]) >= {"command", "seed", "versions", "inputs"}
-
-
-def test_errors_are_told_under_other_contacts_than_the_one_believed(chain):
-    folder, result = chain
-    document = json.loads((folder / "out/pad/contacts.json").read_text())
-    assert {row["pad"] for row in document["rows"]} == {"designed", "straight"}
-    assert len(document["rows"]) == 8
-    assert all(len(row["errors_mm"]) == 4 and 0 < min(row["errors_mm"]) < 20 for row in document["rows"])
-    assert result.out.count("\ncontact: a small network on one reading of each fibre errs by ") == 1
-
-
-def test_the_report_is_one_page_with_its_pictures(chain):
-    text = (chain[0] / "out" / "pad" / "report.html").read_text()
+    text = (out / "report.html").read_text()
     assert text.count('src="data:image/') == 6
     assert "http://" not in text.replace("http://www.w3.org", "")
     for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Provenance"):
         assert f">{heading}</h2>" in text
 
 
-def test_running_again_gives_the_same_pad(chain):
+def test_errors_are_told_under_other_contacts_than_the_one_believed(finished: tuple[Path, str]) -> None:
+    folder, printed = finished
+    rows = json.loads((folder / "out/pad/contacts.json").read_text())["rows"]
+    assert {row["pad"] for row in rows} == {"designed", "straight"}
+    assert len(rows) == 8
+    assert all(len(row["errors_mm"]) == 4 and 0 < min(row["errors_mm"]) < 20 for row in rows)
+    assert printed.count("\ncontact: a small network on one reading of each fibre errs by ") == 1
+
+
+@pytest.mark.slow
+def test_running_again_gives_the_same_pad(folder: Path) -> None:
     """In a process of its own, as people run it."""
-    folder, _ = chain
-    before = (folder / "out/pad/morphology.json").read_bytes(), (folder / "out/pad/mould.stl").read_bytes()
-    result = padforge("run", cwd=folder)
+    before = digests(folder, *VOLATILE)
+    result = started("run", cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert ((folder / "out/pad/morphology.json").read_bytes(), (folder / "out/pad/mould.stl").read_bytes()) == before
+    again = digests(folder, *VOLATILE)
+    assert again["mould.stl"] == before["mould.stl"]
+    assert again["morphology.json"] == before["morphology.json"]
 
 
-def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain, tmp_path):
+def test_of_a_finished_run_nothing_is_done_anew(folder: Path) -> None:
+    before = digests(folder)
+    assert resumed(folder) == ALL
+    assert digests(folder) == before
+
+
+def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing of an earlier run counts as finished once it has begun."""
+    monkeypatch.setattr(padforge.running, "_designed", breaks)
+    assert called("run", cwd=folder).code == 130
+    assert not (folder / "out" / "pad" / "run.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "more", "kept", "others"),
+    [
+        ("epochs = 4", "epochs = 5", (), "fibres, mould, recording, contacts", set()),
+        ("presses = 80", "presses = 90", (), "fibres, mould, contacts", {"recording"}),
+        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "fibres, recording, contacts, calibration", {"mould.stl"}),
+        ("", "", ("--seed", "1"), "", {"recording"}),
+    ],
+)
+def test_what_was_made_of_other_settings_is_made_anew(
+    folder: Path, old: str, new: str, more: tuple[str, ...], kept: str, others: set[str]
+) -> None:
+    before = digests(folder)
+    (folder / "pad.toml").write_text(SMALL.replace(old, new))
+    assert resumed(folder, *more) == kept
+    after = digests(folder)
+    assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
+
+
+def test_a_file_that_is_gone_or_another_one_is_made_anew(folder: Path) -> None:
+    before = digests(folder)
+    (folder / "out" / "pad" / "mould.stl").unlink()
+    (folder / "out" / "pad" / "localizer.safetensors").write_bytes(b"torn")
+    (folder / "out" / "pad" / "recording" / "readings.bin").write_bytes(b"")
+    assert resumed(folder) == "fibres, contacts"
+    assert digests(folder) == before
+
+
+def test_a_broken_off_calibration_is_all_that_is_done_again(
+    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And two runs give the same files."""
+    (tmp_path / "pad.toml").write_text(SMALL)
+    with monkeypatch.context() as patch:
+        patch.setattr(sense.cli.calibration, "run_calibration", breaks)
+        assert called("run", cwd=tmp_path).code == 130
+    assert resumed(tmp_path) == "fibres, mould, recording, contacts"
+    assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
+
+
+def test_a_search_goes_on_from_its_states(
+    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pad.toml").write_text(SMALL)
+    save, begin, found = Checkpoints.save, Checkpoints.begin, []
+
+    def save_and_break(kept: Checkpoints, start: int, state: dict) -> None:
+        save(kept, start, state)
+        raise SystemExit(9)
+
+    def begun(kept: Checkpoints, resume: bool) -> dict:
+        found.append(begin(kept, resume))
+        return found[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", save_and_break)
+        assert called("run", cwd=tmp_path).code == 9
+    assert not (tmp_path / "out" / "pad" / "morphology.json").exists()
+    monkeypatch.setattr(Checkpoints, "begin", begun)
+    assert resumed(tmp_path, "--formats", "svg") == ""
+    assert [sorted(states) for states in found] == [[0]]
+    assert digests(tmp_path)["morphology.json"] == digests(finished[0])["morphology.json"]
+    assert not (tmp_path / "out" / "pad" / "search").exists()
+
+
+def test_fibres_of_another_search_are_not_kept(folder: Path) -> None:
+    """One that was made in the folder meanwhile, with other settings than the run has."""
+    before = digests(folder)
+    (folder / "other.toml").write_text(SMALL.replace("starts = 1", "starts = 1\nseed = 5"))
+    assert called("design", "--spec", "other.toml", "--force", cwd=folder).code == 0
+    assert digests(folder)["morphology.json"] != before["morphology.json"]
+    assert resumed(folder) == "mould, recording, contacts, calibration"
+    assert digests(folder)["morphology.json"] == before["morphology.json"]
+
+
+def test_an_interrupted_run_keeps_the_recording_of_the_one_before(folder: Path) -> None:
     """Whose mould and recording are of another pad than what was found so far, as the report then tells."""
-    folder = shutil.copytree(chain[0], tmp_path / "again")
     recording = folder / "out" / "pad" / "recording" / "readings.bin"
     before = recording.read_bytes()
     (folder / "long.toml").write_text(SMALL.replace("steps = 10", "steps = 1000000"))
     ended = threading.Event()
 
-    def interrupt():
+    def interrupt() -> None:
         while not any((folder / "out" / "pad" / "search").glob("start_*")):
             if ended.wait(0.05):
                 return
@@ -117,7 +189,7 @@ def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain, tmp_pat
 
     watch = threading.Thread(target=interrupt)
     watch.start()
-    result = called("run", "--spec", "long.toml", cwd=folder, limit_s=300)
+    result = called("run", "--spec", "long.toml", cwd=folder)
     ended.set()
     watch.join()
     assert result.code == 130, result.out + result.err
@@ -127,27 +199,64 @@ def test_an_interrupted_run_keeps_the_recording_of_the_one_before(chain, tmp_pat
     assert "fabrication (fabricate) is of another pad than the morphology.json here" in result.err
 
 
-def test_the_front_door_in_one_process(chain, tmp_path, monkeypatch, capsys):
-    """Settings, a page of what is there, and one line for what is not."""
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [("[rules]\nmin_gap_mm = 30\n", "min_gap_mm"), ("[printer]\nbed_mm = [30, 30, 30]\n", "bed")],
+)
+def test_a_run_that_breaks_a_rule_or_a_check_ends_in_exit_1(folder: Path, wrong: str, said: str) -> None:
+    (folder / "pad.toml").write_text(SMALL + wrong)
+    ended = called("run", "--resume", "--formats", "svg", cwd=folder)
+    assert ended.code == 1, ended
+    assert said in ended.out
 
-    def ends(*arguments):
-        monkeypatch.setattr(sys, "argv", ["padforge", *arguments])
-        with pytest.raises(SystemExit) as end:
-            front_door.main()
-        return end.value.code
 
-    monkeypatch.chdir(tmp_path)
-    assert ends("init") == 0
-    assert (tmp_path / "pad.toml").read_text(encoding="utf-8").count("[") >= 8
-    capsys.readouterr()
-    assert ends("init") == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    shutil.copytree(chain[0] / "out" / "pad", tmp_path / "pad")
-    page = tmp_path / "pad" / "report.html"
+@pytest.mark.slow
+def test_a_time_budget_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search and a training of hours end in time, and what they left is finished."""
+    (tmp_path / "pad.toml").write_text(
+        SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
+    )
+    run, given = sense.cli.calibration.run_calibration, []
+
+    def noted(*arguments, **more):
+        given.append(arguments[-1])
+        return run(*arguments, **more)
+
+    monkeypatch.setattr(sense.cli.calibration, "run_calibration", noted)
+    begin = time.monotonic()
+    words = ("run", "--time-budget", "16", "--formats", "stl,svg")
+    ended = called(*words, cwd=tmp_path)
+    assert ended.code in (0, 1), ended
+    assert time.monotonic() - begin < 45
+    assert "(out of time: the best so far)" in ended.out
+    assert len(given) == 1
+    assert 0 <= given[0] < 8
+    again = called(*words, "--resume", cwd=tmp_path)
+    assert f"made it: {ALL}" in again.err, again
+
+
+@pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/1"}', '{"format": "padforge-run/1", "stages": 3}'])
+def test_a_note_that_is_none_of_padforge_is_named(folder: Path, content: str) -> None:
+    (folder / "out" / "pad" / "run.json").write_text(content)
+    assert "run.json: " in refused("run", "--resume", cwd=folder)
+
+
+def test_a_report_made_again_is_the_same(folder: Path) -> None:
+    page = folder / "out" / "pad" / "report.html"
     pages = []
     for _ in range(2):
         page.unlink()
-        assert ends("report", "pad") == 0
-        pages.append(hashlib.sha256(page.read_bytes()).hexdigest())
+        assert called("report", cwd=folder).code == 0
+        pages.append(page.read_bytes())
     assert pages[0] == pages[1]
-    assert ">Calibration</h2>" in page.read_text(encoding="utf-8")
+    assert b">Calibration</h2>" in pages[0]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
+def test_a_pipe_in_place_of_a_result_is_not_waited_for(folder: Path) -> None:
+    (folder / "out" / "pad" / "mould.stl").unlink()
+    os.mkfifo(folder / "out" / "pad" / "mould.stl")
+    shutil.rmtree(folder / "out" / "pad" / "recording")
+    ended = called("run", "--resume", cwd=folder)
+    assert (ended.code, ended.err.count("\n")) == (2, 1), ended
+    assert "mould.stl: " in ended.err

@@ -1,22 +1,25 @@
 """Hostile inputs: command lines, files and calls with something wrong, each in a process of its own, under limits.
 
-`python -m tools.hostile_inputs FOLDER ROUNDS SEED [FIRST]` makes good files in FOLDER, which is new, and tries
-so many inputs, from number FIRST on. Each must end in results, or in one line with nothing changed: no traceback, no
-file torn or left over, at most 1 GiB of memory and 10 s of computing. Told are counts by kind and outcome, the most
-memory and time, and every violation with the number of its input; with FIRST that number, one round repeats it. The
-files of such an input are kept in FOLDER/violation-NUMBER. It refuses to run as root.
+`python -m tools.hostile_inputs FOLDER SECONDS [SEED [NUMBER]]` makes good files in FOLDER, which is new, and tries
+inputs for so long, or the one of NUMBER again. Each must end in results, or in one line with nothing changed: no
+traceback, no file torn or left over, at most 1 GiB of memory and 10 s of computing. Told are counts by kind and
+outcome, the most memory and time, and every violation with the number of its input, whose files are kept in
+FOLDER/violation-NUMBER. It refuses to run as root.
 """
 
 import gc
 import os
+import secrets
 import shlex
 import shutil
 import sys
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import chdir
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -178,32 +181,36 @@ def _no_files(folder: str, names: list[str]) -> set[str]:
     return {*names} - {name for name in copied if paths[name].is_symlink() or os.access(paths[name], os.R_OK)}
 
 
-def main(where: Path, rounds: int, seed: int, first: int = 0) -> int:
-    """Try so many inputs and tell of them; how many had an end that may not be."""
+def main(where: Path, seconds: float, seed: int, first: int | None = None) -> int:
+    """Try inputs for so long, or the one of number `first`, and tell of them; how many had an end that may not be."""
     if os.geteuid() == 0:
         sys.exit(
             "hostile inputs name devices and files of others: run this as a user who may harm nothing, not as root"
         )
+    print(f"hostile inputs for {seconds:g} s, seed {seed}", flush=True)
     os.environ |= {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
     for name in LIBRARIES:
         import_module(name)
     where.mkdir(parents=True)
     campaign, failed = Campaign(where, seed), 0
-    for number in range(first, first + rounds):
+    end = time.monotonic() + seconds
+    for number in count(first or 0):
         found = campaign.round(number)
         failed += bool(found)
         for line in found:
             print(line, flush=True)
-        if (number + 1 - first) % 500 == 0:
-            print(f"{number + 1 - first} inputs, {failed} violations", flush=True)
+        if first is not None or time.monotonic() > end:
+            break
     for kind, tally in sorted(campaign.tallies.items()):
         print(f"{kind:<28} {tally}")
     fresh_mib = max(campaign.fresh, default=0) / MIB
     print(f"{len(campaign.fresh)} of them in a process that began with nothing: at most {fresh_mib:.0f} MiB")
-    print(f"{rounds} inputs, {failed} violations")
+    print(f"{number - (first or 0) + 1} inputs, {failed} violations")
     return failed
 
 
 if __name__ == "__main__":
     on_one_thread()
-    sys.exit(main(Path(sys.argv[1]).resolve(), *map(int, sys.argv[2:])) > 0)
+    where, seconds, *more = sys.argv[1:]
+    seed, *first = map(int, more or [secrets.randbelow(2**32)])
+    sys.exit(main(Path(where).resolve(), float(seconds), seed, *first) > 0)

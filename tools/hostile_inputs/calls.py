@@ -18,10 +18,9 @@ import sense
 from design import InputError
 from design.common.errors import Fault, shown
 from sense.health.health_model import DETECTED
-from tests.stress.sense.cases import TINY, spoiled
-from tests.stress.values import ODD
 
 from .texts import Rng, pick
+from .values import ODD, spoiled
 
 TRUSTED = {"sense.HealthModel.refuse_other", "sense.Finder.follow"}
 """They are handed what those who call them have checked."""
@@ -52,7 +51,7 @@ def sound() -> dict[str, Any]:
         "localizers": [sense.Localizer.load(Path("pad"))],
         "model": sense.HealthModel.load(Path("pad")),
         "health": sense.HealthModel.load(Path("pad"), DETECTED),
-        "options": TINY,
+        "options": sense.LocalizerSettings(members=1, hidden=8, layers=1, epochs=2, batch=64, lost=2),
         "rig": sense.RigSettings(presses=4, readings_per_press=8),
         "readings": recording.readings,
         "times_s": recording.times_s,

@@ -8,9 +8,9 @@ from itertools import chain
 import click
 
 from padforge.commands import cli
-from tests.stress.door import HOSTILE, PATHS
 
 from .texts import Rng, pick
+from .values import HOSTILE, PATHS
 from .workplace import BAG, LAB, LAB_H5
 
 FOLDERS = ("new", "pad", "new/deep", "empty")

@@ -5,8 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.stress.door import require_whole_file
-
+from .files import require_whole_file
 from .limited import MIB, Ended
 
 MOST_MEMORY, MOST_CPU_S = 1024 * MIB, 10.0

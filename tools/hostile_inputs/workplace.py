@@ -11,10 +11,11 @@ import h5py
 import numpy as np
 import scipy.io
 
+from tests.helpers.door import Ended, call, contents
 from tests.sense.recordings.formats.ros.foreign import array, pose, write_bag
-from tests.stress.damage import published
-from tests.stress.door import CHEAP, SPECIAL, Ended, call, contents, fill
 from tools.kills import killed
+
+from .files import CHEAP, SPECIAL, fill, published
 
 LAB = "time=time_s,fibres=fibre*,x=x_mm,y=y_mm"
 """How a table of another program is named, `lab.csv`."""
@@ -87,7 +88,7 @@ def _is_folder(path: Path) -> bool:
 
 
 def _made(*words: str) -> Ended:
-    ended = call(*words, limit_s=600)
+    ended = call(*words)
     assert ended.code in (0, 1), ended
     return ended
 
@@ -130,6 +131,6 @@ def _leave_unfinished(words: Iterable[str], folder: Path, state: str) -> None:
     for number in count():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
-        assert killed(lambda: call(*words, limit_s=600), number, folder), f"{words} keep no {state}"
+        assert killed(lambda: call(*words), number, folder), f"{words} keep no {state}"
         if list(folder.rglob(state)):
             return

@@ -12,7 +12,7 @@ import trimesh
 
 from fabricate.report.mould_view import Packed, packed
 from padforge import write_report
-from tests.helpers.chromium import CHROMIUM, SOFTWARE_GL, Chromium
+from tests.helpers.chromium import SOFTWARE_GL, Chromium
 
 
 def unpacked(text: str) -> tuple[np.ndarray, np.ndarray]:
@@ -66,8 +66,6 @@ def volume(mesh: Packed) -> float:
 
 @pytest.fixture
 def chromium(tmp_path: Path) -> Iterator[Chromium]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
     with Chromium(tmp_path / "profile", *SOFTWARE_GL) as chromium:
         yield chromium
 
@@ -77,6 +75,7 @@ def changed(one: np.ndarray, other: np.ndarray) -> float:
     return float((np.abs(one - other).max(axis=-1) > 20).mean())
 
 
+@pytest.mark.slow
 def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) -> None:
     chromium.open(page.as_uri())
     assert chromium.ask("document.getElementById('mould-view').hidden") is False
@@ -134,9 +133,8 @@ def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) 
     assert len(np.unique(chromium.picture("canvas").reshape(-1, 3), axis=0)) > 100
 
 
+@pytest.mark.slow
 def test_without_webgl_the_picture_stands_there(tmp_path: Path, page: Path) -> None:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
     with Chromium(tmp_path / "profile", "--disable-gpu", "--disable-3d-apis") as chromium:
         chromium.open(page.as_uri())
         assert chromium.ask("document.getElementById('mould-view').hidden") is True
