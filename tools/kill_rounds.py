@@ -1,9 +1,9 @@
 """Kills commands again and again, at random moments or between file operations, and looks at what they leave.
 
-`python -m tools.kill_rounds FOLDER SECONDS [SEED [COMMAND]...]` makes pads in FOLDER, which is new, kills three commands
-that the seed draws, or those that are named, in turn for so long, and prints a line for each. A round begins with the
-results of an earlier run in place, or with none, kills the command that replaces them, and runs it again: files that
-belong together must be all old or all new, the second run must end well, and nothing else must be left.
+`python -m tools.kill_rounds FOLDER SECONDS [SEED [COMMAND]...]` makes pads in FOLDER, which is new, kills three of the
+commands, which the seed draws, or those that are named, in turn for so long, and prints a line for each. A round begins
+with the results of an earlier run in place, or with none, kills the command that replaces them, and runs it again:
+files that belong together must be all old or all new, the second run must end well, and nothing else must be left.
 """
 
 import os

@@ -102,7 +102,7 @@ def _fill_more() -> None:
     _made("sense", "record", *planned, "--spec", "long.toml", "--out", "long")
     _made("sense", "identify", "long", *planned, "--out", "pad")
     _made("sense", "fibre-loss", "pad/recording", "--model", "pad", "--lost", "1", "--out", "pad")
-    _made("sense", "calibrate", "long", "--out", "pad")
+    _made("sense", "calibrate", "long", "--out", "pad", "--force")
     _made("sense", "learning-curve", "long", "--out", "pad")
     _made("sense", "recalibrate", "--model", "pad", "pad/recording", "--out", "again")
     _made("sense", "export", "pad/recording", "presses.mcap")
