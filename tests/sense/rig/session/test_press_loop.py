@@ -117,10 +117,11 @@ def test_a_pose_above_the_pad_is_as_safe_as_the_press_below_it():
 
 def test_a_steered_plan_is_checked_before_its_next_press(tmp_path):
     arm, converter, options = rig()
-    astray = PressPlan(PLAN.places_mm + [0, 150], PLAN.depths_mm)
-    with recorder(tmp_path / "run") as keep, pytest.raises(RigFault, match="y -250 mm"):
+    astray = PressPlan(PLAN.places_mm + 150.0, PLAN.depths_mm)
+    with recorder(tmp_path / "run") as keep:
         session = Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep)
-        session.run(PLAN, steer=lambda plan, press: astray if press == 1 else plan)
+        with pytest.raises(RigFault, match="x 150 mm"):
+            session.run(PLAN, steer=lambda plan, press: astray if press == 1 else plan)
     assert len(arm.moves) == 3  # of the press before
 
 

@@ -138,4 +138,3 @@ def test_too_much_force_is_seen_at_once_and_taken_off_however_slow_the_disk(
     assert rows[-1, 7] == 0
     assert (rows[-3:, 1:4] == (0, -400, 60)).all()
     robots.free()
-

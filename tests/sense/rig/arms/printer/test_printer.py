@@ -242,9 +242,9 @@ def test_what_is_silent_and_what_never_falls_silent_is_no_printer():
         link.begin(2.0)
         printer.busy(60)
         fault_of(lambda: link.ask("M114", 0.3), "stale", r"not answered for 0\.3 s; it may be busy")
-    with EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4)) as board:
-        with link_to(board.port) as link:
-            assert fault_of(lambda: link.begin(0.5), "refused", "no printer answers") < 5
+    board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4))
+    with board, link_to(board.port) as link:
+        assert fault_of(lambda: link.begin(0.5), "refused", "no printer answers") < 5
 
 
 def test_a_board_that_restarts_as_its_port_is_opened_does_so_once():

@@ -2,6 +2,9 @@
 
 import importlib.util
 import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +32,7 @@ from tests.sense.rig.arms.ur5.arms import (
 )
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
-BOTH = pytest.mark.parametrize("series", ["cb3", "e"], scope="module")
+BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
 
 
 @BOTH
@@ -95,51 +98,57 @@ def test_one_move_at_a_time(robot: UrEmulator, arm: UR5) -> None:
     arm.stop()
 
 
-def test_arms_that_cannot_be_had(robots: Robots, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure: Callable[[], object]) -> None:
+    spoil()
+    assert fault_of(arm.connect, seconds=1.5) == cause
+    cure()
+
+
+def test_arms_that_cannot_be_had(robots: Robots, host: str) -> None:
     robots.free()
-    arm = UR5(host)
-    assert fault_of(arm.connect) == "refused"
-    assert fault_of(arm.state) == "lost"
-    arm.stop()
-    robot = robots.get("e")
-    for spoil, cause, cure in (
-        (lambda: robot.remote_control(False), "refused", lambda: robot.remote_control(True)),
-        (lambda: robot.refuse(True), "refused", lambda: robot.refuse(False)),
-        (robot.protective_stop, "protective_stop", robot.clear),
-        (robot.emergency_stop, "emergency_stop", robot.clear),
-        (lambda: robot.unplug(True), "refused", lambda: robot.unplug(False)),
-    ):
-        spoil()
-        assert fault_of(arm.connect) == cause
-        cure()
-    robot.slow(0.5)
-    monkeypatch.setattr(ur5, "CONNECT_S", 1.0)
-    assert fault_of(arm.connect, seconds=1.5) == "deadline"
-    robot.slow(0)
-    arm.connect()
-    arm.close()
+    with closing(UR5(host)) as arm:
+        assert fault_of(arm.connect) == "refused"
+        assert fault_of(arm.state) == "lost"
+        arm.stop()
+        robot = robots.get("e")
+        refused_until_cured(arm, lambda: robot.remote_control(False), "refused", lambda: robot.remote_control(True))
+        refused_until_cured(arm, robot.protective_stop, "protective_stop", robot.clear)
+        refused_until_cured(arm, robot.emergency_stop, "emergency_stop", robot.clear)
+        arm.connect()
 
 
-def test_the_tip_is_told_as_it_is_installed(robots: Robots, host: str) -> None:
-    robots.get("cb3", tcp_mm=(0.0, 1.5, 150.0))
-    assert robots.connected(host).connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
-    robots.free()
+@pytest.mark.slow
+def test_arms_that_do_not_answer_are_not_waited_for(robot: UrEmulator, host: str, monkeypatch) -> None:
+    with closing(UR5(host)) as arm:
+        refused_until_cured(arm, lambda: robot.refuse(True), "refused", lambda: robot.refuse(False))
+        refused_until_cured(arm, lambda: robot.unplug(True), "refused", lambda: robot.unplug(False))
+        monkeypatch.setattr(ur5, "CONNECT_S", 1.0)
+        refused_until_cured(arm, lambda: robot.slow(0.5), "deadline", lambda: robot.slow(0))
+        arm.connect()
 
 
-def test_an_arm_at_work_is_taken_over_by_nobody(
-    robot: UrEmulator, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_arm_at_work_is_not_taken_over_by_a_program_on_this_computer(
+    robot: UrEmulator, arm: UR5, address: str
 ) -> None:
-    """Neither on this computer nor from another one, nor by `doctor`; the move that is under way goes on."""
+    """Nor looked over by `doctor`; the move that is under way goes on."""
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    second = UR5(address)
-    (found,) = examine_arm(second, RigSettings(), time.monotonic, time.sleep)
+    (found,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
     assert found.status == "fail"
     assert "another program on this computer uses the arm" in found.found
     assert arm.state().moving
+    arm.stop()
+
+
+@pytest.mark.slow
+def test_an_arm_at_work_is_not_taken_over_from_another_computer(
+    robot: UrEmulator, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go(arm, HOME)
+    arm.move(LOW, 50, 500)
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # where the child locks: as if it ran on another computer
     with pytest.raises(RigFault, match="a program runs on the arm"):
-        second.connect()
+        UR5(address).connect()
     assert arm.state().moving
     assert wait_until_still(arm, LIMITS).pose == pytest.approx(LOW, abs=0.1)
     go(arm, HOME)
@@ -151,29 +160,22 @@ def test_without_ur_rtde(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
         UR5(host).connect()
 
 
-def test_force_is_felt_and_limited(robots: Robots, host: str) -> None:
-    robots.get("e", surface_mm=100, stiffness_n_mm=2.0)
-    arm = UR5(host)
-    arm.connect()
-    assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
-    arm.move(LOW, 50, 500)
-    assert fault_of(wait_until_still, arm, LIMITS) == "force"
-    state = arm.state()
-    assert not state.moving
-    assert 50 < (state.force_n or 0) < 60
-    arm.close()
-    robots.free()
-
-
-def test_what_pushes_the_tool_sideways_stops_it_too(robots: Robots, host: str) -> None:
-    robot = robots.get("e", surface_mm=100)
-    arm = UR5(host)
-    arm.connect()
-    arm.move((HOME[0] + 80, *HOME[1:]), 40, 500)
-    robot.push(60.0)
-    assert fault_of(wait_until_still, arm, LIMITS) == "force"
-    state = arm.state()
-    assert state.pose[0] < HOME[0] + 40
-    assert (state.force_n, state.sideways_n) == (0, 60)
-    arm.close()
+def test_force_from_below_and_from_the_side_is_felt_and_limited_and_the_tip_told(robots: Robots, host: str) -> None:
+    robot = robots.get("e", surface_mm=100, stiffness_n_mm=2.0, tcp_mm=(0.0, 1.5, 150.0))
+    with closing(UR5(host)) as arm:
+        assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
+        assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
+        arm.move(LOW, 50, 500)
+        assert fault_of(wait_until_still, arm, LIMITS) == "force"
+        state = arm.state()
+        assert not state.moving
+        assert 50 < (state.force_n or 0) < 60
+        arm.move(HOME, 1000, 20_000)
+        wait_until_still(arm, replace(LIMITS, max_force_n=None))
+        arm.move((HOME[0] + 80, *HOME[1:]), 40, 500)
+        robot.push(60.0)
+        assert fault_of(wait_until_still, arm, LIMITS) == "force"
+        state = arm.state()
+        assert state.pose[0] < HOME[0] + 40
+        assert (state.force_n, state.sideways_n) == (0, 60)
     robots.free()

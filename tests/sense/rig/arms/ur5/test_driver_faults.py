@@ -50,13 +50,15 @@ FAULTS: dict[str, tuple[Callable[[UrEmulator], object], str, float, Callable[[Ur
     "slow": (lambda robot: robot.slow(1.0), "lost", 3.0, lambda robot: robot.slow(0.0)),
 }
 
+QUICK = ("protective stop", "stream frozen")
+
 
 @pytest.mark.parametrize(
     ("series", "name"),
     [
-        ("e", "protective stop"),
-        *(pytest.param("e", name, marks=pytest.mark.slow) for name in ("links closed", "stream frozen")),
-        *(("cb3", name) for name in FAULTS),
+        *(("cb3", name) for name in QUICK),
+        *(pytest.param("cb3", name, marks=pytest.mark.slow) for name in FAULTS if name not in QUICK),
+        *(pytest.param("e", name, marks=pytest.mark.slow) for name in (*QUICK, "links closed")),
     ],
 )
 def test_faults_during_a_move(robot: UrEmulator, arm: UR5, name: str) -> None:
@@ -76,6 +78,7 @@ def test_faults_during_a_move(robot: UrEmulator, arm: UR5, name: str) -> None:
     go(arm, (x, y, z + 1, *HOME[3:]))
 
 
+@pytest.mark.slow
 def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> None:
     begin(arm)
     robot.refuse(True)
@@ -90,7 +93,7 @@ def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> No
     arm.connect()
 
 
-@pytest.mark.parametrize("name", ["SIGKILL", "SIGSTOP"])
+@pytest.mark.parametrize("name", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
 def test_the_child_dies_or_hangs(robot: UrEmulator, arm: UR5, name: str) -> None:
     begin(arm)
     begun = time.monotonic()
@@ -118,7 +121,12 @@ while True:
 
 
 @pytest.mark.parametrize(
-    ("series", "name"), [("cb3", "SIGKILL"), ("cb3", "SIGSTOP"), pytest.param("e", "SIGKILL", marks=pytest.mark.slow)]
+    ("series", "name"),
+    [
+        ("cb3", "SIGKILL"),
+        pytest.param("cb3", "SIGSTOP", marks=pytest.mark.slow),
+        pytest.param("e", "SIGKILL", marks=pytest.mark.slow),
+    ],
 )
 def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)
@@ -134,6 +142,7 @@ def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str
     assert begun < rested_s(robot) < begun + REST_S
 
 
+@pytest.mark.slow
 def test_a_program_that_does_not_look(robot: UrEmulator, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5_link, "LOOK_S", 0.4)
     go(arm, HOME)
@@ -144,6 +153,7 @@ def test_a_program_that_does_not_look(robot: UrEmulator, arm: UR5, monkeypatch: 
     assert fault_of(arm.state) == "deadline"
 
 
+@pytest.mark.slow
 def test_the_script_link_is_not_missed(robot: UrEmulator, arm: UR5) -> None:
     begin(arm)
     robot.drop("script")
