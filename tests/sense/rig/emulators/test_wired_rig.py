@@ -1,5 +1,9 @@
-"""Whole emulated rigs whose fibres are wired to the board in any order, and one whose board speaks in lines."""
+"""Whole emulated rigs wired in any order, one whose board speaks in lines, and one whose recorder is killed."""
 
+import random
+import socket
+import subprocess
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -10,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import padforge
 from design import Morphology
 from design.common.errors import InputError
 from design.settings import PUBLISHED_CONTACT
+from sense.recordings.press_journal import read_journal
 from sense.recordings.press_plan import planned
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
 from sense.recordings.simulation.pad_model import LivePad
+from sense.rig.arms.ur5.rtde_frames import RTDE_PORT
 from sense.rig.boards import block_reader
 from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators.line_board import EmulatedLineBoard
@@ -61,17 +68,14 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
     assert np.unique(volts).size > grid
 
 
-@pytest.mark.parametrize(("board", "grid"), [("due", 7), ("crane", 2)])
-def test_a_board_with_too_few_inputs_and_one_that_is_not_emulated_are_refused(board: str, grid: int) -> None:
+@pytest.mark.parametrize(
+    ("board", "grid", "said"),
+    [("due", 7, "fibre 13 is on input 12, an Arduino Due has 0 to 11"), ("crane", 2, "emulated are due and line")],
+)
+def test_a_board_with_too_few_inputs_and_one_that_is_not_emulated_are_refused(board: str, grid: int, said: str) -> None:
     pad = Morphology.straight(grid)
     rig = emulated_rig(RigSettings(board=board), pad)
-    with (
-        pytest.raises(
-            (InputError, RigFault),
-            match=r"fibre 13 is on input 12, an Arduino Due has 0 to 11|emulated are due and line",
-        ),
-        emulated(pad, PUBLISHED_CONTACT, rig),
-    ):
+    with pytest.raises((InputError, RigFault), match=said), emulated(pad, PUBLISHED_CONTACT, rig):
         pass
 
 
@@ -138,9 +142,8 @@ FAULTS: dict[str, tuple[str, Callable[[LineRig], object], Callable[[LineRig], ob
 """How a board fails: what is told, how it is made to, and what helps."""
 
 
-@pytest.mark.parametrize(
-    "names", [("reset", "unplug"), pytest.param(("other columns", "stall"), marks=pytest.mark.slow)], ids=" ".join
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("reset", "unplug"), ("other columns", "stall")], ids=" ".join)
 def test_a_line_board_that_fails_among_damaged_lines_loses_no_press_and_gives_no_wrong_reading(
     rig: LineRig, tmp_path: Path, names: tuple[str, ...]
 ) -> None:
@@ -204,3 +207,64 @@ def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkey
     assert found["channel 2"].found.startswith("input 3 rests at")
     assert "channel 3" not in found
     assert found["board"].found.startswith("name emulated, serial 0, channels 2, inputs [14, 3]")
+
+
+SETTINGS = """[pad]
+grid = 2
+[rig]
+rate_hz = 125.0
+readings_per_press = 20
+clearance_mm = 5
+travel_mm_s = 500
+press_mm_s = 250
+acceleration_mm_s2 = 3000
+"""
+PROGRAM = """
+import sys
+from sense.rig.emulators import whole_rig
+whole_rig.HOST = sys.argv.pop(1)
+import padforge
+padforge.main()
+"""
+
+
+def await_the_end_of_its_arm(address: str) -> None:
+    """The emulated arm ends as soon as it finds that its program has."""
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        try:
+            socket.create_connection((address, RTDE_PORT), 1.0).close()
+        except ConnectionRefusedError:
+            return
+        except ConnectionResetError:  # it ends at this moment
+            pass
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
+    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[4]))
+    Path("pad.toml").write_text(SETTINGS, encoding="utf-8")
+    words = ["sense", "record", "--through-drivers", "--presses", "7", "--out", "run", "--resume"]
+    journal, kept, rng = Path("run", "journal.ndjson"), set(), random.Random(0)
+    for _ in range(2):
+        process = subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
+        end = time.monotonic() + 60
+        while not (journal.exists() and len(read_journal(journal)) >= len(kept) + 2):
+            assert process.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        time.sleep(rng.uniform(0, 0.3))
+        process.kill()
+        process.wait()
+        assert set(read_journal(journal)) >= kept
+        kept = set(read_journal(journal))
+        await_the_end_of_its_arm(address)
+    monkeypatch.setattr(sys, "argv", ["padforge", *words])
+    with pytest.raises(SystemExit) as done:
+        padforge.main()
+    assert not done.value.code
+    assert len(Recording.open(Path("run")).presses_mm) == 7
