@@ -2,9 +2,13 @@
 
 import json
 import os
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,16 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+import padforge
 from design import Morphology
+from design.common.errors import InputError
 from design.settings import PUBLISHED_CONTACT
 from sense.recordings.press_journal import read_journal
 from sense.recordings.press_plan import PressPlan, planned
 from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
+from sense.recordings.simulation.pad_model import LivePad
+from sense.rig.arms.ur5.rtde_frames import RTDE_PORT
 from sense.rig.boards import block_reader
 from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators import whole_rig
 from sense.rig.emulators.printer.emulator import EmulatedPrinter
+from sense.rig.operation import look_over, record
+from sense.rig.planning.setup import Setup
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
 from sense.rig.session.retreat import HEIGHT_MM
@@ -38,24 +48,11 @@ PAD = Morphology.straight(2)
 QUIET = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
 NIMBLE = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.0)}
 """A printer whose z axis is as quick as the others."""
-ARM = whole_rig.emulated_rig(
-    RigSettings.model_validate(
-        {
-            **{"presses": 6, "rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5},
-            **{"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000, **QUIET},
-        }
-    ),
-    PAD,
-)
-PRINTER = whole_rig.emulated_printer_rig(
-    RigSettings.model_validate(
-        {
-            **{"presses": 6, "rate_hz": 50, "readings_per_press": 30, "clearance_mm": 2.0, "depth_mm": 3.0},
-            **{"travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 3000, **QUIET},
-        }
-    ),
-    PAD,
-)
+QUICK = {"rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5}
+QUICK |= {"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000}
+SLOWER = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 2.0, "depth_mm": 3.0, "press_mm_s": 100}
+ARM = whole_rig.emulated_rig(RigSettings.model_validate(QUICK | QUIET), PAD)
+PRINTER = whole_rig.emulated_printer_rig(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
 
 
 class Rig:
@@ -123,9 +120,16 @@ def quick() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def arm(own_address: None) -> Iterator[Rig]:
+@pytest.fixture
+def arm() -> Iterator[Rig]:
     rig = Rig(ARM, whole_rig.emulated)
+    with rig.kept:
+        yield rig
+
+
+@pytest.fixture
+def line() -> Iterator[Rig]:
+    rig = Rig(ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), whole_rig.emulated)
     with rig.kept:
         yield rig
 
@@ -183,18 +187,6 @@ def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(printer: 
     assert np.column_stack([places, depths])[depths > 0] == pytest.approx(presses, abs=0.06)
 
 
-@pytest.mark.slow
-def test_damaged_bytes_cost_samples_but_never_give_wrong_ones(arm: Rig, tmp_path: Path) -> None:
-    plan = arm.plan(4)
-    arm.record(tmp_path / "run", plan, lambda done, of: arm.board.garble(1e-3) if done else None)
-    arm.board.garble(0)
-    assert arm.converter.statistics()["damaged"] > 3
-    recording = Recording.open(tmp_path / "run")
-    assert len(recording.presses_mm) == len(plan)
-    rest = np.median(recording.readings, axis=0)
-    assert np.abs(recording.readings - rest).max() < 0.6
-
-
 class Fault(NamedTuple):
     """How a rig is disturbed, what a person then reads, and what helps."""
 
@@ -211,29 +203,32 @@ FAULTS = {
     "restart": Fault(lambda rig: rig.robot.restart(0.4), "lost", lambda rig: time.sleep(0.3)),
     "stall": Fault(lambda rig: rig.board.stall(), "stale", lambda rig: rig.board.stall(False)),
     "unplug": Fault(lambda rig: rig.board.unplug(), "lost", Rig.anew),
-    "printer halts": Fault(lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
-    "printer busy": Fault(lambda rig: rig.robot.busy(10), "stale", Rig.home),
-    "printer restarts": Fault(lambda rig: rig.robot.restart(), "lost", Rig.home),
-    "printer unplugged": Fault(lambda rig: rig.robot.unplug(), "lost", Rig.anew),
+    "reset": Fault(lambda rig: rig.board.reset(), "data", lambda rig: None),
+    "columns": Fault(lambda rig: rig.board.send_columns(15), "data", lambda rig: rig.board.send_columns(16)),
+    "printer_halts": Fault(lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
+    "printer_busy": Fault(lambda rig: rig.robot.busy(10), "stale", Rig.home),
+    "printer_restarts": Fault(lambda rig: rig.robot.restart(), "lost", Rig.home),
+    "printer_unplugged": Fault(lambda rig: rig.robot.unplug(), "lost", Rig.anew),
 }
 
 
 @pytest.mark.parametrize(
     ("kind", "presses", "names"),
     [
-        ("arm", 2, ("protective",)),
-        ("printer", 2, ("printer halts",)),
-        pytest.param("arm", 6, ("drop", "freeze", "stall", "unplug", "emergency", "restart"), marks=pytest.mark.slow),
-        pytest.param("printer", 8, ("printer busy", "printer restarts", "printer unplugged"), marks=pytest.mark.slow),
+        ("arm", 2, "protective"),
+        ("printer", 2, "printer_halts"),
+        pytest.param("arm", 8, "drop freeze stall unplug emergency restart", marks=pytest.mark.slow),
+        pytest.param("line", 6, "reset columns stall unplug", marks=pytest.mark.slow),
+        pytest.param("printer", 8, "printer_busy printer_restarts printer_unplugged", marks=pytest.mark.slow),
     ],
 )
 def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(
-    kind: str, presses: int, names: tuple[str, ...], request: pytest.FixtureRequest, tmp_path: Path
+    kind: str, presses: int, names: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    """One after the other in one recording, which is resumed after each."""
+    """One after the other in one recording, which is resumed after each, at last with bytes of the board damaged."""
     rig, run = request.getfixturevalue(kind), tmp_path / "run"
     plan = rig.plan(presses)
-    for press, name in enumerate(names, start=1):
+    for press, name in enumerate(names.split(), start=1):
         disturb, cause, cure = FAULTS[name]
         fault, told_s = rig.disturbed(run, plan, disturb)
         assert fault.cause == cause, name
@@ -242,8 +237,10 @@ def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(
         assert rig.rests(), name
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
-    rig.record(run, plan)
+    rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
     assert_whole(run, plan)
+    readings = Recording.open(run).readings
+    assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong one would stand out
 
 
 @pytest.mark.slow
@@ -252,3 +249,108 @@ def test_a_fault_of_the_board_stops_and_lifts_the_probe(printer: Rig, tmp_path: 
     assert fault.cause == "lost"
     tip = printer.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
     assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + HEIGHT_MM, abs=0.05)
+
+
+@pytest.mark.parametrize(("board", "grid"), [("due", 6), ("line", 8)])
+def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: int) -> None:
+    """As many as the board has inputs, and not in its order."""
+    pad = Morphology.straight(grid)
+    channels = np.random.default_rng(1).permutation(2 * grid).tolist()
+    rig = whole_rig.emulated_rig(RigSettings.model_validate({"board": board, "channels": channels, **QUIET}), pad)
+    with whole_rig.emulated(pad, PUBLISHED_CONTACT, rig) as (_, converter, _, _):
+        said = converter.connect()
+        assert said["inputs"] == list(rig.channels)
+        volts = np.median(converter.read().volts, axis=0)
+    still = LivePad(pad, PUBLISHED_CONTACT, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
+    rests_v = still.volts(np.zeros((1, 2)), np.full(1, -10.0))[0]
+    assert volts == pytest.approx(rests_v, abs=3.3 / 4095)
+    assert np.unique(volts).size > grid
+
+
+@pytest.mark.parametrize(
+    ("board", "grid", "said"),
+    [("due", 7, "fibre 13 is on input 12, an Arduino Due has 0 to 11"), ("crane", 2, "emulated are due and line")],
+)
+def test_a_board_with_too_few_inputs_and_one_that_is_not_emulated_are_refused(board: str, grid: int, said: str) -> None:
+    pad = Morphology.straight(grid)
+    rig = whole_rig.emulated_rig(RigSettings(board=board), pad)
+    with pytest.raises((InputError, RigFault), match=said), whole_rig.emulated(pad, PUBLISHED_CONTACT, rig):
+        pass
+
+
+EIGHT = Morphology.straight(8)
+LINE = RigSettings.model_validate({"board": "line", "presses": 1, **QUICK})
+
+
+def test_sixteen_fibres_are_recorded_and_their_wiring_is_kept(tmp_path: Path) -> None:
+    setup = Setup(EIGHT, PUBLISHED_CONTACT, LINE, tmp_path / "run", "test")
+    recording = record("simulated", setup)
+    assert recording is not None
+    assert recording.fibres == 16
+    assert recording.source["rig"]["channels"] == list(range(16))
+    turned = LINE.model_copy(update={"channels": tuple(range(16))[::-1]})
+    with pytest.raises(InputError, match=r"\[rig\] channels: got \[15, 14, .* was begun with \[0, 1, "):
+        record("simulated", replace(setup, rig=turned), resume=True)
+    with pytest.raises(InputError, match=r"was begun with another pad|\[rig\] channels"):
+        record("simulated", replace(setup, pad=Morphology.straight(6)), resume=True)
+
+
+def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sense.rig.diagnostics.LOOK_S", 0.3)
+    setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, LINE, tmp_path, "test")
+    found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
+    assert found["channel 1"].found.startswith("input 14 rests at")
+    assert found["channel 2"].found.startswith("input 3 rests at")
+    assert "channel 3" not in found
+    assert found["board"].found.startswith("name emulated, serial 0, channels 2, inputs [14, 3]")
+
+
+PROGRAM = """
+import sys
+from sense.rig.emulators import whole_rig
+whole_rig.HOST = sys.argv.pop(1)
+import padforge
+padforge.main()
+"""
+
+
+def await_the_end_of_its_arm(address: str) -> None:
+    """The emulated arm ends as soon as it finds that its program has."""
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        try:
+            socket.create_connection((address, RTDE_PORT), 1.0).close()
+        except ConnectionRefusedError:
+            return
+        except ConnectionResetError:  # it ends at this moment
+            pass
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
+    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[4]))
+    settings = "\n".join(f"{name} = {value}" for name, value in (QUICK | {"rate_hz": 125.0}).items())
+    Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{settings}\n", encoding="utf-8")
+    words = ["sense", "record", "--through-drivers", "--presses", "5", "--out", "run", "--resume"]
+    journal = Path("run", "journal.ndjson")
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 60
+    while not (journal.exists() and len(read_journal(journal)) >= 2):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    time.sleep(0.1)
+    process.kill()
+    process.wait()
+    kept = set(read_journal(journal))
+    await_the_end_of_its_arm(address)
+    monkeypatch.setattr(sys, "argv", ["padforge", *words])
+    with pytest.raises(SystemExit) as done:
+        padforge.main()
+    assert not done.value.code
+    assert len(Recording.open(Path("run")).presses_mm) == 5
+    assert set(read_journal(journal)) >= kept >= {0, 1}
