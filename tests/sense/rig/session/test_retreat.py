@@ -6,6 +6,7 @@ import threading
 import time as real_time
 from collections.abc import Callable
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from sense.rig.devices.protocols import RigFault
 from sense.rig.safety import Limits
 from sense.rig.session.press_loop import Session
 from sense.rig.session.retreat import FALL_S, HEIGHT_MM, SPEED_MM_S, retreat
-from tests.sense.rig.arms.ur5.arms import Robots
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 LIMITS = Limits.of(RIG)
@@ -103,7 +103,7 @@ def test_a_tool_above_the_pad_is_only_lifted_off_what_it_presses() -> None:
 @pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 @pytest.mark.parametrize("slow_s", [0.0, 1.0])
 def test_too_much_force_is_seen_at_once_and_taken_off_however_slow_the_disk(
-    robots: Robots, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float
+    robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float
 ) -> None:
     """20 N/mm at 10 mm/s: a tenth of a second without a look costs 20 N, and the disk would take half a press."""
     robot = robots.get("e", pose=(0.0, -400.0, 60.0, 0.0, np.pi, 0.0), surface_mm=50, stiffness_n_mm=20.0)

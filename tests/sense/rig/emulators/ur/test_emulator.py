@@ -1,6 +1,5 @@
 """The emulated arm on its sockets, the record of what it really did, and the real ur-rtde."""
 
-import collections
 import importlib.util
 import json
 import re
@@ -100,20 +99,6 @@ os._exit(0)
     np.testing.assert_allclose(below, START - [0, 0, 0.01, 0, 0, 0], atol=1e-4)
     assert 0.09 < speed[2] < 0.101
     assert not refused
-
-
-@pytest.mark.slow
-def test_a_restart_takes_its_time(address: str) -> None:
-    with UrEmulator(host=address) as robot:
-        reader = RtdeReader(address, 1.0)
-        robot.restart(0.3)
-        with pytest.raises(ConnectionError):
-            collections.deque(iter(lambda: reader.read(1.0), None))
-        with pytest.raises(ConnectionRefusedError):
-            RtdeReader(address, 1.0)
-        time.sleep(0.4)
-        RtdeReader(address, 1.0).close()
-        reader.close()
 
 
 LEFT = """
