@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
@@ -13,6 +13,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense.rig.boards import block_reader
+from sense.rig.boards.due import driver as due_driver
 from sense.rig.boards.due.driver import Arduino
 from sense.rig.boards.line import driver as line_driver
 from sense.rig.boards.line.driver import LineBoard
@@ -20,6 +21,7 @@ from sense.rig.boards.line.framing import Header
 from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.rig.emulators.due_board import EmulatedBoard
 from sense.rig.emulators.line_board import EmulatedLineBoard
+from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
@@ -69,21 +71,6 @@ def read_for(converter: Driver, seconds: float) -> ConverterSamples:
         time.sleep(0.02)
         parts.append(converter.read())
     return joined(*parts)
-
-
-def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> float:
-    """Call `action` until it raises the fault; returns how long that took."""
-
-    def repeat() -> None:
-        while time.monotonic() < begun + 10:
-            action()
-            time.sleep(0.01)
-
-    begun = time.monotonic()
-    with pytest.raises(RigFault, match=match) as caught:
-        repeat()
-    assert caught.value.cause == cause
-    return time.monotonic() - begun
 
 
 def check(
@@ -280,7 +267,8 @@ def test_lines_of_other_columns_are_never_taken_and_told() -> None:
 def test_a_board_that_is_not_ours_or_cannot_do_what_is_asked_is_refused(
     kind: str, board_is: dict, rate_hz: float, options: dict, match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(line_driver, "_ANSWER_S", 0.3)
+    for module in (due_driver, line_driver):
+        monkeypatch.setattr(module, "_ANSWER_S", 0.3)
     with emulated(kind, **board_is) as board:
         assert fault_of(driver(board, rate_hz, **options).connect, "refused", match) < 5
 

@@ -176,7 +176,7 @@ def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_
 
 
 def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(printer: Rig, tmp_path: Path) -> None:
-    plan = printer.plan(3)
+    plan = printer.plan(2)
     printer.record(tmp_path / "run", plan, lambda done, of: printer.robot.garble(1e-3))
     printer.robot.garble(0)
     assert_whole(tmp_path / "run", plan, 0.06)
@@ -216,10 +216,11 @@ FAULTS = {
     ("kind", "presses", "names"),
     [
         ("arm", 2, "protective"),
-        ("printer", 2, "printer_halts"),
         pytest.param("arm", 8, "drop freeze stall unplug emergency restart", marks=pytest.mark.slow),
         pytest.param("line", 6, "reset columns stall unplug", marks=pytest.mark.slow),
-        pytest.param("printer", 8, "printer_busy printer_restarts printer_unplugged", marks=pytest.mark.slow),
+        pytest.param(
+            "printer", 8, "printer_halts printer_busy printer_restarts printer_unplugged", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from typing import Any
 
@@ -19,6 +19,7 @@ from sense.rig.emulators.line_board import EmulatedLineBoard
 from sense.rig.emulators.printer import firmware
 from sense.rig.emulators.printer.emulator import EmulatedPrinter
 from sense.settings import RigSettings
+from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
@@ -48,21 +49,6 @@ def to_rest(arm: Printer) -> ArmState:
     while (state := arm.state()).moving:
         time.sleep(0.004)
     return state
-
-
-def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> float:
-    """Call `action` until it raises the fault; returns how long that took."""
-
-    def repeat() -> None:
-        while time.monotonic() < begun + 5:
-            action()
-            time.sleep(0.004)
-
-    begun = time.monotonic()
-    with pytest.raises(RigFault, match=match) as caught:
-        repeat()
-    assert caught.value.cause == cause
-    return time.monotonic() - begun
 
 
 def test_a_printer_says_who_it_is_and_where_its_tip_is():
@@ -233,8 +219,7 @@ def test_every_line_is_executed_once_and_in_its_turn_whatever_noise_there_is():
         assert np.array([made.move.end for made in printer.firmware.made[1:]]) == pytest.approx(ends)
 
 
-def test_what_is_silent_and_what_never_falls_silent_is_no_printer():
-    """As where the port is that of the board that reads the fibres."""
+def test_what_is_silent_is_no_printer():
     with EmulatedPrinter(AT) as printer, link_to(printer.port) as link:
         printer.busy(60)
         fault_of(lambda: link.begin(0.2), "refused", "no printer answers")
@@ -242,6 +227,11 @@ def test_what_is_silent_and_what_never_falls_silent_is_no_printer():
         link.begin(2.0)
         printer.busy(60)
         fault_of(lambda: link.ask("M114", 0.3), "stale", r"not answered for 0\.3 s; it may be busy")
+
+
+@pytest.mark.slow
+def test_what_never_falls_silent_is_no_printer():
+    """As where the port is that of the board that reads the fibres."""
     board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4))
     with board, link_to(board.port) as link:
         assert fault_of(lambda: link.begin(0.5), "refused", "no printer answers") < 5
