@@ -92,22 +92,10 @@ def test_an_arm_that_was_stopped_fails(kind):
     ("force_n", "settings", "name", "status", "words"),
     [
         (0.3, {"max_force_n": 60.0}, "force", "ok", "0.3 N, stopped beyond 60 N"),
-        (
-            None,
-            {"max_force_n": 60.0},
-            "force",
-            "fail",
-            'no force; [rig] max_force_n is 60, allowed is "unwatched',
-        ),
+        (None, {"max_force_n": 60.0}, "force", "fail", 'no force; [rig] max_force_n is 60, allowed is "unwatched'),
         (None, {"max_force_n": None}, "force", "warn", "no force stops the arm"),
         (0.0, {"tcp_mm": (0.0, 0.0, 150.05)}, "tcp", "ok", "150.05"),
-        (
-            0.0,
-            {"tcp_mm": None},
-            "tcp",
-            "fail",
-            "is unknown; allowed x, y and z of the tip as measured",
-        ),
+        (0.0, {"tcp_mm": None}, "tcp", "fail", "is unknown; allowed x, y and z of the tip as measured"),
         (0.0, {"tcp_mm": (0.0, 0.0, 149.0)}, "tcp", "fail", "149.0]; allowed what the controller says, [0.0, 0.0, 150"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Devices by their names, their ports, the inputs of boards, and processes that run padforge's own code."""
+"""Devices by their names, their ports, and processes that run padforge's own code."""
 
 import subprocess
 import sys
@@ -12,7 +12,6 @@ from design.common.errors import InputError
 from sense.rig.arms.ur5.driver import UR5
 from sense.rig.boards.due import serial_link as due_link
 from sense.rig.boards.due.driver import Arduino
-from sense.rig.boards.inputs import chosen_inputs
 from sense.rig.boards.line import driver as line_driver
 from sense.rig.devices import plugins
 from sense.rig.devices.plugins import device, device_names
@@ -103,14 +102,3 @@ def test_the_ports_of_a_due_are_found_native_first_and_that_of_a_line_board_wher
         line_driver.port_of(RigSettings())
     for port_of in (due_link.port_of, line_driver.port_of):
         assert port_of(RigSettings(port="COM3")) == "COM3"
-
-
-def test_inputs_are_those_that_are_named_or_all() -> None:
-    assert chosen_inputs((5, 0, 15), 16, "the board") == (5, 0, 15)
-    assert chosen_inputs((), 3, "the board") == (0, 1, 2)
-
-
-@pytest.mark.parametrize(("inputs", "fibre", "there"), [((0, 1, 2, 3), 4, 3), ((0, 3), 2, 3), ((-1, 3), 1, -1)])
-def test_an_input_that_is_not_there_is_named(inputs: tuple[int, ...], fibre: int, there: int) -> None:
-    with pytest.raises(RigFault, match=rf"\[rig\] channels: fibre {fibre} is on input {there}, the board has 0 to 2"):
-        chosen_inputs(inputs, 3, "the board")

@@ -208,6 +208,7 @@ FAULTS = {
     "printer_halts": Fault(lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
     "printer_busy": Fault(lambda rig: rig.robot.busy(10), "stale", Rig.home),
     "printer_restarts": Fault(lambda rig: rig.robot.restart(), "lost", Rig.home),
+    "board_of_printer": Fault(lambda rig: rig.board.unplug(), "lost", Rig.anew),
     "printer_unplugged": Fault(lambda rig: rig.robot.unplug(), "lost", Rig.anew),
 }
 
@@ -236,20 +237,15 @@ def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(
         assert "\n" not in str(fault)
         assert told_s < (2 if kind == "printer" else 5), name
         assert rig.rests(), name
+        if name == "board_of_printer":  # the probe is lifted
+            tip = rig.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
+            assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + HEIGHT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
     rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
     assert_whole(run, plan)
     readings = Recording.open(run).readings
     assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong one would stand out
-
-
-@pytest.mark.slow
-def test_a_fault_of_the_board_stops_and_lifts_the_probe(printer: Rig, tmp_path: Path) -> None:
-    fault, _ = printer.disturbed(tmp_path / "run", printer.plan(2), lambda rig: rig.board.unplug())
-    assert fault.cause == "lost"
-    tip = printer.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
-    assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + HEIGHT_MM, abs=0.05)
 
 
 @pytest.mark.parametrize(("board", "grid"), [("due", 6), ("line", 8)])
@@ -268,14 +264,9 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
     assert np.unique(volts).size > grid
 
 
-@pytest.mark.parametrize(
-    ("board", "grid", "said"),
-    [("due", 7, "fibre 13 is on input 12, an Arduino Due has 0 to 11"), ("crane", 2, "emulated are due and line")],
-)
-def test_a_board_with_too_few_inputs_and_one_that_is_not_emulated_are_refused(board: str, grid: int, said: str) -> None:
-    pad = Morphology.straight(grid)
-    rig = whole_rig.emulated_rig(RigSettings(board=board), pad)
-    with pytest.raises((InputError, RigFault), match=said), whole_rig.emulated(pad, PUBLISHED_CONTACT, rig):
+def test_a_board_that_is_not_emulated_is_refused() -> None:
+    rig = whole_rig.emulated_rig(RigSettings(board="crane"), PAD)
+    with pytest.raises(InputError, match="emulated are due and line"), whole_rig.emulated(PAD, PUBLISHED_CONTACT, rig):
         pass
 
 

@@ -15,7 +15,6 @@ from sense.recordings.recorder import Recorder
 from sense.recordings.recording import Recording
 from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.rig.session.averaging import Averager
-from sense.rig.session.disk_thread import DiskThread
 from sense.rig.session.press_loop import Session, require_safe_plan
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
@@ -348,30 +347,3 @@ def test_readings_are_means_of_whole_stretches_whatever_the_pieces(ratio, count,
     assert np.allclose(volts[:, 1], -np.array(expected))
     assert np.allclose(1000 * times, expected)
     assert averager.lost == sum(i <= last for i in lost)
-
-
-def test_the_disk_thread_does_all_in_order_while_the_caller_goes_on_and_nothing_after_a_failure():
-    def full():
-        raise OSError(28, "No space left on device")
-
-    go, done = threading.Event(), []
-    with DiskThread() as disk:
-        assert disk.idle()
-        disk.do(go.wait, 5)
-        for number in range(100):
-            disk.do(done.append, number)
-        assert not disk.idle(0.01)
-        assert done == []
-        go.set()
-        assert disk.idle(5)
-        assert done == list(range(100))
-        disk.do(time.sleep, 0.05)
-        disk.do(done.append, 100)  # the end of the thread waits for it
-    assert done[-1] == 100
-    with DiskThread() as disk:
-        disk.do(full)
-        disk.do(done.append, 101)
-        for _ in range(2):
-            with pytest.raises(OSError, match="No space"):
-                disk.idle(5)
-    assert done[-1] == 100
