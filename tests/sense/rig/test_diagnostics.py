@@ -19,8 +19,8 @@ class Rig:
     def spoil(self, channel, volts) -> None:
         read = self.converter.model.volts
 
-        def spoiled(places, depths):
-            values = read(places, depths)
+        def spoiled(places_mm, depths_mm):
+            values = read(places_mm, depths_mm)
             values[:, channel - 1] = volts(values[:, channel - 1])
             return values
 
@@ -99,10 +99,12 @@ def test_an_arm_that_was_stopped_fails(kind):
         (0.0, {"tcp_mm": (0.0, 0.0, 149.0)}, "tcp", "fail", "149.0]; allowed what the controller says, [0.0, 0.0, 150"),
     ],
 )
-def test_a_force_that_nobody_watches_and_a_tip_that_is_elsewhere_are_told(force_n, settings, name, status, words):
+def test_a_force_that_nobody_watches_and_a_tip_that_is_elsewhere_are_told(
+    monkeypatch, force_n, settings, name, status, words
+):
     rig = Rig()
     rig.arm.force_n = force_n
-    rig.arm.connect = lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
+    monkeypatch.setattr(rig.arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
     looked = rig.robot(**settings)[name]
     assert looked.status == status
     assert words in looked.found

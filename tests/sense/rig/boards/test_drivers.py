@@ -38,7 +38,7 @@ def waves(times_s: np.ndarray) -> np.ndarray:
     return 1.65 + 1.5 * np.sin(2 * np.pi * (0.7 + 0.1 * np.arange(16)) * times_s[:, None])
 
 
-def emulated(kind: str, header: Header = HEADER, **options: Any) -> Board:
+def emulated(kind: str, header: Any = HEADER, **options: Any) -> Board:
     return EmulatedBoard(waves, **options) if kind == "due" else EmulatedLineBoard(waves, header, **options)
 
 

@@ -274,7 +274,10 @@ def test_a_disk_that_hangs_is_a_fault(tmp_path):
     go_on = threading.Event()
     with recorder(tmp_path / "run") as keep:
         sync = keep.sync
-        keep.sync = lambda: (go_on.wait(20), sync())
+
+        def hangs():
+            go_on.wait(20)
+            sync()
 
         def hook(arm):
             if len(arm.moves) >= 3 and arm.pose[2] == 60:
@@ -283,7 +286,7 @@ def test_a_disk_that_hangs_is_a_fault(tmp_path):
             if arm.stops:
                 go_on.set()
 
-        arm.hook = hook
+        keep.sync, arm.hook = hangs, hook
         with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
             Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep).run(PLAN)
     assert fault.value.cause == "disk"
@@ -332,11 +335,11 @@ def test_depth_and_force_of_a_held_press_are_kept(tmp_path):
 @given(st.integers(1, 12), st.integers(1, 200), st.sets(st.integers(0, 199), max_size=60), st.data())
 def test_readings_are_means_of_whole_stretches_whatever_the_pieces(ratio, count, lost, data):
     kept = np.array([i for i in range(count) if i not in lost], dtype=np.int64)
-    columns = kept / 1000, np.column_stack([kept, -kept]).astype(float), np.diff(kept, prepend=-1) - 1
+    whole = kept / 1000, np.column_stack([kept, -kept]).astype(float), np.diff(kept, prepend=-1) - 1
     cuts = sorted(data.draw(st.lists(st.integers(0, len(kept)), max_size=6)))
     averager = Averager(ratio, 2)
     pieces = [
-        averager.feed(ConverterSamples(*(column[a:b] for column in columns)))
+        averager.feed(ConverterSamples(whole[0][a:b], whole[1][a:b], whole[2][a:b]))
         for a, b in zip([0, *cuts], [*cuts, len(kept)], strict=True)
     ]
     times, volts = (np.concatenate(column) for column in zip(*pieces, strict=True))
