@@ -110,7 +110,7 @@ SAYS: dict[str, dict[str, Any]] = {
 }
 
 
-@BOTH
+@pytest.mark.parametrize("kind", ["due", SLOW_LINE])
 def test_a_second_without_a_gap_right_to_a_step_and_on_time(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     board = emulated(kind, **SKEWED[kind])

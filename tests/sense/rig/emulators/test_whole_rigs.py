@@ -213,15 +213,13 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "presses", "names"),
     [
-        ("arm", 2, "protective"),
-        pytest.param("arm", 8, "drop freeze stall unplug emergency restart", marks=pytest.mark.slow),
-        pytest.param("line", 6, "reset columns stall unplug", marks=pytest.mark.slow),
-        pytest.param(
-            "printer", 8, "printer_halts printer_busy printer_restarts printer_unplugged", marks=pytest.mark.slow
-        ),
+        ("arm", 9, "protective drop freeze stall unplug emergency restart"),
+        ("line", 6, "reset columns stall unplug"),
+        ("printer", 8, " ".join(name for name in FAULTS if "printer" in name)),
     ],
 )
 def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(
@@ -274,6 +272,7 @@ EIGHT = Morphology.straight(8)
 LINE = RigSettings.model_validate({"board": "line", "presses": 1, **QUICK})
 
 
+@pytest.mark.slow
 def test_sixteen_fibres_are_recorded_and_their_wiring_is_kept(tmp_path: Path) -> None:
     setup = Setup(EIGHT, PUBLISHED_CONTACT, LINE, tmp_path / "run", "test")
     recording = record("simulated", setup)

@@ -205,7 +205,7 @@ def link_to(port: str) -> Iterator[MarlinLink]:
 
 
 def test_every_line_is_executed_once_and_in_its_turn_whatever_noise_there_is():
-    ends = np.column_stack([50 + np.arange(1, 41) / 50, np.full((40, 2), 50.0)])
+    ends = np.column_stack([50 + np.arange(1, 31) / 50, np.full((30, 2), 50.0)])
     with EmulatedPrinter((50.0, 50.0, 50.0), seed=3) as printer, link_to(printer.port) as link:
         link.begin(2.0)
         answer = link.ask("M114")
