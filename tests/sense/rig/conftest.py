@@ -6,19 +6,56 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import pytest
 
 from sense.rig.arms.ur5.driver import UR5
+from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators import whole_rig
 from sense.rig.emulators.ur.controller import Series
 from sense.rig.emulators.ur.emulator import UrEmulator
-from tests.sense.rig.arms.ur5.arms import Robots
 
 WAIT_S = 180.0
 ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]
 """Of this machine: on Linux all that begin with 127, elsewhere the first alone."""
+
+FORBIDDEN = ("play", "unlock", "power", "brake", "safety")
+"""Words of orders to the dashboard that are for a person alone."""
+
+
+class Robots:
+    """One emulator at a time, kept while the next test wants the same, and the link to it while that is whole."""
+
+    def __init__(self, host: str) -> None:
+        self.host, self.series, self.robot = host, "", None
+        self.arm: UR5 | None = None
+
+    def get(self, series: Series, **settings: Any) -> UrEmulator:
+        if self.robot is None or settings or self.series != series:
+            self.free()
+            self.series, self.robot = series, UrEmulator(series, host=self.host, **settings).__enter__()
+        return self.robot
+
+    def connected(self, host: str) -> UR5:
+        """The arm by one of its names, at rest."""
+        arm = self.arm = self.arm or UR5(host)
+        try:
+            if arm.state().moving:
+                arm.stop()
+        except RigFault:
+            arm.connect()
+        return arm
+
+    def free(self) -> None:
+        if self.arm is not None:
+            self.arm.close()
+            self.arm = None
+        if self.robot is not None:
+            asked, self.series = self.robot.asked(), ""
+            self.robot.__exit__()
+            self.robot = None
+            assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
 
 
 def taken(address: str) -> IO[str] | None:

@@ -1,5 +1,6 @@
 """The sample clock against simulated truth: jitter, stalls, a board that is off by up to 200 ppm and drifts."""
 
+import pickle
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from sense.rig.boards import sample_clock as clock
-from sense.rig.boards.sample_clock import QUARTZ_SKEW, SampleClock
-from tests.helpers.effort import few
+from sense.rig.boards.sample_clock import SampleClock
 
 SETTLE_S = 0.5
 
@@ -65,7 +64,7 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     return np.array(errors), clock
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(
     rate=st.sampled_from([(1000.0, 16), (100.0, 2), (40.0, 1)]),
     skew=st.floats(-200e-6, 200e-6),
@@ -75,20 +74,20 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
 def test_times_are_within_5_ms_from_the_first_and_half_a_ms_soon(
     rate: tuple[float, int], skew: float, jitter_s: float, seed: int
 ) -> None:
-    errors, clock = run(Link(*rate, 40.0, skew, seed, jitter_s))
+    errors, clock = run(Link(*rate, 30.0, skew, seed, jitter_s))
     assert np.abs(errors).max() < 5e-3
     assert np.abs(errors[len(errors) // 2 :]).max() < 5e-4
     assert clock.skew_ppm == pytest.approx(skew * 1e6, abs=60)
 
 
-def test_times_hold_for_hours_in_bounded_memory() -> None:
-    """An hour, two under stress."""
-    errors, clock = run(Link(40.0, 8, min(few(1).max_examples, 2) * 3600.0, 200e-6, seed=1))
+def test_times_hold_for_long_in_bounded_memory() -> None:
+    errors, clock = run(Link(40.0, 8, 1500.0, 200e-6, seed=1))
     assert np.abs(errors).max() < 2e-3
     assert np.abs(errors[500:]).max() < 1e-3
-    assert len(clock._buckets) <= 60
+    assert len(pickle.dumps(clock)) < 3000  # a minute of arrivals
 
 
+@settings(max_examples=30)
 @given(start_s=st.floats(0, 1e7), period_s=st.floats(1e-4, 0.1), count=st.integers(1, 50), first=st.integers(0, 2**40))
 def test_without_delay_the_times_are_the_arrivals(start_s: float, period_s: float, count: int, first: int) -> None:
     clock = SampleClock(period_s)
@@ -138,16 +137,19 @@ def test_there_is_no_time_before_the_first_block() -> None:
         SampleClock(1e-3).times(block_of(0, 1))
 
 
-@few(40)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
-def test_the_line_under_the_points_is_the_highest_at_their_middle(seed: int, count: int, size: float) -> None:
+def test_the_line_under_the_arrivals_is_the_highest_at_their_middle(seed: int, count: int, size: float) -> None:
     """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
     rng = np.random.default_rng(seed)
-    x, y = np.sort(rng.uniform(0, 100, count)), size * rng.uniform(0, 1, count)
-    steepest = QUARTZ_SKEW
-    offset, slope = clock._line_under(list(zip(x.tolist(), y.tolist(), strict=True)), steepest)
-    below = np.column_stack([np.ones(count), x])
-    best = linprog([-1, -x.mean()], below, y, bounds=[(None, None), (-steepest, steepest)])
-    assert abs(slope) <= steepest
-    assert (offset + slope * x <= y + 1e-12).all()
-    assert offset + slope * x.mean() == pytest.approx(-best.fun, abs=1e-9)
+    x, y = np.sort(rng.choice(100, count, replace=False)), size * rng.uniform(0, 1, count)
+    clock = SampleClock(1.0)
+    for second, delay_s in zip(x.tolist(), y.tolist(), strict=True):
+        clock.observe(second, second + delay_s)
+    clock.observe(101, 102.0)  # so late that it does not matter
+    slope, at_0 = clock.skew_ppm * 1e-6, float(clock.times(np.array([101]))[0]) - 101
+    line = at_0 + slope * (x - 101)
+    best = linprog([-1, -x.mean()], np.column_stack([np.ones(count), x]), y, bounds=[(None, None), (-5e-4, 5e-4)])
+    assert abs(slope) <= 5e-4
+    assert (line <= y + 1e-9).all()
+    assert line.mean() == pytest.approx(-best.fun, abs=1e-9)

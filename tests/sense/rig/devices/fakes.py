@@ -1,10 +1,12 @@
 """An arm and a converter in virtual time, on one simulated pad: minutes of pressing take moments."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from design import Morphology
@@ -144,3 +146,18 @@ class FakeConverter:
 
     def close(self) -> None:
         pass
+
+
+def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> float:
+    """Call `action` until it raises the fault; returns how long that took by the wall's clock."""
+
+    def repeat() -> None:
+        while time.monotonic() < begun + 10:
+            action()
+            time.sleep(0.005)
+
+    begun = time.monotonic()
+    with pytest.raises(RigFault, match=match) as caught:
+        repeat()
+    assert caught.value.cause == cause
+    return time.monotonic() - begun

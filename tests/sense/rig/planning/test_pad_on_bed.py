@@ -1,7 +1,9 @@
 """The place of the pad from the file that fabricate writes, the contract of two packages that know nothing else."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 
 PAD = Morphology.straight(2)
+HALF = PAD.layout.size_mm[0] / 2
 RIG = RigSettings(tcp_mm=(30.0, -5.0, -20.0), max_force_n=None)
 
 
@@ -27,11 +30,24 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture
+def changed(folder, tmp_path) -> Callable[..., Path]:
+    """A folder whose file has another frame, by keys; those of None are not in it."""
+
+    def write(**frame: Any) -> Path:
+        document = json.loads((folder / "fabrication.json").read_text())
+        assert document["frame"]["mirrored"] is True
+        document["frame"] = {k: v for k, v in (document["frame"] | frame).items() if v is not None}
+        (tmp_path / "fabrication.json").write_text(json.dumps(document))
+        return tmp_path
+
+    return write
+
+
 def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
     rig = on_bed(RIG, folder)
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
-    half = PAD.layout.size_mm[0] / 2
-    assert rig.box_mm == pytest.approx((100 - half, 100 + half, 90 - half, 90 + half, 3.0, 130.0), abs=1e-5)
+    assert rig.box_mm == pytest.approx((100 - HALF, 100 + HALF, 90 - HALF, 90 + HALF, 3.0, 130.0), abs=1e-5)
     require_safe_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
 
 
@@ -42,10 +58,9 @@ def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, d
 
 
 def test_the_workspace_ends_where_the_nozzle_does(folder):
-    rig = on_bed(RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder)
-    assert rig.box_mm is not None
-    assert rig.box_mm[0] == 95
-    assert rig.box_mm[3] == 90
+    box = on_bed(RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder).box_mm
+    assert box is not None
+    assert (box[0], box[3]) == (95, 90)
 
 
 def test_what_rig_says_counts_more(folder):
@@ -53,7 +68,7 @@ def test_what_rig_says_counts_more(folder):
     rig = on_bed(said, folder)
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg) == ((50.0, 60.0), 9.0, 90.0)
     assert rig.box_mm is not None
-    assert rig.box_mm[0] == 50 - PAD.layout.size_mm[0] / 2
+    assert rig.box_mm[0] == 50 - HALF
     everything = rig.model_copy(update={"tcp_mm": None})
     assert on_bed(everything, folder / "nowhere") is everything
 
@@ -62,13 +77,9 @@ def test_what_rig_says_counts_more(folder):
     ("in_file", "said", "counts"),
     [(True, None, True), (True, False, False), (False, None, False), (False, True, True), (None, None, False)],
 )
-def test_the_holder_says_which_side_is_up_unless_rig_does(folder, tmp_path, in_file, said, counts):
+def test_the_holder_says_which_side_is_up_unless_rig_does(changed, in_file, said, counts):
     """A file of before that was written is of a holder that took the pad with its tracks down."""
-    document = json.loads((folder / "fabrication.json").read_text())
-    assert document["frame"].pop("mirrored") is True
-    document["frame"] |= {} if in_file is None else {"mirrored": in_file}
-    (tmp_path / "fabrication.json").write_text(json.dumps(document))
-    assert on_bed(RIG.model_copy(update={"mirrored": said}), tmp_path).mirrored is counts
+    assert on_bed(RIG.model_copy(update={"mirrored": said}), changed(mirrored=in_file)).mirrored is counts
 
 
 def test_a_pad_without_a_holder_lies_nobody_knows_where(folder, tmp_path):
@@ -84,34 +95,23 @@ def test_a_pad_without_a_holder_lies_nobody_knows_where(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("centre_mm", [1.0]), ("surface_mm", "8"), ("bed_mm", [1, 2, None]), ("walls_mm", 1e9)]
+    ("key", "value", "said"),
+    [
+        ("centre_mm", [1.0], "frame has no centre_mm, expected 2 finite numbers"),
+        ("surface_mm", "8", "frame has no surface_mm"),
+        ("bed_mm", [1, 2, None], "frame has no bed_mm, expected 3"),
+        ("walls_mm", 1e9, "frame has no walls_mm"),
+        ("pad_mm", [60.0, 20.0, 5.0], "frame has no pad_mm, expected 2 finite numbers"),
+        ("mirrored", "up", "mirrored of frame is 'up', expected true or false"),
+    ],
 )
-def test_a_damaged_frame_is_named(folder, tmp_path, key, value):
-    document = json.loads((folder / "fabrication.json").read_text())
-    document["frame"][key] = value
-    (tmp_path / "fabrication.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=f"frame has no {key}"):
-        on_bed(RIG, tmp_path)
-
-
-def test_a_damaged_side_is_named(folder, tmp_path):
-    document = json.loads((folder / "fabrication.json").read_text())
-    document["frame"]["mirrored"] = "up"
-    (tmp_path / "fabrication.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="mirrored of frame is 'up', expected true or false"):
-        on_bed(RIG, tmp_path)
+def test_a_damaged_frame_is_named(changed, key, value, said):
+    with pytest.raises(InputError, match=said):
+        on_bed(RIG, changed(**{key: value}))
 
 
 @pytest.mark.parametrize(("angle_deg", "halves"), [(0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))])
-def test_the_workspace_over_a_rectangle_is_as_wide_and_high_as_that(tmp_path, angle_deg, halves):
-    frame = {"bed_mm": [200, 180, 150], "centre_mm": [100, 90], "angle_deg": angle_deg, "mirrored": True}
-    frame |= {"pad_mm": [60.0, 20.0], "surface_mm": 8, "walls_mm": 3}
-    document = {"format": "padforge-fabrication/1", "frame": frame}
-    (tmp_path / "fabrication.json").write_text(json.dumps(document))
-    (right, top), box = halves, on_bed(RIG, tmp_path).box_mm
+def test_the_workspace_over_a_rectangle_is_as_wide_and_high_as_that(changed, angle_deg, halves):
+    (right, top), box = halves, on_bed(RIG, changed(pad_mm=[60.0, 20.0], angle_deg=angle_deg)).box_mm
     assert box is not None
     assert box[:4] == (100 - right, 100 + right, 90 - top, 90 + top)
-    frame["pad_mm"] = [60.0, 20.0, 5.0]
-    (tmp_path / "fabrication.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="frame has no pad_mm, expected 2 finite numbers"):
-        on_bed(RIG, tmp_path)

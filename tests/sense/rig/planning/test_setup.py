@@ -1,5 +1,9 @@
+"""A recording that is gone on with keeps its plan, and is refused where anything that makes a press has changed."""
+
 import json
 import re
+import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,27 +21,35 @@ from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
 RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))
+ARM = {"model": "UR5", "serial": "2018", "controller": "5.12.2", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
+BOARD = {"name": "padforge-due", "serial": "ab12", "firmware": "1.0.0", "port": "/dev/ttyACM0"}
+DEVICES: dict[str, dict[str, Any]] = {"arm": ARM, "board": BOARD}
 
 
 def setup(out: Path, pad: Morphology = PAD) -> Setup:
     return Setup(pad, PUBLISHED_CONTACT, RIG, out, "test")
 
 
-ARM = {"model": "UR5", "serial": "2018", "controller": "5.12.2", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
-BOARD = {"name": "padforge-due", "serial": "ab12", "firmware": "1.0.0", "port": "/dev/ttyACM0"}
-DEVICES = {"arm": ARM, "board": BOARD}
+def resumed(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
+    """The plan that is gone on with under other settings."""
+    return plan_of(setup(out, pad), RIG.model_copy(update=settings), resume=True).document()
 
 
-def begun(out: Path) -> None:
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory) -> Path:
+    """A recording of no press so far, which nobody may change."""
+    out = tmp_path_factory.mktemp("begun")
     with recorder_of(setup(out), RIG, planned(PAD, RIG, np.random.default_rng(0)), out, False, DEVICES):
         pass
+    return out
 
 
-def test_a_resumed_recording_keeps_its_plan(tmp_path):
-    begun(tmp_path / "run")
-    first = plan_of(setup(tmp_path / "run"), RIG, resume=True)
-    other = RIG.model_copy(update={"seed": 9, "presses": 3})
-    assert plan_of(setup(tmp_path / "run"), other, resume=True).document() == first.document()
+def test_a_resumed_recording_keeps_its_plan_and_tells_where_another_is_asked_for(begun, tmp_path):
+    assert resumed(begun, seed=9, presses=3) == resumed(begun)
+    assert resumed(begun, seed=9)[0] == pytest.approx([*planned(PAD, RIG, np.random.default_rng(0)).places_mm[0], 5.0])
+    other = replace(setup(begun), rig=RIG.model_copy(update={"seed": 9, "presses": 30}))
+    assert kept_plan(other).endswith("the plan it was begun with, [rig] presses = 5, seed = 0")
+    assert kept_plan(setup(begun)) == kept_plan(replace(other, out=tmp_path / "new")) == ""
 
 
 def test_a_recording_of_a_rectangle_is_resumed_but_for_holes_that_were_made_since(tmp_path):
@@ -45,31 +57,18 @@ def test_a_recording_of_a_rectangle_is_resumed_but_for_holes_that_were_made_sinc
     plan = planned(pad, RIG, np.random.default_rng(0))
     with recorder_of(setup(tmp_path, pad), RIG, plan, tmp_path, False, DEVICES):
         pass
-    assert plan_of(setup(tmp_path, pad), RIG, resume=True).document() == plan.document()
+    assert resumed(tmp_path, pad) == plan.document()
     with pytest.raises(InputError, match="another pad"):
-        plan_of(setup(tmp_path, Morphology.straight((1, 3), (8.0, 15.0))), RIG, resume=True)
+        resumed(tmp_path, Morphology.straight((1, 3), (8.0, 15.0)))
     x, y = plan.places_mm[1].tolist()
     hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
     with pytest.raises(InputError, match=r"press 2, at .* lies in a keep-out"):
         plan_of(replace(setup(tmp_path, pad), size=PadSettings(keep_out_mm=(hole,))), RIG, resume=True)
 
 
-def test_it_is_told_where_other_presses_are_asked_for_than_the_plan_has(tmp_path):
-    begun(tmp_path / "run")
-    other = replace(setup(tmp_path / "run"), rig=RIG.model_copy(update={"seed": 9, "presses": 30}))
-    assert kept_plan(other).endswith("the plan it was begun with, [rig] presses = 5, seed = 0")
-    assert kept_plan(setup(tmp_path / "run")) == kept_plan(replace(other, out=tmp_path / "new")) == ""
-
-
-CHANGES = {
-    **{
-        "channels": [0, 1, 3, 2],
-        "rate_hz": 5.0,
-        "contact_mm": 12.0,
-        "readings_per_press": 50,
-        "converter_rate_hz": 500.0,
-    },
-    **{"clearance_mm": 12.0, "travel_mm_s": 90.0, "press_mm_s": 30.0, "acceleration_mm_s2": 400.0},
+CHANGES: dict[str, Any] = {
+    **{"channels": [0, 1, 3, 2], "rate_hz": 5.0, "readings_per_press": 50, "converter_rate_hz": 500.0},
+    **{"contact_mm": 12.0, "clearance_mm": 12.0, "travel_mm_s": 90.0, "press_mm_s": 30.0, "acceleration_mm_s2": 400.0},
     **{"depth_mm": 4.0, "depths_mm": [1.0, 2.0], "pad_mm": [1.0, 2.0], "pad_angle_deg": 5.0},
     **{"tool_rad": [0.1, 3.1, 0.0], "tcp_mm": [0.0, 0.0, 150.0], "mirrored": True},
 }
@@ -77,62 +76,56 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(("key", "value"), CHANGES.items())
-def test_other_settings_are_refused(tmp_path, key, value):
-    begun(tmp_path / "run")
+def test_other_settings_are_refused(begun, key, value):
     with pytest.raises(InputError, match=re.escape(f"[rig] {key}: got {value}, the recording")):
-        plan_of(setup(tmp_path / "run"), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
+        plan_of(setup(begun), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
 
 
-def test_a_recording_of_before_there_was_a_side_to_name_counts_as_not_mirrored(tmp_path):
-    begun(tmp_path / "run")
-    start = tmp_path / "run" / START
-    document = json.loads(start.read_text())
+def test_limits_and_addresses_may_change(begun):
+    limits = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1)}
+    resumed(begun, **limits, host="arm", port="COM3")
+
+
+def test_another_pad_is_refused(begun):
+    with pytest.raises(InputError, match="another pad"):
+        resumed(begun, Morphology.random(2, 3, 1))
+    with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
+        resumed(begun, Morphology.straight(3), channels=())
+
+
+def test_a_recording_of_before_there_was_a_side_to_name_counts_as_not_mirrored(begun, tmp_path):
+    document = json.loads((begun / START).read_text())
     assert document["source"]["rig"].pop("mirrored") is False
-    start.write_text(json.dumps(document))
+    (tmp_path / START).write_text(json.dumps(document))
     for side in (None, False):
-        plan_of(setup(tmp_path / "run"), RIG.model_copy(update={"mirrored": side}), resume=True)
+        resumed(tmp_path, mirrored=side)
     with pytest.raises(InputError, match=r"mirrored: got True, .* was begun with False"):
-        plan_of(setup(tmp_path / "run"), RIG.model_copy(update={"mirrored": True}), resume=True)
-
-
-def test_limits_and_addresses_may_change(tmp_path):
-    begun(tmp_path / "run")
-    other = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1), "host": "arm", "port": "COM3"}
-    plan_of(setup(tmp_path / "run"), RIG.model_copy(update=other), resume=True)
-
-
-def resumed(out: Path, devices: dict[str, Any]) -> None:
-    with recorder_of(setup(out), RIG, plan_of(setup(out), RIG, resume=True), out, True, devices):
-        pass
-
-
-def test_start_json_keeps_what_arm_and_board_said(tmp_path):
-    begun(tmp_path / "run")
-    assert json.loads((tmp_path / "run" / START).read_text())["source"]["devices"] == DEVICES
-    resumed(tmp_path / "run", {"arm": ARM | {"controller": "5.13.0"}, "board": BOARD | {"port": "/dev/ttyACM1"}})
+        resumed(tmp_path, mirrored=True)
 
 
 @pytest.mark.parametrize(
-    ("device", "key", "value"),
+    ("device", "key", "value", "goes_on"),
     [
-        ("arm", "serial", "2019"),
-        ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0]),
-        ("board", "serial", "cd34"),
-        ("board", "firmware", "1.1.0"),
+        ("arm", "controller", "5.13.0", True),
+        ("board", "port", "/dev/ttyACM1", True),
+        ("arm", "serial", "2019", False),
+        ("arm", "model", "UR3", False),
+        ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0], False),
+        ("board", "name", "another", False),
+        ("board", "serial", "cd34", False),
+        ("board", "firmware", "1.1.0", False),
     ],
 )
-def test_another_arm_tool_or_board_is_refused(tmp_path, device, key, value):
-    begun(tmp_path / "run")
-    with pytest.raises(InputError, match=re.escape(f"{device}: {key} is {value}, the recording in")):
-        resumed(tmp_path / "run", DEVICES | {device: DEVICES[device] | {key: value}})
-
-
-def test_another_pad_is_refused(tmp_path):
-    begun(tmp_path / "run")
-    with pytest.raises(InputError, match="another pad"):
-        plan_of(setup(tmp_path / "run", Morphology.random(2, 3, 1)), RIG, resume=True)
-    with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
-        plan_of(setup(tmp_path / "run", Morphology.straight(3)), RIG.model_copy(update={"channels": ()}), resume=True)
+def test_start_json_keeps_what_devices_said_and_another_arm_tool_or_board_is_refused(
+    begun, tmp_path, device, key, value, goes_on
+):
+    assert json.loads((begun / START).read_text())["source"]["devices"] == DEVICES
+    out = Path(shutil.copytree(begun, tmp_path / "run"))
+    devices = DEVICES | {device: DEVICES[device] | {key: value}}
+    plan = plan_of(setup(out), RIG, resume=True)
+    refusal = pytest.raises(InputError, match=re.escape(f"{device}: {key} is {value}, the recording in"))
+    with nullcontext() if goes_on else refusal, recorder_of(setup(out), RIG, plan, out, True, devices):
+        pass
 
 
 @pytest.mark.parametrize("source", ["[]", "5", '{"plan": 5}', "{}"])
@@ -140,7 +133,7 @@ def test_a_recording_without_a_plan_cannot_be_resumed(tmp_path, source):
     text = f'{{"format": "padforge-recording/1", "fibres": 4, "source": {source}}}'
     (tmp_path / "start.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="has no plan"):
-        plan_of(setup(tmp_path), RIG, resume=True)
+        resumed(tmp_path)
 
 
 def test_a_plan_is_of_a_kind_or_from_a_file(tmp_path):

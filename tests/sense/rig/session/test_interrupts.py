@@ -2,58 +2,49 @@
 
 import contextlib
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from design.settings import PUBLISHED_CONTACT
-from sense.recordings.press_plan import PressPlan
-from sense.recordings.recorder import Recorder
 from sense.rig import operation
 from sense.rig.devices.protocols import RigFault
 from sense.rig.planning.setup import Setup
-from sense.rig.session.press_loop import Session
-from sense.settings import RigSettings
 from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
-
-PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4]], float), np.full(3, 4.0))
-
-
-@pytest.fixture
-def arm() -> FakeArm:
-    return FakeArm(Time())
+from tests.sense.rig.session.test_press_loop import FOUR, run
 
 
-def run(arm: FakeArm, path: Path) -> None:
-    with Recorder(path, 4, {"kind": "fake"}, {}) as keep:
-        Session(arm, FakeConverter(arm), keep, RIG, clock=arm.time, sleep=arm.time.sleep).run(PLAN)
+def interrupted(arm: FakeArm, path: Path, raises: type[BaseException]) -> None:
+    """Record until that is raised, and see that the tool is lifted off the pad and signals are as before."""
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises((RigFault, KeyboardInterrupt)) as caught:
+        run(path, arm, FakeConverter(arm), RIG, FOUR)
+    assert caught.type is raises
+    assert arm.pose[2] == 50 + 10
+    assert signal.getsignal(signal.SIGINT) is before
 
 
-def lifted(arm: FakeArm) -> bool:
-    return arm.pose[2] == (RIG.contact_mm or 0.0) + 10
-
-
-def test_an_interrupt_that_was_lost_is_heard_all_the_same(arm: FakeArm, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_an_interrupt_that_was_lost_is_heard_all_the_same(tmp_path: Path, name: str) -> None:
     def lost_once(arm: FakeArm) -> None:
         if arm.pose[2] < 48 and not came:
             came.append(arm.time())
             with contextlib.suppress(KeyboardInterrupt):  # as a callback of C code does
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(signal.Signals[name])
 
-    came: list[float] = []
+    arm, came = FakeArm(Time()), []
     arm.hook = lost_once
-    with pytest.raises(KeyboardInterrupt):
-        run(arm, tmp_path / "run")
+    ends = {name: signal.signal(signal.Signals[name], signal.default_int_handler) for name in ("SIGTERM", "SIGHUP")}
+    try:
+        interrupted(arm, tmp_path / "run", KeyboardInterrupt)
+    finally:
+        for other, handler in ends.items():
+            signal.signal(signal.Signals[other], handler)
     assert arm.time() - came[0] < 2
-    assert lifted(arm)
 
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt, RigFault])
-def test_more_interrupts_do_not_keep_the_tool_on_the_pad(
-    arm: FakeArm, tmp_path: Path, fault: type[BaseException]
-) -> None:
+def test_more_interrupts_do_not_keep_the_tool_on_the_pad(tmp_path: Path, fault: type[BaseException]) -> None:
     def impatient(arm: FakeArm) -> None:
         if arm.pose[2] < 48 and not arm.stops and fault is RigFault:
             arm.force_n = 80.0
@@ -61,16 +52,9 @@ def test_more_interrupts_do_not_keep_the_tool_on_the_pad(
             arm.force_n = 0.0
             signal.raise_signal(signal.SIGINT)
 
+    arm = FakeArm(Time())
     arm.hook = impatient
-    with pytest.raises(fault):
-        run(arm, tmp_path / "run")
-    assert lifted(arm)
-
-
-def test_what_was_done_with_a_signal_is_done_again_afterwards(arm: FakeArm, tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    run(arm, tmp_path / "run")
-    assert signal.getsignal(signal.SIGINT) is before
+    interrupted(arm, tmp_path / "run", fault)
 
 
 def test_a_second_ctrl_c_is_heard_where_the_session_has_done_its_part(
@@ -78,11 +62,6 @@ def test_a_second_ctrl_c_is_heard_where_the_session_has_done_its_part(
 ) -> None:
     """As where the disk hangs, which nobody else could end then."""
     heard = []
-
-    @contextlib.contextmanager
-    def opened(kind: str, setup: Setup, *more: object) -> Iterator[tuple[FakeArm, FakeConverter, RigSettings]]:
-        arm = FakeArm(Time())
-        yield arm, FakeConverter(arm), setup.rig
 
     class Interrupted:
         def __init__(self, *devices: object, **more: object) -> None:
@@ -96,7 +75,9 @@ def test_a_second_ctrl_c_is_heard_where_the_session_has_done_its_part(
                     heard.append(signal.SIGINT)
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(operation, "opened_rig", opened)
+    arm = FakeArm(Time())
+    rig = contextlib.nullcontext((arm, FakeConverter(arm), RIG))
+    monkeypatch.setattr(operation, "opened_rig", lambda *setup: rig)
     monkeypatch.setattr(operation, "Session", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         operation.record("ur5", Setup(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test"))

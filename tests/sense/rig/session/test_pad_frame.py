@@ -12,18 +12,13 @@ from sense.rig.devices.protocols import RigFault
 from sense.rig.session.pad_frame import Frame
 from tests.sense.rig.devices.fakes import RIG
 
-TURNED = RIG.model_copy(update={"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2)})
 
-
-def test_a_pad_turned_to_the_left_has_its_x_axis_along_the_arms_y_axis():
-    frame = Frame.of(TURNED)
-    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, -397, 46, 0.1, 3.1, 0.2))
-    assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
-
-
-def test_with_its_tracks_up_a_pad_keeps_its_y_axis_and_x_runs_the_other_way():
-    frame = Frame.of(TURNED.model_copy(update={"mirrored": True}))
-    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, -403, 46, 0.1, 3.1, 0.2))
+@pytest.mark.parametrize(("mirrored", "y_mm"), [(False, -397), (True, -403)])
+def test_a_pad_turned_to_the_left_has_its_x_axis_along_the_arms_y_axis(mirrored, y_mm):
+    """With its tracks up it keeps its y axis, and x runs the other way."""
+    lies = {"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2), "mirrored": mirrored}
+    frame = Frame.of(RIG.model_copy(update=lies))
+    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, y_mm, 46, 0.1, 3.1, 0.2))
     assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
 
 
@@ -32,26 +27,18 @@ PLACES = st.lists(st.tuples(NUMBERS, NUMBERS, st.floats(-20, 20)), min_size=1, m
 
 
 @given(st.booleans(), st.floats(-360, 360), st.tuples(NUMBERS, NUMBERS), PLACES)
-def test_a_tip_is_where_its_pose_was_asked_for(mirrored, angle_deg, centre_mm, asked):
-    """From places to poses and back, and no length changes on the way, however the pad lies."""
-    said = {"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}
-    frame = Frame.of(RIG.model_copy(update=said))
+def test_a_tip_is_where_its_pose_was_asked_for_and_a_twins_frame_says_the_same(mirrored, angle_deg, centre_mm, asked):
+    """No length changes, however the pad lies; a twin's frame takes an arm's places that was told nothing of it."""
+    frame = Frame.of(RIG.model_copy(update={"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}))
     places, depths = np.array(asked)[:, :2], np.array(asked)[:, 2]
     poses = np.array([frame.pose(place, depth) for place, depth in zip(places, depths, strict=True)])
     np.testing.assert_allclose(np.hypot(*(poses[:, :2] - centre_mm).T), np.hypot(*places.T), atol=1e-9)
     found = frame.tip(poses)
     np.testing.assert_allclose(found[0], places, atol=1e-9)
     np.testing.assert_allclose(found[1], depths, atol=1e-9)
-
-
-@given(st.booleans(), st.floats(-180, 180), st.tuples(NUMBERS, NUMBERS), PLACES)
-def test_the_frame_of_a_twin_says_the_same(mirrored, angle_deg, centre_mm, poses):
-    """It takes places of an arm that was told nothing of the pad to the plan, as `tip` does for one that was told."""
-    said = {"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}
-    found, _ = Frame.of(RIG.model_copy(update=said)).tip(np.array(poses))
     twin = TwinFrame(mirrored, angle_deg if mirrored else -angle_deg)
     moved = replace(twin, shift_mm=tuple(-twin.turned(np.array(centre_mm))))
-    np.testing.assert_allclose(moved.to_plan(np.array(poses)[:, :2]), found, atol=1e-9)
+    np.testing.assert_allclose(moved.to_plan(poses[:, :2]), places, atol=1e-9)
 
 
 def test_an_unknown_height_is_refused():

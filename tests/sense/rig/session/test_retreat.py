@@ -6,6 +6,7 @@ import threading
 import time as real_time
 from collections.abc import Callable
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from sense.rig.devices.protocols import RigFault
 from sense.rig.safety import Limits
 from sense.rig.session.press_loop import Session
 from sense.rig.session.retreat import FALL_S, HEIGHT_MM, SPEED_MM_S, retreat
-from tests.sense.rig.arms.ur5.arms import Robots
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 LIMITS = Limits.of(RIG)
@@ -73,14 +73,13 @@ def test_an_arm_that_was_stopped_or_is_gone_is_not_moved(what: str) -> None:
     assert arm.moves == []
 
 
-def test_a_tool_deeper_than_allowed_may_come_up() -> None:
-    assert retreated(pressed(42.0, lambda arm: 0.0)).pose[2] == pytest.approx(50 + HEIGHT_MM)
-
-
-@pytest.mark.parametrize(("x", "y"), [(100.4, -400.0), (-100.4, -400.0), (0.0, -299.6), (0.0, -500.4)])
-def test_a_tool_that_pressed_at_the_edge_of_the_box_comes_up(x: float, y: float) -> None:
+@pytest.mark.parametrize(
+    ("x", "y", "z"),
+    [(0.0, -400.0, 42.0), *((x, y, DEEP_MM) for x, y in ((100.4, -400), (-100.4, -400), (0, -299.6), (0, -500.4)))],
+)
+def test_a_tool_too_deep_or_at_the_edge_of_the_box_comes_up(x: float, y: float, z: float) -> None:
     """No arm stands quite where it was sent: half of those at the edge stand beyond it."""
-    arm = pressed(DEEP_MM, lambda arm: 0.0)
+    arm = pressed(z, lambda arm: 0.0)
     arm.pose = (x, y, *arm.pose[2:])
     assert retreated(arm).pose[:3] == (x, y, pytest.approx(50 + HEIGHT_MM))
 
@@ -100,16 +99,17 @@ def test_a_tool_above_the_pad_is_only_lifted_off_what_it_presses() -> None:
     assert retreated(pressed(115.0, lambda arm: 80.0 if arm.pose[2] < 116 else 0.0)).pose[2] == LIMITS.box_mm[2][1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 @pytest.mark.parametrize("slow_s", [0.0, 1.0])
 def test_too_much_force_is_seen_at_once_and_taken_off_however_slow_the_disk(
-    robots: Robots, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float
+    robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float
 ) -> None:
     """20 N/mm at 10 mm/s: a tenth of a second without a look costs 20 N, and the disk would take half a press."""
     robot = robots.get("e", pose=(0.0, -400.0, 60.0, 0.0, np.pi, 0.0), surface_mm=50, stiffness_n_mm=20.0)
     slowly = {"press_mm_s": 10.0, "clearance_mm": 2.0}
     rig = RIG.model_copy(update={"max_force_n": 20.0, "readings_per_press": 20, **slowly})
-    converter = FakeConverter(Clocked())
+    converter = FakeConverter(FakeArm(real_time.monotonic))  # pyright: ignore[reportArgumentType]
     converter.model.volts(np.zeros((2, 2)), np.array([0.0, 5.0]))  # what takes long the first time
     arm, stopped, sync = UR5(host), threading.Event(), os.fsync
     halt = arm.stop
@@ -138,10 +138,3 @@ def test_too_much_force_is_seen_at_once_and_taken_off_however_slow_the_disk(
     assert rows[-1, 7] == 0
     assert (rows[-3:, 1:4] == (0, -400, 60)).all()
     robots.free()
-
-
-class Clocked(FakeArm):
-    """A fake arm in real time, for the converter's sake."""
-
-    def __init__(self) -> None:
-        super().__init__(real_time.monotonic)  # pyright: ignore[reportArgumentType]

@@ -1,8 +1,11 @@
-"""Lines of Marlin, as its sources print them and as hosts write them."""
+"""Lines of Marlin, as its sources print them and as hosts write them, and straight moves within limits of axes."""
+
+import math
 
 import pytest
 
 from sense.rig.arms.printer import marlin
+from sense.rig.arms.printer.motion import StraightMove
 
 M115 = [
     "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"
@@ -22,60 +25,77 @@ M503 = [
 ]
 
 
-def test_a_numbered_line_has_the_exclusive_or_of_its_bytes():
+def test_lines_are_written_as_marlin_reads_them():
+    """A numbered line ends in the exclusive or of its bytes, a move is in mm/min."""
     assert marlin.numbered(0, "M110 N0") == b"N0 M110 N0*125\n"
     assert marlin.numbered(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
-
-
-def test_a_move_is_in_millimetres_a_minute():
     assert marlin.move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
 
 
 @pytest.mark.parametrize(
-    ("line", "number"),
-    [("Resend: 42", 42), ("Resend:7", 7), ("rs N12", 12), ("Resend: ", None), ("ok", None), ("Resend: 4x", None)],
-)
-def test_the_line_that_is_asked_for_again(line, number):
-    assert marlin.resend(line) == number
-
-
-@pytest.mark.parametrize(
-    ("line", "place"),
+    ("read", "line", "expected"),
     [
-        ("X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
-        ("X:1.00 Y:2.00 Z:3.00", (1.0, 2.0, 3.0)),
-        ("X:1.00 Y:2.00 Z:3.0o E:0.00", None),
-        ("X:1.00 Y:2.00", None),
-        ("T:20.1 /0.0 B:20.0 /0.0", None),
+        (marlin.resend, "Resend: 42", 42),
+        (marlin.resend, "Resend:7", 7),
+        (marlin.resend, "rs N12", 12),
+        (marlin.resend, "Resend: ", None),
+        (marlin.resend, "ok", None),
+        (marlin.resend, "Resend: 4x", None),
+        (marlin.place, "X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
+        (marlin.place, "X:1.00 Y:2.00 Z:3.00", (1.0, 2.0, 3.0)),
+        (marlin.place, "X:1.00 Y:2.00 Z:3.0o E:0.00", None),
+        (marlin.place, "X:1.00 Y:2.00", None),
+        (marlin.place, "T:20.1 /0.0 B:20.0 /0.0", None),
+        (marlin.halts, "Error:Printer halted. kill() called!", True),
+        (marlin.halts, "Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
+        (marlin.halts, "Error:checksum mismatch, Last Line: 41", False),
+        (marlin.halts, "echo:Printer halted", False),
     ],
 )
-def test_a_place_is_read_whole_or_not_at_all(line, place):
-    assert marlin.place(line) == place
+def test_a_line_is_read_whole_or_not_at_all(read, line, expected):
+    assert read(line) == expected
 
 
-def test_what_a_printer_says_of_itself():
+def test_what_a_printer_says_of_itself_and_of_its_axes():
     found = marlin.Firmware.of(M115)
     assert found.name == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
     assert found.machine == "Ender-3 Pro"
     assert found.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
     assert marlin.Firmware.of(["echo: hello"]) == marlin.Firmware()
-
-
-def test_limits_of_axes():
     assert marlin.limits(M503, "M203") == (500.0, 400.0, 5.0)
     assert marlin.limits(M503, "M201") == (500.0, 500.0, 100.0)
     assert marlin.limits(M503[2:], "M203") is None
     assert marlin.limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
 
 
+LONG_WAY = StraightMove((0.0, 0.0, 0.0), (30.0, 40.0, 0.0), 10.0, 20.0)
+
+
+def test_a_long_move_has_a_trapezoid_of_speed_and_a_short_one_never_reaches_it():
+    assert LONG_WAY.duration_s == pytest.approx(50 / 10 + 10 / 20)
+    assert LONG_WAY.at(-1.0) == LONG_WAY.start
+    assert LONG_WAY.at(0.5) == pytest.approx((1.5, 2.0, 0.0))  # 2.5 mm while it gains speed
+    assert LONG_WAY.at(2.5) == pytest.approx((13.5, 18.0, 0.0))
+    assert LONG_WAY.at(LONG_WAY.duration_s - 0.5) == pytest.approx((28.5, 38.0, 0.0))
+    assert LONG_WAY.at(99.0) == LONG_WAY.end
+    short = StraightMove((0.0, 0.0, 5.0), (0.0, 0.0, 4.0), 100.0, 100.0)
+    assert short.duration_s == pytest.approx(0.2)
+    assert short.at(0.1) == pytest.approx((0.0, 0.0, 4.5))
+    nowhere = StraightMove((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 10.0, 10.0)
+    assert nowhere.duration_s == 0
+    assert nowhere.within((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)).at(0.0) == nowhere.end
+
+
+def test_no_axis_exceeds_its_limits():
+    move = LONG_WAY.within((3.0, 100.0, 1.0), (100.0, 4.0, 1.0))  # z does not move, and limits nothing
+    assert move.speed * 0.6 == pytest.approx(3.0)
+    assert move.acceleration * 0.8 == pytest.approx(4.0)
+    assert LONG_WAY.within((100.0, 100.0, 1.0), (100.0, 100.0, 1.0)) == LONG_WAY
+
+
 @pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("Error:Printer halted. kill() called!", True),
-        ("Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
-        ("Error:checksum mismatch, Last Line: 41", False),
-        ("echo:Printer halted", False),
-    ],
+    ("place", "expected"), [((15.0, 20.0, 2.0), 2.0), ((33.0, 44.0, 0.0), 5.0), ((-4.0, 3.0, 0.0), 5.0)]
 )
-def test_some_errors_are_the_end(line, expected):
-    assert marlin.halts(line) is expected
+def test_distance_is_to_the_way_between_its_ends(place, expected):
+    assert LONG_WAY.distance_mm(place) == pytest.approx(expected)
+    assert math.isfinite(StraightMove(place, place, 1.0, 1.0).distance_mm((0.0, 0.0, 0.0)))

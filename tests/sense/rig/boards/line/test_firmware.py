@@ -36,7 +36,7 @@ def samples_of(found: list[Header | Sample]) -> list[Sample]:
     return [each for each in found if isinstance(each, Sample)]
 
 
-@pytest.mark.parametrize("board", ["ESP32", "TEENSY"])
+@pytest.mark.parametrize("board", ["ESP32", pytest.param("TEENSY", marks=pytest.mark.slow)])
 def test_it_says_what_it_is_as_it_starts_and_whenever_it_is_asked(board: str, program: Path, tmp_path: Path) -> None:
     runs = program if board == "ESP32" else compiled("line", FIRMWARE, tmp_path, board)
     found, _ = read(runs, "run 5000", "host x", "host ?", "run 5000")

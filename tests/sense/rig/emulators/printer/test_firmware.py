@@ -46,18 +46,6 @@ def test_moves_take_their_time_and_m400_waits_for_them():
     assert firmware.at(START_S + 0.25) == pytest.approx((50, 50, 47.5), abs=0.01)
 
 
-def test_without_realtime_places_are_where_the_move_leads():
-    firmware = Firmware(HOME, realtime=False)
-    said(firmware, b"G1 X90\n")
-    assert where(firmware, 0.01, b"M114 R\n") == (90, 50, 50)
-
-
-def test_software_endstops_cut_a_move_short():
-    firmware = Firmware(HOME, bed_mm=(220.0, 220.0, 250.0))
-    said(firmware, b"G1 X300 Z-5\n")
-    assert where(firmware, 0.0) == (220, 50, 0)
-
-
 @pytest.mark.parametrize("emergency_parser", [True, False])
 def test_m410_ends_a_move_at_once_where_it_is_heard(emergency_parser):
     firmware = Firmware(HOME, emergency_parser=emergency_parser)
@@ -75,14 +63,6 @@ def test_a_busy_firmware_says_so_every_two_seconds_and_catches_up():
     assert said(firmware, b"", 2.1) == ["echo:busy: processing"]
     assert said(firmware, b"", 4.2) == ["echo:busy: processing"]
     assert said(firmware, b"", 5.1)[-1] == "ok"
-
-
-def test_a_halted_firmware_stands_and_says_nothing_more():
-    firmware = Firmware(HOME)
-    said(firmware, b"G1 X90\n")
-    assert said(firmware, b"M112\n", 0.2) == ["Error:Printer halted. kill() called!"]
-    assert said(firmware, b"M114\n", 0.3) == []
-    assert firmware.at(9.0) == firmware.at(0.2) != (90, 50, 50)
 
 
 def test_a_restarted_firmware_takes_any_place_for_the_origin_until_it_is_homed():

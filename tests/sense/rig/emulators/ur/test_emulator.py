@@ -1,8 +1,5 @@
-"""The emulated arm on its sockets: frames, the record of what it really did, and the real ur-rtde."""
+"""The emulated arm: the record of what it really did, its dashboard, and what it leaves behind."""
 
-import collections
-import importlib.util
-import json
 import re
 import subprocess
 import sys
@@ -12,43 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sense.rig.arms.ur5 import rtde_frames as ur_frames
-from sense.rig.arms.ur5.rtde_reader import HostClock, RtdeReader
 from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators.ur import truth as ur_truth
-from sense.rig.emulators.ur.controller import Series
-from sense.rig.emulators.ur.emulator import HOME, UrEmulator
-from tests.helpers.effort import few
-
-START = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0])
-CYCLE_S = 0.008
-
-needs_ur_rtde = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
-
-
-@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20))
-def test_frames_survive_any_cut(sent: list[tuple[int, bytes]], size: int) -> None:
-    stream = b"".join(ur_frames.frame(*frame) for frame in sent)
-    splitter = ur_frames.Splitter()
-    got = [frame for at in range(0, len(stream), size) for frame in splitter.feed(stream[at : at + size])]
-    assert got == sent
-
-
-def test_a_frame_without_room_for_its_header() -> None:
-    with pytest.raises(ValueError, match="2 bytes"):
-        list(ur_frames.Splitter().feed(b"\x00\x02U"))
-
-
-@few(40)
-@given(st.lists(st.floats(0, 0.5), min_size=50, max_size=50))
-def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
-    clock, delays = HostClock(), [0.0, *delays]
-    times = [clock.host_time(CYCLE_S * i, 100 + CYCLE_S * i + delay) for i, delay in enumerate(delays)]
-    np.testing.assert_allclose(times, 100 + CYCLE_S * np.arange(len(delays)), atol=1e-3)
-    assert (np.diff(times) > 0).all()
+from sense.rig.emulators.ur.emulator import UrEmulator
 
 
 def test_the_truth_keeps_the_newest_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,81 +29,19 @@ def test_the_truth_keeps_the_newest_rows(tmp_path: Path, monkeypatch: pytest.Mon
         truth.pose_at(36.0)
 
 
-class TestSockets:
-    """What clients of the running emulator see."""
-
-    @pytest.mark.parametrize(("series", "rate_hz"), [("cb3", 125), ("e", 500)])
-    def test_a_reader_gets_every_state(self, address: str, series: Series, rate_hz: int) -> None:
-        with UrEmulator(series, host=address) as robot:
-            reader = RtdeReader(address, 1.0)
-            states = [reader.read(1.0) for _ in range(rate_hz // 2)]
-            reader.close()
-            assert reader.rate_hz == rate_hz
-            assert sum(state.skipped for state in states) == 0
-            assert {state.force_n for state in states} == {0.0 if series == "e" else None}
-            times = np.array([state.time_s for state in states])
-            assert (np.diff(times[rate_hz // 4 :]) < 1.1 / rate_hz).all()
-            np.testing.assert_allclose(robot.pose_at(times[-1])[0], HOME)
-            np.testing.assert_allclose(states[-1].pose, START, atol=1e-12)
-
-    def test_one_at_a_time_and_the_ports_are_free_again(self, address: str) -> None:
-        taken = re.escape(f"{address}: Address already in use")
-        with UrEmulator(host=address), pytest.raises(RigFault, match=taken) as caught:
-            UrEmulator(host=address).__enter__()
-        assert "\n" not in str(caught.value)
-        with UrEmulator("e", host=address) as robot:
-            robot.remote_control(False)
-            asked = ["PolyscopeVersion", "is in remote control", "get serial number", "running", "nonsense"]
-            answers = ur_frames.ask_dashboard(address, asked, 1.0)
-            assert answers[0].startswith("URSoftware 5.12.2.")
-            assert answers[1:4] == ["false", "20185500000", "Program running: false"]
-            assert answers[4].startswith("could not understand")
-            assert robot.asked() == asked
-
-    @needs_ur_rtde
-    @pytest.mark.parametrize("series", ["cb3", "e"])
-    def test_ur_rtde_itself(self, address: str, host: str, series: Series) -> None:
-        program = """
-import json, sys, time, rtde_control, rtde_receive
-host = sys.argv[1]
-control, receive = rtde_control.RTDEControlInterface(host), rtde_receive.RTDEReceiveInterface(host)
-time.sleep(0.05)
-start = receive.getActualTCPPose()
-arrived = control.moveL([*start[:2], 0.19, *start[3:]], 0.2, 2.0)
-below = receive.getActualTCPPose()
-control.speedL([0, 0, 0.1, 0, 0, 0], 1.0)
-time.sleep(0.2)
-speed = receive.getActualTCPSpeed()
-control.speedStop(5.0)
-refused = []
-for work in (control.setWatchdog, control.isSteady, lambda: control.isPoseWithinSafetyLimits(start)):
-    refused += [] if work() else [str(work)]
-print(json.dumps([start, arrived, below, speed, refused]), flush=True)
-import os
-os._exit(0)
-"""
-        with UrEmulator(series, host=address):
-            done = subprocess.run(
-                [sys.executable, "-c", program, host], capture_output=True, text=True, timeout=20, check=True
-            )
-        start, arrived, below, speed, refused = json.loads(done.stdout)
-        np.testing.assert_allclose(start, START, atol=1e-9)
-        assert arrived
-        np.testing.assert_allclose(below, START - [0, 0, 0.01, 0, 0, 0], atol=1e-4)
-        assert 0.09 < speed[2] < 0.101
-        assert not refused
-
-    def test_a_restart_takes_its_time(self, address: str) -> None:
-        with UrEmulator(host=address) as robot:
-            reader = RtdeReader(address, 1.0)
-            robot.restart(0.3)
-            with pytest.raises(ConnectionError):
-                collections.deque(iter(lambda: reader.read(1.0), None))
-            with pytest.raises(ConnectionRefusedError):
-                RtdeReader(address, 1.0)
-            time.sleep(0.4)
-            RtdeReader(address, 1.0).close()
-            reader.close()
+def test_one_at_a_time_and_the_ports_are_free_again(address: str) -> None:
+    taken = re.escape(f"{address}: Address already in use")
+    with UrEmulator(host=address), pytest.raises(RigFault, match=taken) as caught:
+        UrEmulator(host=address).__enter__()
+    assert "\n" not in str(caught.value)
+    with UrEmulator("e", host=address) as robot:
+        robot.remote_control(False)
+        asked = ["PolyscopeVersion", "is in remote control", "get serial number", "running", "nonsense"]
+        answers = ur_frames.ask_dashboard(address, asked, 1.0)
+        assert answers[0].startswith("URSoftware 5.12.2.")
+        assert answers[1:4] == ["false", "20185500000", "Program running: false"]
+        assert answers[4].startswith("could not understand")
+        assert robot.asked() == asked
 
 
 LEFT = """
@@ -149,6 +52,7 @@ with UrEmulator(host=sys.argv[1]):
 """
 
 
+@pytest.mark.slow
 def test_what_a_killed_program_has_left_among_temporary_files_goes_with_the_next(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

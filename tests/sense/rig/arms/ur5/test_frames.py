@@ -1,0 +1,165 @@
+"""What comes over the wires of the arm: frames in any portions, states that are none, and times on the host's clock."""
+
+import json
+import struct
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sense.rig.arms.ur5 import messages
+from sense.rig.arms.ur5 import rtde_frames as frames
+from sense.rig.arms.ur5.rtde_reader import VARIABLES, HostClock, RtdeReader
+
+TYPES = [frames.type_of(name) for name in VARIABLES]
+VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.0, -25.0, 0.0, 0.0, 0.0, 7, 1, 1, 5)
+"""Of a state: stamp, pose, speed, force, mode, runtime, safety and progress."""
+
+
+def portions(data: bytes, size: int) -> list[bytes]:
+    return [data[at : at + size] for at in range(0, len(data), size)]
+
+
+def spoiled(data: bytes, places: list[tuple[int, int]]) -> bytes:
+    """`data` with some bytes replaced."""
+    changed = bytearray(data)
+    for at, byte in places:
+        changed[at % len(changed)] = byte
+    return bytes(changed)
+
+
+DAMAGE = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=6)
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20), DAMAGE)
+def test_frames_survive_any_cut_and_damage_is_the_same_in_any_portions(sent, size, damage) -> None:
+    def cut(parts: list[bytes]) -> list[tuple[int, bytes] | None]:
+        splitter, found = frames.Splitter(), []
+        try:
+            for part in parts:
+                for frame in splitter.feed(part):
+                    found.append(frame)
+        except ValueError:
+            found.append(None)
+        return found
+
+    stream = b"".join(frames.frame(*frame) for frame in sent)
+    assert cut(portions(stream, size)) == sent
+    if stream:
+        damaged = spoiled(stream, damage)
+        assert cut(portions(damaged, size)) == cut([damaged])
+    with pytest.raises(ValueError, match="2 bytes"):
+        list(frames.Splitter().feed(b"\x00\x02U"))
+
+
+@settings(max_examples=40)
+@given(st.lists(st.floats(0, 0.5), min_size=50, max_size=50))
+def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
+    clock, delays = HostClock(), [0.0, *delays]
+    times = [clock.host_time(0.008 * i, 100 + 0.008 * i + delay) for i, delay in enumerate(delays)]
+    np.testing.assert_allclose(times, 100 + 0.008 * np.arange(len(delays)), atol=1e-3)
+    assert (np.diff(times) > 0).all()
+
+
+class Link:
+    """A socket that hands out what a controller sends, frame by frame."""
+
+    def __init__(self, sent: list[bytes]) -> None:
+        self._sent = iter(sent)
+
+    def recv(self, most: int) -> bytes:
+        return next(self._sent, b"")
+
+    def settimeout(self, seconds: float) -> None: ...
+
+    def setsockopt(self, *option: int) -> None: ...
+
+    def sendall(self, data: bytes) -> None: ...
+
+
+def state(*values: float) -> bytes:
+    return frames.frame(frames.DATA, b"\x01" + frames.layout(TYPES).pack(*values))
+
+
+def stream(*states: bytes, major: int = 5, version: bytes = b"\x01", types: list[str] = TYPES) -> list[bytes]:
+    """What a controller sends to a reader that connects."""
+    answers = (
+        (frames.VERSION, version),
+        (frames.CONTROLLER, struct.pack(">4I", major, 11, 0, 0)),
+        (frames.OUTPUTS, b"\x01" + ",".join(types).encode()),
+        (frames.START, b"\x01"),
+    )
+    return [*(frames.frame(*answer) for answer in answers), *states]
+
+
+def reader(sent: list[bytes]) -> RtdeReader:
+    with mock.patch("socket.create_connection", return_value=Link(sent)):
+        return RtdeReader("arm", 1.0)
+
+
+def test_a_state_is_read_in_its_units_and_those_left_out_are_counted() -> None:
+    later = (VALUES[0] + 4 / 500, *VALUES[1:])
+    link = reader(stream(state(*VALUES), state(*later)))
+    first, second = link.read(1.0), link.read(1.0)
+    assert (link.version, link.rate_hz) == ((5, 11, 0, 0), 500)
+    assert first.pose == pytest.approx(VALUES[1:7])
+    assert (first.speed, first.force_n, first.sideways_n) == pytest.approx((0.5, -25.0, 10.0))
+    assert (first.mode, first.runtime, first.safety, first.progress) == (7, 1, 1, 5)
+    assert (first.skipped, second.skipped) == (0, 3)
+    without = reader(stream(state(*VALUES), major=3)).read(1.0)
+    assert (without.force_n, without.sideways_n) == (None, 0)
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        (stream(version=b"\x00"), "does not speak RTDE 2"),
+        (stream(types=["NOT_FOUND", *TYPES[1:]]), "the controller has no timestamp"),
+        (stream(types=TYPES[::-1]), "the controller would send"),
+        (stream(frames.frame(frames.DATA, b"\x01" + b"x" * 10)), "sent 10 bytes, expected 168"),
+        *((stream(state(*VALUES[:k], value, *VALUES[k + 1 :])), "NaN") for k in (3, 15) for value in (np.nan, np.inf)),
+    ],
+    ids=range(8),
+)
+def test_a_controller_of_another_kind_and_a_state_that_is_none_are_refused(sent: list[bytes], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        reader(sent).read(1.0)
+
+
+@settings(max_examples=100)
+@given(st.integers(0, 8), DAMAGE)
+def test_a_controller_that_talks_nonsense_is_an_os_or_value_error(which: int, damage: list[tuple[int, int]]) -> None:
+    """The two that whoever uses the reader is prepared for."""
+    sent = stream(*[state(*VALUES)] * 5)
+    sent[which] = spoiled(sent[which], damage)
+    try:
+        link = reader(sent)
+        for _ in range(6):
+            reading = link.read(1.0)
+            assert np.isfinite(reading.pose).all()
+            assert reading.skipped >= 0
+    except (OSError, ValueError):
+        return
+
+
+@settings(max_examples=60)
+@given(st.lists(st.booleans(), min_size=1, max_size=6), DAMAGE)
+def test_what_the_child_of_the_arm_writes_is_read_up_to_where_it_is_damaged(kinds: list[bool], damage) -> None:
+    row = messages.Row._make(np.arange(14.0).tolist())
+    answer = {"id": 1, "is": [1.5, "a"]}
+    sent = b"".join(messages.pack_row(row) if kind else messages.pack_answer(answer) for kind in kinds)
+
+    def read(data: bytes) -> list:
+        rest = [data]
+
+        def source(count: int) -> bytes:
+            taken, rest[0] = rest[0][:count], rest[0][count:]
+            return taken
+
+        return list(messages.read(source))
+
+    assert read(sent) == [row if kind else answer for kind in kinds]
+    for found in read(spoiled(sent, damage)):
+        assert isinstance(found, messages.Row) or json.dumps(found)

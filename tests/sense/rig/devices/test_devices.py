@@ -1,0 +1,104 @@
+"""Devices by their names, their ports, and processes that run padforge's own code."""
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from design.common.errors import InputError
+from sense.rig.arms.ur5.driver import UR5
+from sense.rig.boards.due import serial_link as due_link
+from sense.rig.boards.due.driver import Arduino
+from sense.rig.boards.line import driver as line_driver
+from sense.rig.devices import plugins
+from sense.rig.devices.plugins import device, device_names
+from sense.rig.devices.processes import start
+from sense.rig.devices.protocols import RigFault
+from sense.rig.devices.serial_port import refusal
+from sense.settings import RigSettings
+
+serial = pytest.importorskip("serial")
+
+
+def test_devices_are_found_by_name_and_others_are_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert {"due", "line"} <= set(device_names("padforge.boards"))
+    assert isinstance(device("padforge.arms", "ur5")(RigSettings()), UR5)
+    with pytest.raises(InputError, match=r"^arms: got 'crane', allowed are .*printer.*ur5"):
+        device("padforge.arms", "crane")
+    broken = EntryPoints([EntryPoint("crane", "no.such.module:Crane", "padforge.arms")])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: broken)
+    with pytest.raises(InputError, match=r"^crane: no.such.module:Crane cannot be loaded"):
+        device("padforge.arms", "crane")
+
+
+@pytest.mark.parametrize("python_path", [None, ":", "/nowhere::"])
+def test_code_in_the_current_folder_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, python_path: str | None
+) -> None:
+    spoil = "open('pwned', 'w').close()\n"
+    (tmp_path / "sense").mkdir()
+    for name in ("queue.py", "sense/__init__.py", "selectors.py"):
+        (tmp_path / name).write_text(spoil, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    if python_path is None:
+        monkeypatch.delenv("PYTHONPATH", raising=False)
+    else:
+        monkeypatch.setenv("PYTHONPATH", python_path)
+    process = start("sense.rig.arms.ur5.child_process", "127.0.0.1", stderr=subprocess.PIPE)
+    _, said = process.communicate(timeout=20)  # the end of its stdin ends it
+    assert not (tmp_path / "pwned").exists(), said
+    assert process.returncode == 0, said
+
+
+@pytest.mark.parametrize(
+    ("error", "match"),
+    [
+        (serial.SerialException(13, "Permission denied"), "no permission.*dialout"),
+        (serial.SerialException("could not open port 'COM7': PermissionError(13, 'Access is denied.')"), "another"),
+        (serial.SerialException("could not open port 'COM7': FileNotFoundError(2, '...')"), "no such port"),
+        (serial.SerialException("a device attached to the system is not functioning"), "not functioning.*right port"),
+    ],
+)
+def test_every_way_in_which_a_port_is_refused_comes_with_advice(error: Exception, match: str) -> None:
+    with pytest.raises(RigFault, match=match):
+        raise refusal("COM7", error)
+
+
+def test_without_pyserial_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serial", None)
+    for action in (Arduino("/dev/ttyACM0", 1000).connect, due_link.find_ports):
+        with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
+            action()
+        assert caught.value.cause == "refused"
+
+
+BUILT_IN = SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None)
+UNO = SimpleNamespace(device="/dev/ttyACM2", vid=0x2341, pid=0x0043, serial_number="uno")
+PROGRAMMING = SimpleNamespace(device="/dev/ttyACM1", vid=0x2341, pid=0x003D, serial_number="7")
+NATIVE = SimpleNamespace(device="/dev/ttyACM3", vid=0x2341, pid=0x003E, serial_number=None)
+
+
+def test_the_ports_of_a_due_are_found_native_first_and_that_of_a_line_board_where_there_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def ports(*there: SimpleNamespace) -> None:
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [BUILT_IN, *there])
+
+    ports(PROGRAMMING, NATIVE, UNO)
+    native = due_link.BoardPort("/dev/ttyACM3", "native", "")
+    assert due_link.find_ports() == [native, due_link.BoardPort("/dev/ttyACM1", "programming", "7")]
+    assert due_link.port_of(RigSettings()) == "/dev/ttyACM3"
+    with pytest.raises(RigFault, match="3 serial ports on USB; name one of /dev/ttyACM1, /dev/ttyACM2, /dev/ttyACM3"):
+        line_driver.port_of(RigSettings())
+    ports(UNO)
+    assert line_driver.port_of(RigSettings()) == "/dev/ttyACM2"
+    with pytest.raises(RigFault, match="no board is found; plug it in"):
+        due_link.port_of(RigSettings())
+    ports()
+    with pytest.raises(RigFault, match="0 serial ports on USB; plug the board in"):
+        line_driver.port_of(RigSettings())
+    for port_of in (due_link.port_of, line_driver.port_of):
+        assert port_of(RigSettings(port="COM3")) == "COM3"

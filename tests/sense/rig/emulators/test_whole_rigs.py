@@ -1,0 +1,347 @@
+"""Whole rigs without hardware: real drivers, and emulators that share one simulated pad, through faults and noise."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import padforge
+from design import Morphology
+from design.common.errors import InputError
+from design.settings import PUBLISHED_CONTACT
+from sense.recordings.press_journal import read_journal
+from sense.recordings.press_plan import PressPlan, planned
+from sense.recordings.recorder import Recorder
+from sense.recordings.recording import Recording
+from sense.recordings.simulation.pad_model import LivePad
+from sense.rig.arms.ur5.rtde_frames import RTDE_PORT
+from sense.rig.boards import block_reader
+from sense.rig.devices.protocols import RigFault
+from sense.rig.emulators import whole_rig
+from sense.rig.emulators.printer.emulator import EmulatedPrinter
+from sense.rig.operation import look_over, record
+from sense.rig.planning.setup import Setup
+from sense.rig.session.pad_frame import Frame
+from sense.rig.session.press_loop import Report, Session
+from sense.rig.session.retreat import HEIGHT_MM
+from sense.settings import RigSettings
+
+pytest.importorskip("rtde_control")
+pytest.importorskip("serial")
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
+    pytest.mark.usefixtures("own_address"),
+]
+
+PAD = Morphology.straight(2)
+QUIET = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
+NIMBLE = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.0)}
+"""A printer whose z axis is as quick as the others."""
+QUICK = {"rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5}
+QUICK |= {"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000}
+SLOWER = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 2.0, "depth_mm": 3.0, "press_mm_s": 100}
+ARM = whole_rig.emulated_rig(RigSettings.model_validate(QUICK | QUIET), PAD)
+PRINTER = whole_rig.emulated_printer_rig(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
+
+
+class Rig:
+    """An emulated rig that is kept from one recording to the next; `robot` is the emulated arm or printer."""
+
+    def __init__(self, settings: RigSettings, emulated: Callable[..., Any]) -> None:
+        self.settings, self.emulated, self.kept = settings, emulated, ExitStack()
+        self.anew()
+
+    def anew(self) -> None:
+        """Another rig in the place of this one."""
+        self.kept.close()
+        devices = self.kept.enter_context(self.emulated(PAD, PUBLISHED_CONTACT, self.settings))
+        self.arm, self.converter, self.robot, self.board = devices
+
+    def plan(self, presses: int) -> PressPlan:
+        return planned(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
+
+    def record(self, run: Path, plan: PressPlan, report: Report = lambda done, of: None) -> float:
+        """Record into `run` or go on with it; when that began."""
+        with Recorder.resume(run) if run.exists() else Recorder(run, len(PAD.knots), {}, {}) as recorder:
+            self.converter.connect()
+            self.arm.connect()
+            began = time.monotonic()
+            report(0, len(plan))
+            Session(self.arm, self.converter, recorder, self.settings).run(plan, report)
+        return began
+
+    def disturbed(self, run: Path, plan: PressPlan, disturb: Callable[["Rig"], object]) -> tuple[RigFault, float]:
+        """Record, disturbed after one more press; the fault, and how long it took to be told."""
+        moment, at = 0.0, 1 + (len(read_journal(run / "journal.ndjson")) if run.exists() else 0)
+
+        def report(done: int, of: int) -> None:
+            nonlocal moment
+            if done == at:
+                moment = time.monotonic()
+                disturb(self)
+
+        with pytest.raises(RigFault) as caught:
+            self.record(run, plan, report)
+        return caught.value, time.monotonic() - moment
+
+    def rests(self) -> bool:
+        """Whether the arm is at rest, in truth, half a second from now, and the printer for as long as it may be."""
+        if isinstance(self.robot, EmulatedPrinter):
+            now = time.monotonic()
+            return bool(np.ptp(self.robot.nozzle_at([now, now + 9]), axis=0).max() == 0)
+        time.sleep(0.5)
+        now = time.monotonic()
+        a, b = self.robot.pose_at([now - 0.05, now - 0.01])[:, :3]
+        return bool(np.linalg.norm(b - a) / 0.04 < 1)
+
+    def home(self) -> None:
+        """What a person does after a fault of a printer: switch it off and on, and home it."""
+        self.robot.restart()
+        self.robot.home()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick() -> Iterator[None]:
+    """Printers are nimble, and boards need not settle: their times need not be exact but in one test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_rig, "EmulatedPrinter", partial(EmulatedPrinter, **NIMBLE))
+        patch.setattr(block_reader, "SETTLE_S", 0.15)
+        yield
+
+
+@pytest.fixture
+def arm() -> Iterator[Rig]:
+    rig = Rig(ARM, whole_rig.emulated)
+    with rig.kept:
+        yield rig
+
+
+@pytest.fixture
+def line() -> Iterator[Rig]:
+    rig = Rig(ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), whole_rig.emulated)
+    with rig.kept:
+        yield rig
+
+
+@pytest.fixture
+def printer() -> Iterator[Rig]:
+    rig = Rig(PRINTER, whole_rig.emulated_printer)
+    with rig.kept:
+        yield rig
+
+
+def assert_whole(run: Path, plan: PressPlan, within_mm: float = 0.1) -> None:
+    """All presses are there, where and as deep as planned, without a gap, and the fibres felt each."""
+    recording = Recording.open(run)
+    assert np.array_equal(recording.presses_mm, plan.places_mm)
+    events = [json.loads(line) for line in (run / "journal.ndjson").read_text().splitlines()]
+    reached = np.array([event["at_mm"] for event in events if event["event"] == "done"])
+    assert reached == pytest.approx(np.column_stack([plan.places_mm, plan.depths_mm]), abs=within_mm)
+    spans = list(zip(recording.begun, recording.lifted, strict=True))
+    rest = [recording.readings[max(b - 4, 0) : b - 1].mean(axis=0) for b, _ in spans]
+    felt = [np.abs(recording.readings[b:u] - rest[press]).max() for press, (b, u) in enumerate(spans)]
+    assert min(felt) > 0.01
+
+
+def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_goes_down(
+    arm: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One clock: where the tip is, by the controller's states, and what the fibres give, by the board's samples."""
+    monkeypatch.setattr(block_reader, "SETTLE_S", 0.5)
+    plan = arm.plan(4)
+    began = arm.record(tmp_path / "run", plan)
+    assert_whole(tmp_path / "run", plan)
+    recording, truth = Recording.open(tmp_path / "run"), arm.robot.truth.rows()
+    assert np.diff(recording.times_s).max() < 1.5 / recording.rate_hz
+    truth = truth[truth[:, 0] > began]
+    _, depths = Frame.of(ARM).tip(truth[:, 1:4])
+    touched = np.flatnonzero((depths[1:] > 0) & (depths[:-1] <= 0))
+    change = np.abs(recording.readings - np.median(recording.readings, axis=0)).max(axis=1) > 2e-3
+    onsets = np.flatnonzero(change[1:] & ~change[:-1]) + 1
+    told = recording.times_s[onsets] + began
+    nearest = np.abs(told[:, None] - truth[touched, 0]).min(axis=1)
+    assert len(onsets) == len(plan)
+    assert np.ptp(nearest) < 0.03  # a reading is a mean over 8 ms, and shallow touches show late
+
+
+def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(printer: Rig, tmp_path: Path) -> None:
+    plan = printer.plan(2)
+    printer.record(tmp_path / "run", plan, lambda done, of: printer.robot.garble(1e-3))
+    printer.robot.garble(0)
+    assert_whole(tmp_path / "run", plan, 0.06)
+    made = printer.robot.firmware.made
+    turned = np.array([move.move.at(move.lasted_s) for move in made]) + PRINTER.tcp_mm
+    places, depths = Frame.of(PRINTER).tip(turned)
+    presses = np.column_stack([plan.places_mm, plan.depths_mm])
+    assert np.column_stack([places, depths])[depths > 0] == pytest.approx(presses, abs=0.06)
+
+
+class Fault(NamedTuple):
+    """How a rig is disturbed, what a person then reads, and what helps."""
+
+    disturb: Callable[[Rig], object]
+    cause: str
+    cure: Callable[[Rig], object]
+
+
+FAULTS = {
+    "protective": Fault(lambda rig: rig.robot.protective_stop(), "protective_stop", lambda rig: rig.robot.clear()),
+    "emergency": Fault(lambda rig: rig.robot.emergency_stop(), "emergency_stop", lambda rig: rig.robot.clear()),
+    "drop": Fault(lambda rig: rig.robot.drop("rtde"), "lost", lambda rig: None),
+    "freeze": Fault(lambda rig: rig.robot.freeze(True), "stale", lambda rig: rig.robot.freeze(False)),
+    "restart": Fault(lambda rig: rig.robot.restart(0.4), "lost", lambda rig: time.sleep(0.3)),
+    "stall": Fault(lambda rig: rig.board.stall(), "stale", lambda rig: rig.board.stall(False)),
+    "unplug": Fault(lambda rig: rig.board.unplug(), "lost", Rig.anew),
+    "reset": Fault(lambda rig: rig.board.reset(), "data", lambda rig: None),
+    "columns": Fault(lambda rig: rig.board.send_columns(15), "data", lambda rig: rig.board.send_columns(16)),
+    "printer_halts": Fault(lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
+    "printer_busy": Fault(lambda rig: rig.robot.busy(10), "stale", Rig.home),
+    "printer_restarts": Fault(lambda rig: rig.robot.restart(), "lost", Rig.home),
+    "board_of_printer": Fault(lambda rig: rig.board.unplug(), "lost", Rig.anew),
+    "printer_unplugged": Fault(lambda rig: rig.robot.unplug(), "lost", Rig.anew),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "presses", "names"),
+    [
+        ("arm", 9, "protective drop freeze stall unplug emergency restart"),
+        ("line", 6, "reset columns stall unplug"),
+        ("printer", 8, " ".join(name for name in FAULTS if "printer" in name)),
+    ],
+)
+def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(
+    kind: str, presses: int, names: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """One after the other in one recording, which is resumed after each, at last with bytes of the board damaged."""
+    rig, run = request.getfixturevalue(kind), tmp_path / "run"
+    plan = rig.plan(presses)
+    for press, name in enumerate(names.split(), start=1):
+        disturb, cause, cure = FAULTS[name]
+        fault, told_s = rig.disturbed(run, plan, disturb)
+        assert fault.cause == cause, name
+        assert "\n" not in str(fault)
+        assert told_s < (2 if kind == "printer" else 5), name
+        assert rig.rests(), name
+        if name == "board_of_printer":  # the probe is lifted
+            tip = rig.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
+            assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + HEIGHT_MM, abs=0.05)
+        assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
+        cure(rig)
+    rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
+    assert_whole(run, plan)
+    readings = Recording.open(run).readings
+    assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong one would stand out
+
+
+@pytest.mark.parametrize(("board", "grid"), [("due", 6), ("line", 8)])
+def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: int) -> None:
+    """As many as the board has inputs, and not in its order."""
+    pad = Morphology.straight(grid)
+    channels = np.random.default_rng(1).permutation(2 * grid).tolist()
+    rig = whole_rig.emulated_rig(RigSettings.model_validate({"board": board, "channels": channels, **QUIET}), pad)
+    with whole_rig.emulated(pad, PUBLISHED_CONTACT, rig) as (_, converter, _, _):
+        said = converter.connect()
+        assert said["inputs"] == list(rig.channels)
+        volts = np.median(converter.read().volts, axis=0)
+    still = LivePad(pad, PUBLISHED_CONTACT, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
+    rests_v = still.volts(np.zeros((1, 2)), np.full(1, -10.0))[0]
+    assert volts == pytest.approx(rests_v, abs=3.3 / 4095)
+    assert np.unique(volts).size > grid
+
+
+def test_a_board_that_is_not_emulated_is_refused() -> None:
+    rig = whole_rig.emulated_rig(RigSettings(board="crane"), PAD)
+    with pytest.raises(InputError, match="emulated are due and line"), whole_rig.emulated(PAD, PUBLISHED_CONTACT, rig):
+        pass
+
+
+EIGHT = Morphology.straight(8)
+LINE = RigSettings.model_validate({"board": "line", "presses": 1, **QUICK})
+
+
+@pytest.mark.slow
+def test_sixteen_fibres_are_recorded_and_their_wiring_is_kept(tmp_path: Path) -> None:
+    setup = Setup(EIGHT, PUBLISHED_CONTACT, LINE, tmp_path / "run", "test")
+    recording = record("simulated", setup)
+    assert recording is not None
+    assert recording.fibres == 16
+    assert recording.source["rig"]["channels"] == list(range(16))
+    turned = LINE.model_copy(update={"channels": tuple(range(16))[::-1]})
+    with pytest.raises(InputError, match=r"\[rig\] channels: got \[15, 14, .* was begun with \[0, 1, "):
+        record("simulated", replace(setup, rig=turned), resume=True)
+    with pytest.raises(InputError, match=r"was begun with another pad|\[rig\] channels"):
+        record("simulated", replace(setup, pad=Morphology.straight(6)), resume=True)
+
+
+def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sense.rig.diagnostics.LOOK_S", 0.3)
+    setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, LINE, tmp_path, "test")
+    found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
+    assert found["channel 1"].found.startswith("input 14 rests at")
+    assert found["channel 2"].found.startswith("input 3 rests at")
+    assert "channel 3" not in found
+    assert found["board"].found.startswith("name emulated, serial 0, channels 2, inputs [14, 3]")
+
+
+PROGRAM = """
+import sys
+from sense.rig.emulators import whole_rig
+whole_rig.HOST = sys.argv.pop(1)
+import padforge
+padforge.main()
+"""
+
+
+def await_the_end_of_its_arm(address: str) -> None:
+    """The emulated arm ends as soon as it finds that its program has."""
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        try:
+            socket.create_connection((address, RTDE_PORT), 1.0).close()
+        except ConnectionRefusedError:
+            return
+        except ConnectionResetError:  # it ends at this moment
+            pass
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
+    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[4]))
+    settings = "\n".join(f"{name} = {value}" for name, value in (QUICK | {"rate_hz": 125.0}).items())
+    Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{settings}\n", encoding="utf-8")
+    words = ["sense", "record", "--through-drivers", "--presses", "5", "--out", "run", "--resume"]
+    journal = Path("run", "journal.ndjson")
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 60
+    while not (journal.exists() and len(read_journal(journal)) >= 2):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    time.sleep(0.1)
+    process.kill()
+    process.wait()
+    kept = set(read_journal(journal))
+    await_the_end_of_its_arm(address)
+    monkeypatch.setattr(sys, "argv", ["padforge", *words])
+    with pytest.raises(SystemExit) as done:
+        padforge.main()
+    assert not done.value.code
+    assert len(Recording.open(Path("run")).presses_mm) == 5
+    assert set(read_journal(journal)) >= kept >= {0, 1}
