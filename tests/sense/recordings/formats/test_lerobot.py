@@ -9,9 +9,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from design import Morphology
 from design.common.errors import InputError
-from sense import Recording, RigSettings, simulate
+from sense import Recording
 from sense.recordings.formats import lerobot
 from sense.recordings.formats.lerobot import export_lerobot
 from sense.recordings.formats.model_findings import ModelFindings
@@ -22,12 +21,9 @@ STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", 
 
 
 @pytest.fixture(scope="module")
-def eight() -> Recording:
-    """A recording of eight presses, one of them at an unknown place, with a reading that is missing."""
-    plain = simulate(Morphology.straight(2), RigSettings(presses=8))
-    readings, places = np.array(plain.readings), np.array(plain.presses_mm)
-    readings[5, 1] = places[2] = np.nan
-    return replace(plain, readings=readings, presses_mm=places)
+def eight(eight: Recording) -> Recording:
+    """Eight presses of known depth, one of them at an unknown place, with readings that are missing."""
+    return replace(eight, depths_mm=np.where(np.isnan(eight.depths_mm), 1.5, eight.depths_mm))
 
 
 def checked(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
