@@ -301,8 +301,9 @@ def test_what_is_no_stream_of_readings_is_refused() -> None:
 def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """Times and readings (R, C) of a pad of which all goes wrong that this room knows of.
 
-    Presses are short, long, in two steps, with the tip moved, or close to each other, of one fibre or of all; levels
-    creep, drift and overshoot; readings are spiky, missing, in steps of a converter, and late now and then.
+    Presses are short, long, in two steps, with the tip moved, or close to each other, of one fibre or of all, now and
+    then the other way round; levels creep, drift and overshoot; readings are spiky, missing, noisier for a time, in
+    steps of a converter, and late now and then.
     """
     rng = np.random.default_rng(seed)
     gaps = np.where(rng.random((presses, 3)) < 0.3, 0.15, rng.uniform(0.4, 3.0, (presses, 3)))
@@ -311,6 +312,8 @@ def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.
     readings = np.full((len(times), fibres), 2.0)
     for start, turn, end in zip(down, other, up, strict=True):
         first, second = rng.exponential(0.05, (2, fibres)) * (rng.random((2, fibres)) < 0.7)
+        if seed > 7 and rng.random() < 0.2:
+            first *= -1
         second = np.where(rng.random() < 0.5, first, np.where(rng.random() < 0.5, first * 2, second))
         for at, step in ((start, first), (turn, second - first), (end, -second)):
             since = np.maximum(times - at, 0)[:, None]
@@ -320,6 +323,10 @@ def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.
     readings += rng.choice([3e-4, 2e-3, 8e-3], fibres) * rng.standard_normal(readings.shape)
     readings[rng.random(readings.shape) < 3e-3] += 0.4
     readings[len(times) // 2 : len(times) // 2 + int(2 * rate_hz), 0] = np.nan
+    if seed > 7:
+        third = readings[len(times) // 3 : len(times) // 2]
+        third += 0.03 * rng.standard_normal((len(third), 1))
+        readings[rng.random(readings.shape) < 0.2] = np.nan
     readings[rng.random(readings.shape) < 0.01] = np.nan
     return times, np.round(readings / 3.2e-3) * 3.2e-3 if seed % 2 else readings
 
@@ -333,6 +340,11 @@ SCENES = {
     (5, 30.0, 60): (59, 170815, 173827),
     (6, 14.0, 120): (105, 310988, 313704),
     (7, 14.0, 120): (98, 294192, 297817),
+    (8, 14.0, 120): (87, 249420, 253232),
+    (9, 14.0, 120): (87, 248623, 252247),
+    (10, 30.0, 100): (65, 321638, 329859),
+    (11, 8.0, 120): (60, 100596, 102451),
+    (12, 14.0, 200): (121, 527170, 533804),
 }
 """How many presses are found in scenes, and the sums of the readings at which they begin and end."""
 
