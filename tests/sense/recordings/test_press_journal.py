@@ -17,24 +17,14 @@ def test_a_torn_journal_line_loses_its_press_only(recording: Recording, folder: 
     assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
 
 
-def test_a_damaged_journal_is_one_clear_error(folder: Path) -> None:
-    journal = folder / "journal.ndjson"
-    lines = journal.read_text().splitlines(keepends=True)
-    journal.write_text("".join([*lines[:4], lines[4].replace("begun", "began"), *lines[5:]]))
-    with pytest.raises(InputError, match="line 5 is no journal entry"):
-        Recording.open(folder)
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        *(
-            ('"reading": 20,', f'"reading": {value},')
-            for value in ("1e999", "1e30", "20.0", "true", '"20"', "-1", "NaN")
-        ),
-        *(('"press": 0,', f'"press": {value},') for value in ("1e999", "0.0", "false", '"0"', "null", "9" * 30)),
+        *(('"reading": 20,', f'"reading": {value},') for value in ("1e30", "20.0", "true", '"20"', "-1", "NaN")),
+        *(('"press": 0,', f'"press": {value},') for value in ("0.0", "false", '"0"', "null", "9" * 30)),
         *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"')),
         ('"event": "begun", ', ""),
+        ('"event": "begun"', '"event": "began"'),
         ('{"event"', "[" * 100_000 + '{"event"'),
         ('{"event"', '3\n{"event"'),
         *(

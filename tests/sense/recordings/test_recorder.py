@@ -16,12 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
+from sense import Recorder, Recording
 from sense.recordings.block_file import block_dtype
-from sense.recordings.press_journal import read_journal
-from sense.recordings.recorder import JOURNAL, READINGS, START, STATES, Recorder
-from sense.recordings.recording import Recording
 from tools.kills import killed
 
+START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
 FIBRES = 3
 
 
@@ -176,8 +175,9 @@ def test_an_aborted_press_is_made_again(tmp_path):
         recorder.abort("told twice")
     events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
     assert events[-2:] == ["begun", "aborted"]
-    assert set(read_journal(tmp_path / "run" / JOURNAL)) == {0, 1}
+    assert len(Recording.open(tmp_path / "run").presses_mm) == 2
     with Recorder.resume(tmp_path / "run") as recorder:
+        assert recorder.done == {0, 1}
         record(recorder, range(2, 4), time_s + 1)
     assert len(Recording.open(tmp_path / "run").presses_mm) == 4
 
@@ -191,11 +191,6 @@ def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
     with pytest.raises(InputError, match=name):
         Recorder.resume(path)
     assert (path / name).read_bytes() == bytes(content)
-
-
-def test_no_recording_to_resume(tmp_path):
-    with pytest.raises(InputError, match="no recording"):
-        Recorder.resume(tmp_path)
 
 
 def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
@@ -212,7 +207,6 @@ def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
         assert recorder.done == kept
         recorder.begin((9, 9), recorder.readings, max(kept) + 1)
         recorder.abort("broken off")
-    assert set(read_journal(path / JOURNAL)) == kept
     assert len(Recording.open(path).presses_mm) == len(kept)
 
 
@@ -242,12 +236,28 @@ def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
         broken()
 
 
-def test_a_press_that_was_not_begun_cannot_be_finished(tmp_path):
-    """Its line would make the whole journal one that nobody can read."""
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: r.append([0.0], [[1.0, 2.0]]), r"expected \(n,\) finite numbers and \(n, 3\)"),
+        (lambda r: r.append([0.0, 1.0], [[1.0, 2.0, 3.0]]), "times have shape"),
+        (lambda r: r.append([np.nan], [[1.0, 2.0, 3.0]]), "finite numbers"),
+        (lambda r: r.finish(100), "press 5 was not begun"),
+        (lambda r: r.begin((1.0, np.nan), 100), "place is .*, expected x and y up to"),
+        (lambda r: r.begin((1e6, 0.0), 100), "place is"),
+        (lambda r: r.begin((0.0, 0.0), -1), "reading is -1"),
+        (lambda r: r.begin((0.0, 0.0), 100, press=-1), "press is -1"),
+        (lambda r: r.begin((0.0, 0.0), 100, depth_mm=np.nan), "expected what JSON can hold"),
+        (lambda r: r.begin((0.0, 0.0), 100, tip=object()), "expected what JSON can hold"),
+    ],
+)
+def test_what_would_spoil_a_recording_is_refused_and_leaves_it_as_it_was(tmp_path, call, message):
+    """A line of the journal that is none would make all of it one that nobody can read."""
     path = made(tmp_path)
-    with Recorder.resume(path) as recorder, pytest.raises(InputError, match="was not begun"):
-        recorder.finish(recorder.readings)
-    assert len(Recording.open(path).begun) == 5
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    with Recorder.resume(path) as recorder, pytest.raises(InputError, match=message):
+        call(recorder)
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
 
 def test_presses_without_a_number_count_on_from_the_last(tmp_path):
@@ -290,27 +300,14 @@ def test_a_recording_that_was_killed_while_being_born_can_be_made_again(tmp_path
         path.parent.mkdir()
         die_being_born(path, step)
         begun.append((path / START).exists())
+        if begun[-1]:
+            with pytest.raises(InputError, match="never written over"):
+                Recorder(path, FIBRES, {}, {})
         with Recorder.resume(path) if begun[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
             record(recorder, range(2), 0.0)
         assert len(Recording.open(path).presses_mm) == 2
         assert {file.name for file in path.iterdir()} == {START, READINGS, STATES, JOURNAL}
     assert begun == [False, True, True, True]
-
-
-@pytest.mark.parametrize(
-    ("files", "resumes"), [((READINGS,), False), ((READINGS, JOURNAL), False), ((READINGS, START), True)]
-)
-def test_what_is_left_of_a_birth_is_in_nobodys_way(tmp_path, files, resumes):
-    whole = made(tmp_path, presses=0)
-    (tmp_path / "half").mkdir()
-    for name in files:
-        (tmp_path / "half" / name).write_bytes((whole / START).read_bytes() if name == START else b"")
-    if resumes:
-        with pytest.raises(InputError, match="never written over"):
-            Recorder(tmp_path / "half", FIBRES, {}, {})
-    with Recorder.resume(tmp_path / "half") if resumes else Recorder(tmp_path / "half", FIBRES, {}, {}) as recorder:
-        record(recorder, range(2), 0.0)
-    assert len(Recording.open(tmp_path / "half").presses_mm) == 2
 
 
 @pytest.mark.parametrize("name", [READINGS, "notes.txt", ".unfinished-0123456789abcdef.json"])

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from design import InputError, Morphology, signals, signals_quantized
 from design.settings import PUBLISHED_CONTACT, PadSettings
@@ -44,12 +42,11 @@ def test_it_has_the_published_form() -> None:
     assert recording.rate_hz == pytest.approx(13.3, rel=0.02)
 
 
-def test_presses_keep_to_what_is_sensed_and_the_recording_says_what_that_is() -> None:
-    places = simulate(PAD, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8))).presses_mm
-    assert (np.abs(places) <= [25.001, 4.001]).all()
-    np.testing.assert_allclose(np.abs(places).max(axis=0), [25, 4], rtol=0.02)
-    assert simulate(PAD, RigSettings(presses=1), size=PadSettings(sensed_mm=(50, 8))).source["sensed_mm"] == [50, 8]
+def test_a_recording_says_what_is_sensed_of_the_pad_and_presses_no_more() -> None:
     assert simulate(PAD, RigSettings(presses=1)).source["sensed_mm"] == "beyond"
+    strip = simulate(PAD, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8)))
+    assert strip.source["sensed_mm"] == [50, 8]
+    np.testing.assert_allclose(np.abs(strip.presses_mm).max(axis=0), [25, 4], rtol=0.02)
     with pytest.raises(InputError, match=r"sensed_mm: got .*the pad itself is 56\.25 mm"):
         simulate(PAD, RigSettings(presses=1), size=PadSettings(sensed_mm=(57, 8)))
 
@@ -112,39 +109,35 @@ def test_strain_of_a_press_reaches_into_the_next_cycle() -> None:
     assert np.array_equal(found[:40, 0], found[40:, 1])
 
 
-@given(value=st.floats(-5, 5), steps=st.floats(0.5, 1e4))
-def test_a_lag_keeps_what_is_constant(value: float, steps: float) -> None:
-    assert np.allclose(Lag(steps)(np.full((50, 2), value)), value)
+def test_a_lag_keeps_what_is_constant() -> None:
+    for steps in (0.5, 30.0, 1e4):
+        assert np.allclose(Lag(steps)(np.full((50, 2), -3.5)), -3.5)
 
 
-@given(volts=st.floats(-1, 5))
-def test_the_adc_gives_whole_steps_within_half_a_step(volts: float) -> None:
-    found = digitised(np.array([volts]))[0]
-    counts = found / SUPPLY_V * ADC_STEPS
-    assert counts == pytest.approx(round(counts), abs=1e-9)
-    assert abs(found - np.clip(volts, 0, SUPPLY_V)) <= SUPPLY_V / ADC_STEPS / 2 * (1 + 1e-9)
-
-
-@given(rest=st.floats(0.5, 3), change=st.floats(0, 2))
-def test_the_divider_rests_where_it_should_and_falls_with_resistance(rest: float, change: float) -> None:
-    assert divider(np.array(rest), np.array(0.0)) == pytest.approx(rest)
-    assert 0 < divider(np.array(rest), np.array(change)) <= rest * (1 + 1e-12)
+def test_the_divider_rests_where_it_should_and_the_adc_gives_whole_steps_within_half_a_step() -> None:
+    """A fibre that has grown by as much as itself and its resistor together halves what its resistor shows."""
+    rest = np.linspace(0.5, 3, 26)
+    np.testing.assert_allclose(divider(rest, np.zeros(26)), rest)
+    np.testing.assert_allclose(divider(rest, SUPPLY_V / (SUPPLY_V - rest)), rest / 2)
+    volts = np.linspace(-1, 5, 1001)
+    counts = digitised(volts) / SUPPLY_V * ADC_STEPS
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+    assert np.abs(digitised(volts) - np.clip(volts, 0, SUPPLY_V)).max() <= SUPPLY_V / ADC_STEPS / 2 * (1 + 1e-9)
 
 
 def test_the_rest_wanders_slowly_about_its_place() -> None:
-    drift = Wander(200, 13.3, np.random.default_rng(0))(20_000)
+    drift = Wander(200, 13.3, np.random.default_rng(0))(10_000)
     assert drift.std() == pytest.approx(1, rel=0.05)
     assert np.diff(drift, axis=0).std() == pytest.approx(np.sqrt(2 / (13.3 * 600)), rel=0.02)
 
 
-@given(st.lists(st.integers(1, 40), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
-def test_asked_bit_by_bit_the_model_gives_the_same(pieces: list[int], seed: int) -> None:
-    strained = np.random.default_rng(seed).uniform(0, 2, (sum(pieces), 3))
-    whole = Answer(13.3, 0.2, 0.3, 2.5)(strained)
+def test_asked_bit_by_bit_the_model_gives_the_same() -> None:
+    pieces = [1, 7, 1, 40, 3]
+    strained = np.random.default_rng(0).uniform(0, 2, (sum(pieces), 3))
     model = Answer(13.3, 0.2, 0.3, 2.5)
     parts = np.split(strained, np.cumsum(pieces)[:-1])
-    assert np.allclose(np.vstack([model(part) for part in parts]), whole)
-    drift, again = (Wander(2, 13.3, np.random.default_rng(seed)) for _ in range(2))
+    assert np.allclose(np.vstack([model(part) for part in parts]), Answer(13.3, 0.2, 0.3, 2.5)(strained))
+    drift, again = (Wander(2, 13.3, np.random.default_rng(1)) for _ in range(2))
     assert np.allclose(np.vstack([drift(n) for n in pieces]), again(sum(pieces)))
 
 
@@ -176,9 +169,7 @@ def test_it_presses_as_deep_as_planned_and_answers_in_proportion() -> None:
     assert swing[1] / swing[0] == pytest.approx(4, rel=0.05)
 
 
-def test_it_presses_where_planned(tmp_path: Path) -> None:
-    grid = simulate(PAD, RigSettings(presses=9, plan="grid"))
-    assert grid.presses_mm[:3].tolist() == [[-22.5, -22.5], [0, -22.5], [22.5, -22.5]]
+def test_it_presses_where_a_file_says(tmp_path: Path) -> None:
     (tmp_path / "plan.csv").write_text("x_mm,y_mm,depth_mm\n1,2,3\n-4,5,0.5\n")
     listed = simulate(PAD, RigSettings(plan=str(tmp_path / "plan.csv")))
     assert listed.presses_mm.tolist() == [[1, 2], [-4, 5]]

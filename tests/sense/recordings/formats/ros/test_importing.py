@@ -81,20 +81,18 @@ def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, t
 
 
 def test_what_is_edited_counts(eight: Recording, bag: Path, tmp_path: Path) -> None:
-    def moved(topic: str, _: float, message: Any) -> bool:
+    def edited(topic: str, _: float, message: Any) -> bool:
         if topic == PLACE:
-            message.pose.pose.position.x += 0.001
-        return True
-
-    found = import_bag(changed(bag, tmp_path / "moved", moved))
-    np.testing.assert_allclose(found.presses_mm[:, 0], eight.presses_mm[:, 0] + 1)
-
-    def louder(topic: str, _: float, message: Any) -> bool:
+            message.pose.pose.position.x += moved_m
         if topic == READINGS:
-            message.data = message.data + 0.5
+            message.data = message.data + louder_v
         return True
 
-    found = import_bag(changed(bag, tmp_path / "louder", louder))
+    moved_m, louder_v = 0.001, 0.0
+    found = import_bag(changed(bag, tmp_path / "moved", edited))
+    np.testing.assert_allclose(found.presses_mm[:, 0], eight.presses_mm[:, 0] + 1)
+    moved_m, louder_v = 0.0, 0.5
+    found = import_bag(changed(bag, tmp_path / "louder", edited))
     assert found == replace(eight, readings=eight.readings + 0.5)
     assert found.source["note"] == "readings are not those that were exported"
 
