@@ -42,13 +42,8 @@ def whole(eight: Recording, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 @st.composite
 def damages(draw: st.DrawFn) -> Callable[[bytes], bytes]:
     """Bytes that are changed, lost or added, at the begin more often than elsewhere, or an end that is missing."""
-    steps = draw(
-        st.lists(
-            st.tuples(st.integers(0, 3), st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8)),
-            min_size=1,
-            max_size=3,
-        )
-    )
+    step = st.tuples(st.integers(0, 3), st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8))
+    steps = draw(st.lists(step, min_size=1, max_size=3))
 
     def damaged(content: bytes) -> bytes:
         found = bytearray(content)

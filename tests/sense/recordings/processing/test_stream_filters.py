@@ -90,18 +90,16 @@ def test_a_dead_channel_holds_the_others_back_up_to_the_cap():
 
 @pytest.mark.parametrize("fidelity", ["robust", "squares"])
 def test_a_long_recording_is_filtered_in_little_memory(fidelity):
-    """20 000 readings in blocks of 1000: the stream never takes as much as some 3000 of them, and holds few back."""
-    rng, stream, count = np.random.default_rng(0), TotalVariation(1, 4, fidelity), 0
+    """20 000 readings in blocks of 1000: the stream takes little more than a block, and holds few back."""
+    rng, stream = np.random.default_rng(0), TotalVariation(1, 4, fidelity)
     blocks = [np.cumsum(rng.normal(size=1000))[:, None] for _ in range(20)]
     stream.feed(blocks[0])
     tracemalloc.start()
-    for block in blocks:
-        count += len(stream.feed(block))
+    assert sum(len(stream.feed(block)) for block in blocks) > 19_000
     kept, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 60_000
     assert most < 20_000 * 8
-    assert count > 19_000
 
 
 @pytest.mark.parametrize("make", [lambda: TotalVariation(2, 4), lambda: RunningMedian(2, 5)])
@@ -118,14 +116,11 @@ def test_what_follows_the_end_begins_anew(make):
     ("call", "message"),
     [
         (lambda: TotalVariation(0, 4), "channels is 0, allowed is a whole number from 1 to 512"),
-        (lambda: TotalVariation(2.0, 4), "channels is 2.0"),  # type: ignore[arg-type]
         (lambda: TotalVariation(2, -1), "lam is -1"),
-        (lambda: TotalVariation(2, 4, "cubes"), "fidelity is 'cubes'"),  # type: ignore[arg-type]
         (lambda: TotalVariation(2, 4, most_held=0), "most_held is 0"),
         (lambda: TotalVariation(2, 4).feed([1, 2]), r"shape \(2,\), expected \(n, 2\)"),
         (lambda: TotalVariation(2, 4).feed([[1, 2, 3]]), r"shape \(1, 3\), expected \(n, 2\)"),
         (lambda: TotalVariation(1, 4).feed([[np.inf]]), "readings hold inf"),
-        (lambda: RunningMedian(0, 3), "channels is 0"),
         (lambda: RunningMedian(1, 2), "width is 2"),
         (lambda: RunningMedian(1, 3).feed([[1, 2]]), r"expected \(n, 1\)"),
     ],
