@@ -106,6 +106,10 @@ def test_a_block_that_claims_other_counts_is_none_even_where_its_checksum_fits(t
     (tmp_path / "s").write_bytes(content[: 8 * 256] + block + content[9 * 256 :])
     with pytest.raises(InputError, match=r"block [89] .*damaged"):
         read_blocks(tmp_path / "s", 6)
+    (tmp_path / "s").write_bytes(content[: 8 * 256] + block)
+    if claimed > 4:
+        with pytest.raises(InputError, match="block 8 is whole, but not of 6 fibres"):
+            read_blocks(tmp_path / "s", 6)
 
 
 @settings(max_examples=30)

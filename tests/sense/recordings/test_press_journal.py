@@ -17,6 +17,12 @@ def test_a_torn_journal_line_loses_its_press_only(recording: Recording, folder: 
     assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
 
 
+def test_a_press_that_was_begun_again_is_not_done(recording: Recording, folder: Path) -> None:
+    with Recorder.resume(folder) as recorder:
+        recorder.begin((0.0, 0.0), recorder.readings, press=7)
+    assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

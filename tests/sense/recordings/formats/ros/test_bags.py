@@ -4,6 +4,7 @@ import json
 import resource
 import sqlite3
 import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,7 +56,10 @@ def test_a_chunk_that_unpacks_to_gigabytes_does_not(tmp_path: Path, form: str, c
     packed = pack(bytes(2**27))
     size = {"the truth": 2**27, "less": 1000, "an exabyte": 2**60}[claim]
     path = mcap_file(tmp_path / "bomb.mcap", [chunk(packed, form, size)] * 3)
+    tracemalloc.start()
     assert ("a chunk of 1000 bytes has more" if claim == "less" else "its chunks claim") in refused(path)
+    assert tracemalloc.get_traced_memory()[1] < 2**25
+    tracemalloc.stop()
 
 
 def test_many_small_bombs_are_stopped_together(tmp_path: Path) -> None:

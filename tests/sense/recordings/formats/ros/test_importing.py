@@ -196,14 +196,17 @@ def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -
         import_file(bag.parent, ALL)
 
 
-def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
+def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
     messages = list(lab())
+    mixed = [messages[at] for at in np.random.default_rng(0).permutation(len(messages))]
     for number, part in enumerate((messages[:400], messages[400:])):
         bag = write_bag(tmp_path / f"part_{number}", part)
         (tmp_path / "bag").mkdir(exist_ok=True)
         bag.rename(tmp_path / "bag" / bag.name)
     (tmp_path / "bag" / "metadata.yaml").write_text("")
-    assert import_file(tmp_path / "bag", ALL) == import_file(write_bag(tmp_path / "lab", messages), ALL)
+    expected = import_file(write_bag(tmp_path / "lab", messages), ALL)
+    assert import_file(tmp_path / "bag", ALL) == expected
+    assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected
 
 
 @pytest.mark.slow
