@@ -354,5 +354,10 @@ def test_presses_that_are_not_felt_stay_as_commanded(recording: Recording) -> No
     begun, lifted = as_detected(silent, recording.times_s, recording.begun, recording.lifted)
     np.testing.assert_array_equal(begun[10:12], recording.begun[10:12])
     np.testing.assert_array_equal(lifted[10:11], recording.lifted[10:11])
+    held = recording.readings.copy()
+    first, last = int(recording.lifted[20]) - 2, int(recording.begun[21]) + 10
+    held[first:last] = held[first - 1]  # two presses show as one, which is neither of them
+    begun, lifted = as_detected(held, recording.times_s, recording.begun, recording.lifted)
+    np.testing.assert_array_equal((begun[20], lifted[20]), (recording.begun[20], recording.lifted[20]))
     flat = as_detected(np.ones_like(silent), recording.times_s, recording.begun, recording.lifted)
     np.testing.assert_array_equal(flat, (recording.begun, recording.lifted))
