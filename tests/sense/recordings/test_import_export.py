@@ -137,7 +137,7 @@ def test_what_is_no_path_mapping_or_recording_is_refused_in_one_line(brief: Reco
             Recorder(other, 4, {}, {})
     for write in (export_bag, export_lerobot):
         with pytest.raises(InputError, match="findings is 3, expected a ModelFindings"):
-            write(brief, tmp_path / "x", 3)
+            write(brief, tmp_path / "x", 3)  # pyright: ignore[reportArgumentType]
     for states in (np.ones((3, 9)), np.ones(10), "a", 3.0):
         with pytest.raises(InputError, match="states"):
             export_bag(brief, tmp_path / "x.mcap", states=states)  # pyright: ignore[reportArgumentType]

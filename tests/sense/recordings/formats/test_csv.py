@@ -261,7 +261,7 @@ PLAIN = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     rows=st.lists(st.lists(PLAIN, min_size=2, max_size=2), min_size=1, max_size=8),
     separator=st.sampled_from(",;\t"),

@@ -83,7 +83,7 @@ def in_a_child(work: Callable[[], None]) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(damage=st.lists(damages(), min_size=4, max_size=4))
 def test_a_damaged_file_is_a_recording_or_one_line(
     whole: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory, name: str, damage: list

@@ -1,6 +1,7 @@
 """The simulated pad behaves like one: touched fibres answer, creep, overshoot, drift; the ADC counts."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from sense.recordings.simulation.pad_model import (
 
 PAD = Morphology.straight(4)
 CYCLE = Cycle(40, 13.3)
+STILL: dict[str, Any] = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
 
 
 def test_the_same_seed_gives_the_same_recording_and_another_another() -> None:
@@ -119,23 +121,21 @@ def test_asked_bit_by_bit_the_model_gives_the_same() -> None:
 
 def test_held_presses_divide_the_supply_as_the_stretch_of_fibres_has_it() -> None:
     """A fibre's resistance grows by 0.4 of its relative stretch at 5 mm; responses scatter by a sixth of that."""
-    still = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
-    recording = simulate(PAD, RigSettings(presses=400, scatter=0, **still), PUBLISHED_CONTACT)
+    recording = simulate(PAD, RigSettings(presses=400, scatter=0, **STILL), PUBLISHED_CONTACT)
     cycles = recording.readings.reshape(400, 40, 8)
     rest, stretch = cycles[:, 15], relative_stretch(PAD, PAD.to_grid(recording.presses_mm), PUBLISHED_CONTACT)
     held = 3.3 / (1 + (3.3 / rest - 1) * (1 + 0.4 * stretch))
     np.testing.assert_allclose(cycles[:, 35], held, atol=1.6 * 3.3 / 4095)
-    rests = [simulate(PAD, RigSettings(presses=1, seed=seed, **still)).readings[0] for seed in range(20)]
+    rests = [simulate(PAD, RigSettings(presses=1, seed=seed, **STILL)).readings[0] for seed in range(20)]
     assert (np.min(rests), np.max(rests)) == pytest.approx((1.7, 2.1), abs=0.02)
-    scattered = simulate(PAD, RigSettings(presses=400, scatter=0.16, **still), PUBLISHED_CONTACT)
+    scattered = simulate(PAD, RigSettings(presses=400, scatter=0.16, **STILL), PUBLISHED_CONTACT)
     strong = rest - held > 0.05
     gains = (scattered.readings.reshape(400, 40, 8)[:, 35] - rest)[strong] / (held - rest)[strong]
     assert gains.std() == pytest.approx(0.16, rel=0.15)
 
 
 def test_presses_show_and_end_as_late_as_the_published_ones_and_creep_in_two_paces() -> None:
-    still = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
-    fast = simulate(PAD, RigSettings(presses=100, rate_hz=1000, readings_per_press=2000, **still))
+    fast = simulate(PAD, RigSettings(presses=100, rate_hz=1000, readings_per_press=2000, **STILL))
     fibre = np.abs(fast.readings - fast.readings[0]).reshape(100, 2000, 8).max(axis=2)
     strong = fibre.max(axis=1) > 0.03
     touched = np.argmax(fibre[strong, 1000:] > 0, axis=1)

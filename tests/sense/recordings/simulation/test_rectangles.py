@@ -55,7 +55,7 @@ def test_places_are_found_in_mm(recording: Recording, calibrated: tuple[Localize
     assert within == pytest.approx([0.5, 0.9], abs=0.2)
 
 
-@pytest.mark.parametrize("counts", [(0, 3), (3, 0), (1, 0)])
+@pytest.mark.parametrize("counts", [(0, 3), (3, 0), pytest.param((1, 0), marks=pytest.mark.slow)])
 def test_a_strip_finds_what_its_fibres_tell(counts: tuple[int, int]) -> None:
     """Straight parallel fibres tell nothing of the place along them; across, they tell it where two are felt."""
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 8.0))
