@@ -1,17 +1,23 @@
+"""Where and how deep a probe presses: plans of each kind over any pad, never in a hole, and plans from files."""
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from design.common.errors import InputError
-from design.pad.morphology import Morphology
+from design import InputError, Morphology
+from design.common.settings import validated
 from design.settings import PadSettings
 from sense.recordings.press_plan import PressPlan, planned, read_plan
 from sense.settings import RigSettings
 
-PAD = Morphology.straight(4)
+HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
+KINDS = ("uniform", "grid", "boustrophedon", "adaptive")
 
 
-def made(**settings: object) -> PressPlan:
-    return planned(PAD, RigSettings.model_validate(settings), np.random.default_rng(0))
+def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
+    pad = Morphology.straight(4 if size is None else size.layout)
+    return planned(pad, validated(RigSettings, settings, "rig"), np.random.default_rng(0), size)
 
 
 def test_a_plan_survives_json():
@@ -21,7 +27,7 @@ def test_a_plan_survives_json():
     assert again.depths_mm.tolist() == [2, 4, 2, 4, 2, 4, 2]
 
 
-@pytest.mark.parametrize("kind", ["uniform", "grid", "boustrophedon", "adaptive"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_all_kinds_stay_on_the_pad(kind):
     plan = made(presses=30, plan=kind)
     assert len(plan) == 30
@@ -50,16 +56,56 @@ def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row
     np.testing.assert_allclose(uniform.mean(axis=0), 0, atol=1.5)
 
 
-def test_plans_keep_to_what_is_pressed_of_the_pad():
-    for kind, presses in (("uniform", 500), ("adaptive", 500), ("grid", 9), ("boustrophedon", 9)):
-        rig = RigSettings(presses=presses, plan=kind)
-        places = planned(PAD, rig, np.random.default_rng(0), PadSettings(sensed_mm=(50.0, 8.0))).places_mm
-        np.testing.assert_allclose(np.abs(places).max(axis=0), [25, 4], rtol=0.02)
-        assert (np.abs(places) <= [25.001, 4.001]).all()
-    between = planned(
-        PAD, RigSettings(presses=9, plan="grid"), np.random.default_rng(0), PadSettings(sensed_mm="fibres")
-    ).places_mm
-    assert np.abs(between).max() == 1.5 * 11.25
+@pytest.mark.parametrize("kind", KINDS)
+def test_plans_keep_to_what_is_pressed_of_the_pad(kind: str) -> None:
+    presses = {"presses": 500 if kind in ("uniform", "adaptive") else 9, "plan": kind}
+    pad = Morphology.straight(4)
+
+    def places(**size) -> np.ndarray:
+        rig = validated(RigSettings, presses, "rig")
+        return planned(pad, rig, np.random.default_rng(0), PadSettings(**size)).places_mm
+
+    strip = places(sensed_mm=(50.0, 8.0))
+    np.testing.assert_allclose(np.abs(strip).max(axis=0), [25, 4], rtol=0.02)
+    assert (np.abs(strip) <= [25.001, 4.001]).all()
+    np.testing.assert_allclose(np.abs(places(sensed_mm="fibres")).max(), 1.5 * 11.25, rtol=0.01)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_plans_fill_a_rectangle_and_keep_out_of_holes(kind: str) -> None:
+    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+
+    def in_the_hole(plan: PressPlan) -> np.ndarray:
+        low, high = np.array(HOLE).min(axis=0), np.array(HOLE).max(axis=0)
+        return ((plan.places_mm > low) & (plan.places_mm < high)).all(axis=1)
+
+    plan = made(size, presses=300, plan=kind)
+    assert len(plan) == 300
+    assert not in_the_hole(plan).any()
+    # half a pitch beyond the outermost of 2 verticals, 8 mm apart, and of 3 horizontals, 15 mm apart
+    np.testing.assert_allclose(np.abs(plan.places_mm).max(axis=0), [8.0, 22.5], rtol=0.05)
+    assert in_the_hole(made(size.model_copy(update={"keep_out_mm": ()}), presses=300, plan=kind)).any()
+
+
+@pytest.mark.parametrize("counts", [(3, 6), (1, 9), (9, 1), (5, 4)])
+def test_places_of_a_grid_are_as_far_apart_along_both_axes(counts: tuple[int, int]) -> None:
+    size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 15.0))
+    for presses in (1, 2, 7, 60, 1500):
+        places = made(size, presses=presses, plan="grid").places_mm
+        assert len(places) == len(np.unique(places, axis=0)) == presses
+        steps = [np.diff(np.unique(places[:, axis])) for axis in range(2)]
+        if min(map(len, steps)) >= 8:
+            assert steps[0].mean() == pytest.approx(steps[1].mean(), rel=0.1)
+
+
+def test_a_hole_is_not_pressed_because_a_file_says_so(tmp_path: Path) -> None:
+    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+    (tmp_path / "plan.csv").write_text("x_mm,y_mm\n-3,2\n4,1\n")
+    with pytest.raises(InputError, match=r"plan\.csv: press 2, at \(4, 1\) mm, lies in a keep-out"):
+        made(size, plan=str(tmp_path / "plan.csv"))
+    everything = ((-20.0, -40.0), (20.0, -40.0), (20.0, 40.0), (-20.0, 40.0))
+    with pytest.raises(InputError, match=r"keep_out_mm leaves 0\.0% of what is pressed"):
+        made(size.model_copy(update={"keep_out_mm": (everything,)}))
 
 
 @pytest.mark.parametrize("plan", ["grid", "boustrophedon"])
@@ -71,10 +117,19 @@ def test_depths_of_a_grid_tell_nothing_of_the_place(plan, presses):
             assert len(set(made_so.depths_mm[made_so.places_mm[:, axis] == value])) == 5
 
 
-@pytest.mark.parametrize("depth", [0.0, -1.0])
-def test_presses_go_in(depth):
-    with pytest.raises(InputError, match="press 1 has depth"):
-        PressPlan.of([[0, 0, 1e-3], [0, 0, depth]])
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([[0, 0, 1e-3], [0, 0, 0.0]], "press 1 has depth"),
+        ([[0, 0, -1.0]], "press 0 has depth"),
+        ([[0, 0]], "shape"),
+        ([[0, 1e6, 1]], "places of the plan hold 1e.06 mm"),
+        (np.empty((0, 3)), "Q > 0"),
+    ],
+)
+def test_plans_that_no_probe_can_press_are_refused(rows, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PressPlan.of(rows)
     assert len(PressPlan.of([[0, 0, 1e-3]])) == 1
 
 

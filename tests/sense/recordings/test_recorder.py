@@ -2,23 +2,25 @@
 
 import json
 import os
+import resource
+import shutil
+import signal
+import time
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
+from sense import Recorder, Recording
 from sense.recordings.block_file import block_dtype
-from sense.recordings.press_journal import read_journal
-from sense.recordings.recorder import JOURNAL, READINGS, START, STATES, Recorder
-from sense.recordings.recording import Recording
-from tests.helpers.effort import few
 from tools.kills import killed
 
+START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
 FIBRES = 3
 
 
@@ -42,6 +44,21 @@ def made(folder, presses=5):
     return folder / "run"
 
 
+@pytest.fixture(scope="module")
+def five(tmp_path_factory):
+    """The files of a run directory of five presses."""
+    path = made(tmp_path_factory.mktemp("five"))
+    return {file.name: file.read_bytes() for file in path.iterdir()}
+
+
+def require_as_recorded(recording):
+    """See that every press has its place and the readings that `record` gave it."""
+    for (x, y), begun, lifted in zip(recording.presses_mm, recording.begun, recording.lifted, strict=True):
+        assert x == -y
+        assert (recording.readings[begun:lifted] == x + 0.5).all()
+    assert (np.diff(recording.times_s) > 0).all()
+
+
 def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
     path = made(tmp_path)
     before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
@@ -52,23 +69,23 @@ def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
     assert {name: (path / name).read_bytes() for name in before} == before
 
 
-@few(20)
+@settings(max_examples=15)
 @given(st.data())
-def test_a_kill_at_any_byte_loses_no_finished_press(tmp_path_factory, data):
+def test_a_kill_at_any_byte_loses_no_finished_press(five, tmp_path_factory, data):
     """Files grow in the order readings, states, journal; a kill leaves any prefix of what came after the last sync."""
-    path = made(tmp_path_factory.mktemp("killed"))
-    whole = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
-    lines = whole[JOURNAL].splitlines(keepends=True)
+    path = tmp_path_factory.mktemp("killed")
+    (path / START).write_bytes(five[START])
+    lines = five[JOURNAL].splitlines(keepends=True)
     finished = data.draw(st.integers(0, 4))
     synced = {JOURNAL: sum(map(len, lines[: 2 * finished]))}
     for name, columns, rows in ((READINGS, FIBRES, 20), (STATES, 9, 10)):
         dtype = block_dtype(columns)
-        blocks = np.frombuffer(whole[name], dtype)
+        blocks = np.frombuffer(five[name], dtype)
         kept = int(np.searchsorted(np.cumsum(blocks["count"]), rows * finished, side="right")) if finished else 0
         synced[name] = kept * dtype.itemsize
-    for name, content in whole.items():
-        cut = data.draw(st.integers(synced[name], len(content)))
-        (path / name).write_bytes(content[: cut if name != JOURNAL else min(cut, synced[name] + 40)])
+    for name in (READINGS, STATES, JOURNAL):
+        cut = data.draw(st.integers(synced[name], len(five[name])))
+        (path / name).write_bytes(five[name][: cut if name != JOURNAL else min(cut, synced[name] + 40)])
     with Recorder.resume(path) as recorder:
         assert recorder.done >= set(range(finished))
         assert len(recorder.done) <= finished + 1
@@ -76,10 +93,77 @@ def test_a_kill_at_any_byte_loses_no_finished_press(tmp_path_factory, data):
         for press in left:
             record(recorder, range(press, press + 1), max(recorder.last_s, 0.0) + 1)
     recording = Recording.open(path)
-    assert recording.presses_mm.tolist() == [[press, -press] for press in range(5)]
-    for press, (begun, lifted) in enumerate(zip(recording.begun, recording.lifted, strict=True)):
-        assert (recording.readings[begun:lifted] == press + 0.5).all()
-    assert (np.diff(recording.times_s) > 0).all()
+    assert recording.presses_mm[:, 0].tolist() == list(range(5))
+    require_as_recorded(recording)
+
+
+def in_a_child(work):
+    """Do `work` in another process; its number."""
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            work()
+            code = 0
+        except (OSError, InputError):
+            code = 2
+        finally:
+            os._exit(code)
+    return child
+
+
+@pytest.mark.parametrize("limit", [100, 300, 700, 2000, 5200, 6000])
+def test_a_full_disk_loses_no_finished_press(tmp_path, limit):
+    """What was told to be done before the disk was full is there, and the rest can be recorded when it is not."""
+    told = tmp_path / "told"
+    told.touch()
+
+    def work():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+            for press in range(12):
+                record(recorder, range(press, press + 1), 2.0 * press)
+                os.truncate(told, press + 1)
+
+    code = os.waitstatus_to_exitcode(os.waitpid(in_a_child(work), 0)[1])
+    done = told.stat().st_size
+    assert (code, done < 12) == (2, True)
+    if not (tmp_path / "run" / START).exists():
+        assert done == 0
+        return
+    with Recorder.resume(tmp_path / "run") as recorder:
+        assert set(range(done)) <= recorder.done
+        record(recorder, range(20, 22), max(recorder.last_s, 0.0) + 1)
+        there = recorder.done
+    found = Recording.open(tmp_path / "run")
+    require_as_recorded(found)
+    assert set(found.presses_mm[:, 0]) == there
+
+
+@pytest.mark.parametrize("pause_s", [0.01, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_a_kill_in_the_middle_loses_no_finished_press(tmp_path, pause_s):
+    told = tmp_path / "told"
+    told.touch()
+
+    def work():
+        with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+            for press in range(10_000):
+                record(recorder, range(press, press + 1), 2.0 * press)
+                os.truncate(told, press + 1)
+
+    child = in_a_child(work)
+    while not told.stat().st_size:
+        time.sleep(0.001)
+    time.sleep(pause_s)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    done = told.stat().st_size
+    found = Recording.open(tmp_path / "run")
+    require_as_recorded(found)
+    assert found.presses_mm[:, 0].tolist()[:done] == list(range(done))
+    with Recorder.resume(tmp_path / "run") as recorder:
+        assert set(range(done)) <= recorder.done
 
 
 def test_an_aborted_press_is_made_again(tmp_path):
@@ -91,8 +175,9 @@ def test_an_aborted_press_is_made_again(tmp_path):
         recorder.abort("told twice")
     events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
     assert events[-2:] == ["begun", "aborted"]
-    assert set(read_journal(tmp_path / "run" / JOURNAL)) == {0, 1}
+    assert len(Recording.open(tmp_path / "run").presses_mm) == 2
     with Recorder.resume(tmp_path / "run") as recorder:
+        assert recorder.done == {0, 1}
         record(recorder, range(2, 4), time_s + 1)
     assert len(Recording.open(tmp_path / "run").presses_mm) == 4
 
@@ -106,11 +191,6 @@ def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
     with pytest.raises(InputError, match=name):
         Recorder.resume(path)
     assert (path / name).read_bytes() == bytes(content)
-
-
-def test_no_recording_to_resume(tmp_path):
-    with pytest.raises(InputError, match="no recording"):
-        Recorder.resume(tmp_path)
 
 
 def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
@@ -127,17 +207,20 @@ def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
         assert recorder.done == kept
         recorder.begin((9, 9), recorder.readings, max(kept) + 1)
         recorder.abort("broken off")
-    assert set(read_journal(path / JOURNAL)) == kept
     assert len(Recording.open(path).presses_mm) == len(kept)
 
 
 def test_two_programs_cannot_record_into_one_folder(tmp_path):
     path = made(tmp_path)
-    with Recorder.resume(path):
+    with Recorder.resume(path) as first:
         before = (path / READINGS).read_bytes()
         with pytest.raises(InputError, match="another program is recording"):
             Recorder.resume(path)
+        with pytest.raises(InputError, match="never written over"):
+            Recorder(path, FIBRES, {}, {})
         assert (path / READINGS).read_bytes() == before
+        record(first, range(5, 7), 10.0)
+    assert len(Recording.open(path).begun) == 7
 
 
 def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
@@ -153,12 +236,28 @@ def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
         broken()
 
 
-def test_a_press_that_was_not_begun_cannot_be_finished(tmp_path):
-    """Its line would make the whole journal one that nobody can read."""
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: r.append([0.0], [[1.0, 2.0]]), r"expected \(n,\) finite numbers and \(n, 3\)"),
+        (lambda r: r.append([0.0, 1.0], [[1.0, 2.0, 3.0]]), "times have shape"),
+        (lambda r: r.append([np.nan], [[1.0, 2.0, 3.0]]), "finite numbers"),
+        (lambda r: r.finish(100), "press 5 was not begun"),
+        (lambda r: r.begin((1.0, np.nan), 100), "place is .*, expected x and y up to"),
+        (lambda r: r.begin((1e6, 0.0), 100), "place is"),
+        (lambda r: r.begin((0.0, 0.0), -1), "reading is -1"),
+        (lambda r: r.begin((0.0, 0.0), 100, press=-1), "press is -1"),
+        (lambda r: r.begin((0.0, 0.0), 100, depth_mm=np.nan), "expected what JSON can hold"),
+        (lambda r: r.begin((0.0, 0.0), 100, tip=object()), "expected what JSON can hold"),
+    ],
+)
+def test_what_would_spoil_a_recording_is_refused_and_leaves_it_as_it_was(tmp_path, call, message):
+    """A line of the journal that is none would make all of it one that nobody can read."""
     path = made(tmp_path)
-    with Recorder.resume(path) as recorder, pytest.raises(InputError, match="was not begun"):
-        recorder.finish(recorder.readings)
-    assert len(Recording.open(path).begun) == 5
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    with Recorder.resume(path) as recorder, pytest.raises(InputError, match=message):
+        call(recorder)
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
 
 def test_presses_without_a_number_count_on_from_the_last(tmp_path):
@@ -201,27 +300,14 @@ def test_a_recording_that_was_killed_while_being_born_can_be_made_again(tmp_path
         path.parent.mkdir()
         die_being_born(path, step)
         begun.append((path / START).exists())
+        if begun[-1]:
+            with pytest.raises(InputError, match="never written over"):
+                Recorder(path, FIBRES, {}, {})
         with Recorder.resume(path) if begun[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
             record(recorder, range(2), 0.0)
         assert len(Recording.open(path).presses_mm) == 2
         assert {file.name for file in path.iterdir()} == {START, READINGS, STATES, JOURNAL}
     assert begun == [False, True, True, True]
-
-
-@pytest.mark.parametrize(
-    ("files", "resumes"), [((READINGS,), False), ((READINGS, JOURNAL), False), ((READINGS, START), True)]
-)
-def test_what_is_left_of_a_birth_is_in_nobodys_way(tmp_path, files, resumes):
-    whole = made(tmp_path, presses=0)
-    (tmp_path / "half").mkdir()
-    for name in files:
-        (tmp_path / "half" / name).write_bytes((whole / START).read_bytes() if name == START else b"")
-    if resumes:
-        with pytest.raises(InputError, match="never written over"):
-            Recorder(tmp_path / "half", FIBRES, {}, {})
-    with Recorder.resume(tmp_path / "half") if resumes else Recorder(tmp_path / "half", FIBRES, {}, {}) as recorder:
-        record(recorder, range(2), 0.0)
-    assert len(Recording.open(tmp_path / "half").presses_mm) == 2
 
 
 @pytest.mark.parametrize("name", [READINGS, "notes.txt", ".unfinished-0123456789abcdef.json"])
@@ -271,14 +357,16 @@ def test_what_a_recording_needs_to_be_opened_outlasts_a_power_cut(tmp_path, monk
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
-def test_a_recording_that_gives_way_is_there_whole_or_not_at_all(tmp_path):
-    """Killed between any two file operations; and what is left goes with the next."""
+@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_recording_that_gives_way_is_there_whole_or_not_at_all(tmp_path, step):
+    """Killed between two file operations, any in the slow tier; and what is left goes with the next."""
     new = replace(Recording.open(made(tmp_path, presses=2)), source={"kind": "simulated"})
+    with Recorder(tmp_path / "old", FIBRES, {"kind": "simulated"}, {}) as recorder:
+        record(recorder, range(3), 0.0)
     found = []
-    for number in count():
+    for number in count(step=step):
         folder = tmp_path / str(number)
-        with Recorder(folder / "run", FIBRES, {"kind": "simulated"}, {}) as recorder:
-            record(recorder, range(3), 0.0)
+        shutil.copytree(tmp_path / "old", folder / "run")
         (folder / ".run-mine").mkdir()
         ended = not killed(lambda folder=folder: new.save(folder / "run", {}, replacing=True), number, folder)
         found.append(len(Recording.open(folder / "run").presses_mm) if (folder / "run").exists() else 0)
@@ -287,5 +375,6 @@ def test_a_recording_that_gives_way_is_there_whole_or_not_at_all(tmp_path):
         assert {path.name for path in folder.iterdir()} == {"run", ".run-mine"}
         if ended:
             break
-    assert set(found) == {3, 0, 2}
+    assert set(found) <= {3, 0, 2}
     assert found == sorted(found, key=[3, 0, 2].index)
+    assert step > 1 or set(found) == {3, 0, 2}

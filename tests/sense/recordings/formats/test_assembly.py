@@ -63,16 +63,9 @@ def test_readings_lie_one_way_or_the_other() -> None:
 
 
 def test_units_are_put_right() -> None:
-    recording = made(
-        {
-            "time": 1000 * TIMES,
-            "fibres": (1000 * VOLTS).astype(np.int32),
-            "places": PLACES / 10,
-            "begun": np.array([150, 601]),
-            "lifted": np.array([500, 801]),
-        },
-        **{"time": 1e-3, "fibres": 1e-3, "places": 10, "begun": 1e-3, "lifted": 1e-3},
-    )
+    told = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "places": PLACES / 10}
+    edges = {"begun": np.array([150, 601]), "lifted": np.array([500, 801])}
+    recording = made(told | edges, **dict.fromkeys(("time", "fibres", "begun", "lifted"), 1e-3), places=10)
     expected = made(EDGES | {"places": PLACES})
     for name in ("times_s", "readings", "presses_mm", "begun", "lifted"):
         np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
@@ -109,19 +102,14 @@ def test_presses_that_nothing_tells_are_found(recording: Recording) -> None:
         ({"time": np.array(["a", "b"])}, "time are"),
         ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), as time has it"),
         ({"fibres": np.ones((12, 2, 2))}, "fibres have shape"),
-        ({"fibres": VOLTS * 1j}, "fibres are"),
         ({"press": PRESSED[:11]}, "press has 11 values, expected 12, one a reading"),
-        (
-            {"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))},
-            "press is missing or negative in row 11 and 0",
-        ),
+        ({"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))}, "press is missing or negative in row 11 and 0"),
         ({"press": 0 * PRESSED}, "press is nowhere above 0; without it, presses are found"),
         ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
         ({"press": 1 - PRESSED}, "press 0 goes from reading 0"),
         ({"press": np.array([0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0, 0])}, "press 1 goes from reading 4"),
         (EDGES | {"lifted": np.array([5])}, "begun has 2 values and lifted 1"),
         (EDGES | {"begun": np.array([2.5, 7])}, "begun are .* whole numbers"),
-        (EDGES | {"begun": np.array([2, 4])}, "press 1 goes from reading 4"),
         (EDGES | {"lifted": np.array([5, 10**9])}, "press 1 goes from"),
         (EDGES | {"places": np.ones((3, 2))}, "places are 3, expected one for each of 2 presses or 12 readings"),
         (EDGES | {"places": np.ones((2, 2, 2))}, r"places have shape \(2, 2, 2\)"),

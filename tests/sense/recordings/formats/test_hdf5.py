@@ -1,53 +1,62 @@
+"""Recordings as HDF5: every number comes back; nothing is read from elsewhere, and little of what is claimed."""
+
 import os
-import time
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from design import Morphology
 from design.common.errors import InputError
-from sense import RigSettings, open_recording, simulate
-from sense.cli.main import sense
-from sense.recordings.formats.hdf5 import export_hdf5, import_hdf5
+from sense import Recording, export_hdf5, import_hdf5, open_recording
+
+MAPPING = "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"
 
 
-@pytest.fixture(scope="module")
-def eight():
-    """A recording of eight presses."""
-    return simulate(Morphology.straight(2), RigSettings(presses=8))
+def refused(path: Path, mapping: str = "") -> str:
+    """The one line that a file is refused with."""
+    with pytest.raises(InputError) as refusal:
+        import_hdf5(path, mapping)
+    line = str(refusal.value)
+    assert path.name in line
+    assert "\n" not in line
+    return line
 
 
-def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path, eight):
-    export_hdf5(eight, tmp_path / "a.h5")
-    export_hdf5(eight, tmp_path / "b.h5")
-    again = import_hdf5(tmp_path / "a.h5")
-    assert again == eight
-    assert again.source == eight.source
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-    assert open_recording(tmp_path / "a.h5") == eight
+def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path: Path, eight: Recording) -> None:
+    for each, measures in (
+        (eight, {"depths_mm", "reached_mm", "forces_n"}),
+        (replace(eight, depths_mm=np.empty(0), reached_mm=np.empty(0)), {"forces_n"}),
+    ):
+        for name in ("a.h5", "b.h5"):
+            export_hdf5(each, tmp_path / name)
+        again = import_hdf5(tmp_path / "a.h5")
+        assert again == open_recording(tmp_path / "b.h5") == each
+        assert again.source == each.source
+        assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+        with h5py.File(tmp_path / "a.h5") as file:
+            assert set(file) - {"times_s", "readings_v", "presses_mm", "begun", "lifted"} == measures
 
 
-@pytest.mark.parametrize("keep", [0, 10, 500, -1])
-def test_a_torn_file_is_one_clear_line(tmp_path, keep, eight):
-    export_hdf5(eight, tmp_path / "a.h5")
-    content = (tmp_path / "a.h5").read_bytes()
-    (tmp_path / "torn.h5").write_bytes(content[:keep])
-    with pytest.raises(InputError, match=r"torn\.h5") as refusal:
-        import_hdf5(tmp_path / "torn.h5")
-    assert "\n" not in str(refusal.value)
-
-
-def test_other_files_are_refused(tmp_path):
-    import h5py
-
+def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = np.arange(3)
-    for name, reason in (("other.h5", "format is None"), ("absent.h5", "cannot be read")):
-        with pytest.raises(InputError, match=reason):
-            import_hdf5(tmp_path / name)
+    os.mkfifo(tmp_path / "pipe.h5")
+    assert "format is None" in refused(tmp_path / "other.h5")
+    assert "cannot be read" in refused(tmp_path / "absent.h5")
+    assert "a pipe or device, expected a file" in refused(tmp_path / "pipe.h5")
+    export_hdf5(eight, tmp_path / "a.h5")
+    content = (tmp_path / "a.h5").read_bytes()
+    for keep in (0, 10, 500, -1):
+        (tmp_path / "torn.h5").write_bytes(content[:keep])
+        refused(tmp_path / "torn.h5")
+    with h5py.File(tmp_path / "deep.h5", "w", libver="latest") as file:
+        group = file
+        for _ in range(300):
+            group = group.create_group("g")
+    assert "it has groups within groups, more than 64" in refused(tmp_path / "deep.h5", "time=t,fibres=a")
 
 
 @pytest.mark.parametrize(
@@ -55,59 +64,43 @@ def test_other_files_are_refused(tmp_path):
     [
         ({"times_s": None}, "times_s"),
         ({"times_s": "group"}, "times_s is no dataset"),
-        ({"times_s": "empty"}, "times_s holds None values"),
-        ({"readings_v": "huge"}, r"readings_v holds 1000000000000 values, allowed are 268435456"),
+        ({"times_s": h5py.Empty("f8")}, "times_s holds None values"),
         ({"readings_v": "text"}, "readings_v holds object values, expected an array of real numbers"),
         ({"readings_v": np.full((40, 2), np.inf)}, "readings hold infinity"),
         ({"presses_mm": np.array([[1.0, np.nan]])}, "press 0 has one of x and y"),
         ({"begun": np.array([20.5])}, "begun are .*whole numbers"),
         ({"times_s": np.arange(39.0)}, "times have shape"),
+        ({"readings_v": (10**6, 10**6, 100)}, "readings_v holds 1000000000000 values, allowed are 268435456"),
+        ({"readings_v": (2**24, 1, 2**20)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
+        ({"readings_v": (16, 1, 2**24)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
+        ({"readings_v": (2**29, 1, 2**20)}, "readings_v holds 536870912 values, allowed are 268435456 in all"),
     ],
 )
-def test_datasets_that_do_not_fit_are_one_clear_line(tmp_path, change, reason):
-    import h5py
-
-    fine = {
-        "times_s": np.arange(40.0),
-        "readings_v": np.ones((40, 2)),
-        "presses_mm": np.ones((1, 2)),
-        "begun": np.array([20]),
-        "lifted": np.array([40]),
-    }
+def test_datasets_that_do_not_fit_or_claim_much_are_one_line(
+    tmp_path: Path, change: dict[str, Any], reason: str
+) -> None:
+    fine = {"times_s": np.arange(40.0), "readings_v": np.ones((40, 2)), "presses_mm": np.ones((1, 2))}
+    edges = {"begun": np.array([20]), "lifted": np.array([40])}
     with h5py.File(tmp_path / "r.h5", "w") as file:
         file.attrs["format"], file.attrs["source"] = "padforge-hdf5/1", "{}"
-        for name, values in (fine | change).items():
-            if isinstance(values, np.ndarray):
-                file[name] = values
-            elif values == "group":
+        for name, values in (fine | edges | change).items():
+            if isinstance(values, str) and values == "group":
                 file.create_group(name)
-            elif values == "empty":
-                file[name] = h5py.Empty("f8")
-            elif values == "huge":
-                file.create_dataset(name, shape=(10**6, 10**6), dtype="f8", chunks=(100, 100))
+            elif isinstance(values, tuple):
+                rows, columns, chunk = values
+                most = {"maxshape": (None, columns), "chunks": (chunk, 1 if columns == 1 else chunk)}
+                file.create_dataset(name, (rows, columns), "f8", compression="gzip", **most)[:8, 0] = 1
             elif values is not None:
                 file[name] = values
+    assert (tmp_path / "r.h5").stat().st_size < 2e6
     with pytest.raises(InputError, match=rf"r\.h5: .*{reason}") as refusal:
         import_hdf5(tmp_path / "r.h5")
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("suffix", ["h5", "csv"])
-def test_export_and_import_by_command(tmp_path, suffix, eight):
-    eight.save(tmp_path / "run", {})
-    file = tmp_path / f"out.{suffix}"
-    result = CliRunner().invoke(sense, ["export", str(tmp_path / "run"), str(file)])
-    assert result.exit_code == 0, result.output
-    result = CliRunner().invoke(sense, ["import", str(file), "--out", str(tmp_path / "again")])
-    assert result.exit_code == 0, result.output
-    assert open_recording(tmp_path / "again") == eight
-
-
-def lab(folder, **changes):
+def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
     """A file of somebody's program, and what it holds; a change to None leaves a dataset out."""
-    import h5py
-
-    content = {
+    content: dict[str, Any] = {
         "t": np.arange(40.0) * 100,
         "data/volts": np.random.default_rng(0).integers(900, 1100, (3, 40)).astype(np.int16),
         "xy": np.array([[1.0, 2], [-3, 4]]),
@@ -122,7 +115,7 @@ def lab(folder, **changes):
     return content
 
 
-def test_a_mapping_tells_what_other_datasets_hold(tmp_path):
+def test_a_mapping_tells_what_other_datasets_hold(tmp_path: Path) -> None:
     content = lab(tmp_path)
     mapping = "time=/t:ms,fibres=/data/volts:mV,places=/xy:cm,begun=/on,lifted=off"
     recording = import_hdf5(tmp_path / "lab.h5", mapping)
@@ -137,33 +130,27 @@ def test_a_mapping_tells_what_other_datasets_hold(tmp_path):
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("volts", "ch*")).fibres == 2
 
 
-@pytest.mark.parametrize(
-    ("mapping", "reason"),
-    [
-        ("", "format is None, expected 'padforge-hdf5/1'; .* there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"),
+def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path: Path) -> None:
+    lab(tmp_path)
+    there = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
+    for mapping, reason in (
+        ("", f"format is None, expected 'padforge-hdf5/1'; a mapping tells what other datasets hold, {there}"),
         ("time=/s,fibres=data/volts", "time is 's', expected one of 'data/volts', 'note'"),
         ("time=t,fibres=data", "fibres is 'data', expected one of"),
         ("time=t,fibres=note", "note holds object values, expected an array of real numbers"),
-        ("time=on,fibres=data/volts:mV", r"fibres have shape \(3, 40\), expected \(2, C\) or \(C, 2\)"),
-    ],
-)
-def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path, mapping, reason):
-    lab(tmp_path)
-    with pytest.raises(InputError, match=rf"lab\.h5: {reason}"):
-        import_hdf5(tmp_path / "lab.h5", mapping)
+        ("time=on,fibres=data/volts:mV", "fibres have shape (3, 40), expected (2, C) or (C, 2)"),
+    ):
+        assert reason in refused(tmp_path / "lab.h5", mapping)
 
 
 @pytest.mark.parametrize("kind", ["external link", "soft link", "virtual", "external storage"])
-def test_nothing_is_read_from_another_file(tmp_path, eight, kind):
+def test_nothing_is_read_from_another_file(tmp_path: Path, eight: Recording, kind: str) -> None:
     """Neither a file that is there, nor a pipe that nobody writes to, which would hang."""
-    import h5py
-
     path = tmp_path / "r.h5"
+    (tmp_path / "other").write_bytes(eight.readings.tobytes())
+    os.mkfifo(tmp_path / "pipe")
     for other in ("other", "pipe"):
         export_hdf5(eight, path)
-        (tmp_path / "other").write_bytes(eight.readings.tobytes())
-        if other == "pipe":
-            os.mkfifo(tmp_path / "pipe")
         with h5py.File(path, "a") as file:
             del file["readings_v"]
             if kind == "external link":
@@ -178,58 +165,7 @@ def test_nothing_is_read_from_another_file(tmp_path, eight, kind):
             else:
                 storage = [(str(tmp_path / other), 0, eight.readings.nbytes)]
                 file.create_dataset("readings_v", eight.readings.shape, "f8", external=storage)
-        for mapping in ("", "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"):
-            with pytest.raises(InputError, match=r"r\.h5: .*readings_v") as refused:
-                import_hdf5(path, mapping)
-            assert "expected" in str(refused.value)
-
-
-def test_a_pipe_is_no_file(tmp_path):
-    os.mkfifo(tmp_path / "pipe.h5")
-    with pytest.raises(InputError, match="a pipe or device, expected a file"):
-        import_hdf5(tmp_path / "pipe.h5")
-
-
-def test_small_files_cannot_ask_for_much_memory(tmp_path, eight):
-    import h5py
-
-    for size, chunk, reason in (
-        (2**24, 2**20, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
-        (16, 2**24, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
-        (2**29, 2**20, "readings_v holds 536870912 values, allowed are 268435456 in all that is read"),
-    ):
-        export_hdf5(eight, tmp_path / "r.h5")
-        with h5py.File(tmp_path / "r.h5", "a") as file:
-            del file["readings_v"]
-            dataset = file.create_dataset(
-                "readings_v", (size, 1), "f8", maxshape=(None, 1), chunks=(chunk, 1), compression="gzip"
-            )
-            dataset[:8] = 1
-        assert (tmp_path / "r.h5").stat().st_size < 2e6
-        with pytest.raises(InputError, match=reason):
-            import_hdf5(tmp_path / "r.h5")
-
-
-MEASURES = {"depths_mm", "reached_mm", "forces_n"}
-
-
-def test_depth_and_force_are_kept_where_they_are_known(recording, tmp_path):
-    count = len(recording.begun)
-    known = replace(recording, reached_mm=np.linspace(4, 5, count), forces_n=np.full(count, 2.5))
-    for each, names in ((replace(recording, depths_mm=np.empty(0)), set()), (known, MEASURES)):
-        export_hdf5(each, tmp_path / "r.h5")
-        assert import_hdf5(tmp_path / "r.h5") == each
-        with h5py.File(tmp_path / "r.h5") as file:
-            assert set(file) & MEASURES == names
-
-
-def test_groups_within_groups_do_not_take_minutes(tmp_path):
-    path = tmp_path / "deep.h5"
-    with h5py.File(path, "w", libver="latest") as file:
-        group = file
-        for _ in range(3000):
-            group = group.create_group("g")
-    begin = time.process_time()
-    with pytest.raises(InputError, match=r"deep\.h5: it has groups within groups, more than 64"):
-        import_hdf5(path, "time=t,fibres=a")
-    assert time.process_time() - begin < 1
+        for mapping in ("", MAPPING):
+            line = refused(path, mapping)
+            assert "readings_v" in line
+            assert "expected" in line

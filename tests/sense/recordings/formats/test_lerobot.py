@@ -9,9 +9,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from design import Morphology
 from design.common.errors import InputError
-from sense import Recording, RigSettings, simulate
+from sense import Recording
 from sense.recordings.formats import lerobot
 from sense.recordings.formats.lerobot import export_lerobot
 from sense.recordings.formats.model_findings import ModelFindings
@@ -22,12 +21,9 @@ STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", 
 
 
 @pytest.fixture(scope="module")
-def eight() -> Recording:
-    """A recording of eight presses, one of them at an unknown place, with a reading that is missing."""
-    plain = simulate(Morphology.straight(2), RigSettings(presses=8))
-    readings, places = np.array(plain.readings), np.array(plain.presses_mm)
-    readings[5, 1] = places[2] = np.nan
-    return replace(plain, readings=readings, presses_mm=places)
+def eight(eight: Recording) -> Recording:
+    """Eight presses of known depth, one of them at an unknown place, with readings that are missing."""
+    return replace(eight, depths_mm=np.where(np.isnan(eight.depths_mm), 1.5, eight.depths_mm))
 
 
 def checked(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
@@ -77,9 +73,7 @@ def read_columns(folder: Path, info: dict[str, Any], episodes: list[dict[str, An
     return columns
 
 
-def check_counts(
-    info: dict[str, Any], columns: dict[str, np.ndarray], episodes: list[dict[str, Any]], tasks: list[str]
-) -> None:
+def check_counts(info: dict, columns: dict[str, np.ndarray], episodes: list[dict], tasks: list[str]) -> None:
     assert columns["index"].tolist() == list(range(info["total_frames"]))
     end = 0
     for number, episode in enumerate(episodes):
@@ -94,9 +88,7 @@ def check_counts(
     assert end == info["total_frames"]
 
 
-def check_statistics(
-    folder: Path, info: dict[str, Any], columns: dict[str, np.ndarray], episodes: list[dict[str, Any]]
-) -> None:
+def check_statistics(folder: Path, info: dict, columns: dict[str, np.ndarray], episodes: list[dict]) -> None:
     whole = json.loads((folder / "meta" / "stats.json").read_text())
     assert set(whole) == set(info["features"])
     for name, values in columns.items():
@@ -138,9 +130,8 @@ def test_a_dataset_has_all_that_the_format_asks_for(eight: Recording, tmp_path: 
 
 def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recording, tmp_path: Path) -> None:
     known = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm), forces_n=np.arange(8.0))
-    touches = ModelFindings(
-        np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), np.full(8, np.nan), np.full(8, np.nan)
-    )
+    nan = np.full(8, np.nan)
+    touches = ModelFindings(np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), nan, nan)
     export_lerobot(known, tmp_path / "set", touches)
     info, columns, _ = checked(tmp_path / "set")
     assert info["total_frames"] == len(known.readings)
@@ -170,12 +161,8 @@ def test_long_recordings_go_to_several_files_and_one_fibre_is_a_number(
     export_lerobot(replace(eight, readings=eight.readings[:, :1]), tmp_path / "set")
     info, _, episodes = checked(tmp_path / "set")
     assert info["features"]["observation.state"]["shape"] == [1]
-    assert {(each["data/chunk_index"], each["data/file_index"]) for each in episodes} == {
-        (0, 0),
-        (0, 1),
-        (1, 0),
-        (1, 1),
-    }
+    files = {(each["data/chunk_index"], each["data/file_index"]) for each in episodes}
+    assert files == {(0, 0), (0, 1), (1, 0), (1, 1)}
 
 
 def test_a_folder_appears_whole_or_not_at_all(

@@ -1,14 +1,14 @@
 """Recordings in MATLAB files: the published one, such as are cut off or go on, and files that are neither."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
 
 from design.common.errors import InputError
-from design.pad.morphology import Morphology
-from sense import RigSettings, import_mat, simulate
+from sense import import_mat
 
 MAT = "para5_long_first4500.mat"
 
@@ -23,7 +23,7 @@ def test_the_published_recording_comes_in_as_it_is(published: Path) -> None:
     assert recording.lifted[:3].tolist() == [40, 80, 120]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.99999])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99999])
 def test_a_truncated_recording_is_refused(published: Path, tmp_path: Path, share: float) -> None:
     content = (published / MAT).read_bytes()
     (tmp_path / "cut.mat").write_bytes(content[: int(share * len(content))])
@@ -49,6 +49,7 @@ def good() -> dict[str, np.ndarray]:
         (80, 3, 2, "the last of 3 presses is left out, with 0 of 40 readings"),
         (100, 2, 2, "the last 20 readings belong to no press"),
         (120, 1, 1, "the last 80 readings belong to no press"),
+        (40, 1, 1, None),
     ],
 )
 def test_presses_and_readings_may_end_apart(
@@ -62,17 +63,6 @@ def test_presses_and_readings_may_end_apart(
     assert np.array_equal(recording.presses_mm, cut["pos"].T[:whole])
     assert recording.lifted.tolist() == [40, 80, 120][:whole]
     assert recording.source.get("note") == note
-
-
-def test_a_recording_of_1500_presses_that_ends_9_readings_early_comes_in(tmp_path: Path) -> None:
-    whole = simulate(Morphology.straight(2), RigSettings(presses=1500))
-    count = 40 * 1500 - 9
-    content = {"voltage": whole.readings[:count], "tim": whole.times_s[None, :count], "pos": whole.presses_mm.T}
-    scipy.io.savemat(tmp_path / "long.mat", content)
-    recording = import_mat(tmp_path / "long.mat")
-    assert len(recording.begun) == 1499
-    assert np.array_equal(recording.begun, whole.begun[:-1])
-    assert recording.source["note"] == "the last of 1500 presses is left out, with 31 of 40 readings"
 
 
 def newer(path: Path, content: dict[str, np.ndarray]) -> Path:
@@ -100,7 +90,7 @@ def test_files_of_matlab_7_3_hold_the_same(tmp_path: Path) -> None:
 
 def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
     content = good()
-    pressed = np.repeat(np.arange(120) % 40 >= 20, 1)
+    pressed = np.arange(120) % 40 >= 20
     lab = {"t": 1000 * content["tim"], "U": content["voltage"].T, "c": pressed[None] * 1.0, "P": content["pos"] / 10}
     mapping = "time=t:ms,fibres=U,press=c,places=P:cm"
     scipy.io.savemat(tmp_path / "old.mat", lab)
@@ -116,8 +106,8 @@ def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
+        ("tim", None, r"has no variable tim \(found pos, voltage\)"),
         ("voltage", np.ones((79, 4)), r"voltage has shape \(79, 4\), expected 40 rows for each of the 3 presses"),
-        ("voltage", np.ones((4, 120)), "voltage has shape"),
         ("voltage", np.full((120, 4), np.nan), "readings are all missing"),
         ("voltage", np.ones((120, 4)) * 1j, "is complex, expected a full matrix of real numbers"),
         ("voltage", np.array(["a", "b"], dtype=object), "is a cell array, expected a full matrix"),
@@ -129,20 +119,16 @@ def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
         ("pos", np.ones((3, 3)), r"pos has shape \(3, 3\)"),
         ("pos", np.ones((1, 3)), r"pos has shape \(1, 3\), expected \(2, presses\)"),
         ("pos", np.ones((2, 0)), "pos has shape"),
-        (
-            "pos",
-            np.ones((2, 5)),
-            "each of the 5 presses of pos, 200 in all; only the last may be cut off",
-        ),
+        ("pos", np.ones((2, 5)), "each of the 5 presses of pos, 200 in all; only the last may be cut off"),
         ("pos", np.array([[1, 2, np.nan], [1, 2, 3]]), "press 2 has one of x and y"),
         ("tim", np.where(np.arange(120) == 7, np.nan, np.arange(120)), r"times hold NaN .*first in row 7"),
         ("tim", np.where(np.arange(120) == 7, 6, np.arange(120)), "times do not ascend at reading 7"),
-        ("tim", np.zeros((1, 120)), "do not ascend at reading 1"),
         ("tim", np.arange(100.0), "times have shape"),
     ],
 )
-def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value: np.ndarray, message: str) -> None:
-    scipy.io.savemat(tmp_path / "bad.mat", good() | {name: value})
+def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value: Any, message: str) -> None:
+    content = {key: each for key, each in (good() | {name: value}).items() if each is not None}
+    scipy.io.savemat(tmp_path / "bad.mat", content)
     with pytest.raises(InputError, match=message) as caught:
         import_mat(tmp_path / "bad.mat")
     assert "\n" not in str(caught.value)
@@ -169,20 +155,6 @@ def test_a_mat_may_hold_what_real_rigs_give(tmp_path: Path) -> None:
         assert np.array_equal(recording.readings, (content | change)["voltage"], equal_nan=True)
         assert np.array_equal(recording.times_s, (content | change)["tim"].ravel())
         assert np.array_equal(recording.presses_mm, content["pos"].T)
-
-
-def test_a_mat_of_one_press_comes_in(tmp_path: Path) -> None:
-    content = {name: values[..., :40] for name, values in good().items() if name == "tim"}
-    scipy.io.savemat(tmp_path / "r.mat", content | {"voltage": good()["voltage"][:40], "pos": [[1.0], [2.0]]})
-    recording = import_mat(tmp_path / "r.mat")
-    assert recording.presses_mm.tolist() == [[1, 2]]
-    assert (recording.begun.tolist(), recording.lifted.tolist()) == ([20], [40])
-
-
-def test_an_unrelated_mat_is_refused(tmp_path: Path) -> None:
-    scipy.io.savemat(tmp_path / "other.mat", {"apples": 3})
-    with pytest.raises(InputError, match=r"no variable voltage, tim \(found apples\)"):
-        import_mat(tmp_path / "other.mat")
 
 
 def test_a_mat_without_places_has_presses_of_unknown_place(tmp_path: Path) -> None:

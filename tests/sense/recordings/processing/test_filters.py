@@ -2,16 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from design.common.errors import InputError
-from sense import open_recording
-from sense.recordings.processing.benchmark import fibre, linear_program, objective
-from sense.recordings.processing.filters import running_median, stretches, total_variation
-from sense.recordings.processing.stream_filters import TotalVariation
-from tests.helpers.effort import few
+from sense import TotalVariation, open_recording, running_median, total_variation
+from sense.recordings.processing.benchmark import fibre, iterated, linear_program
+from sense.recordings.processing.filters import stretches
 
 STEP_V = 3.3 / 1023
 LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])
@@ -22,8 +20,14 @@ VALUES = st.one_of(
     st.floats(-10, 10).map(lambda v: round(v, 9)),
 )
 """Many ties, a converter's steps, or any but the very smallest."""
+EXTREMES = st.sampled_from([0.0, -0.0, 5e-324, 1e-320, -1e-300, 1e-9, 1.0, 1e6, 1e100, -1e100])
 PRESENT = hnp.arrays(np.float64, st.integers(1, 40), elements=VALUES)
 READINGS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.one_of(VALUES, VALUES, st.just(np.nan)))
+
+
+def objective(y, x, lam):
+    """What robust total variation minimises."""
+    return float(np.abs(y - x).sum() + lam * np.abs(np.diff(x)).sum())
 
 
 def excess_robust(y, x, lam):
@@ -65,7 +69,7 @@ def least_by_search(y, lam):
     return cost.min()
 
 
-@few(50)
+@settings(max_examples=50)
 @given(READINGS, LAMS)
 def test_total_variation_meets_the_conditions_of_the_minimum(y, lam):
     # heights of stairs are multiples of 2^-40, which the sums of the check do not know
@@ -74,21 +78,29 @@ def test_total_variation_meets_the_conditions_of_the_minimum(y, lam):
     assert excess_squares(y, total_variation(y, lam, "squares"), lam) <= 1e-12 * (1 + min(lam, 400))
 
 
-@few(50)
-@given(PRESENT, LAMS)
+@settings(max_examples=50)
+@given(st.one_of(PRESENT, hnp.arrays(np.float64, st.integers(1, 20), elements=EXTREMES)), LAMS)
 def test_robust_objective_is_the_least_of_an_exhaustive_search(y, lam):
-    found = objective(y, total_variation(y, lam), lam)
-    assert found == pytest.approx(least_by_search(y, lam), rel=1e-9, abs=1e-9)
+    x = total_variation(y, lam)
+    assert objective(y, x, lam) <= least_by_search(y, lam) * (1 + 1e-9) + 1e-300
+    assert y.min() <= x.min() + 5e-324  # between subnormal values there is nothing
+    assert x.max() <= y.max()
 
 
-def test_robust_objective_is_that_of_a_linear_program():
-    _, y = fibre(2000, np.random.default_rng(3))
+def test_the_ways_that_the_bench_compares_find_the_same_minimum():
+    clean, y = fibre(1000, np.random.default_rng(3))
     for lam in (1.0, 4.0, 17.3):
-        expected = objective(y, linear_program(y, lam), lam)
-        assert objective(y, total_variation(y, lam), lam) == pytest.approx(expected, rel=1e-9)
+        least = objective(y, total_variation(y, lam), lam)
+        assert objective(y, linear_program(y, lam), lam) == pytest.approx(least, rel=1e-9)
+    least = objective(y, total_variation(y, 4), 4)
+    assert least <= objective(y, iterated(y, 4, 1000), 4) <= 1.01 * least
+    off = (y - clean) / STEP_V
+    assert np.median(np.abs(off)) < 2
+    assert 0.003 < (np.abs(off) > 8).mean() < 0.03
+    assert np.abs(total_variation(y, 4) - clean).mean() < 0.3 * np.abs(y - clean).mean()
 
 
-@few(50)
+@settings(max_examples=50)
 @given(READINGS, LAMS, FIDELITY)
 def test_missing_readings_count_for_nothing_and_take_the_next_level(y, lam, fidelity):
     x = total_variation(y, lam, fidelity)
@@ -102,7 +114,7 @@ def test_missing_readings_count_for_nothing_and_take_the_next_level(y, lam, fide
         assert np.isnan(x).all()
 
 
-@few(50)
+@settings(max_examples=50)
 @given(READINGS, LAMS, FIDELITY)
 def test_upside_down_and_in_another_unit_it_is_the_same_filter(y, lam, fidelity):
     x = total_variation(y, lam, fidelity)
@@ -112,14 +124,14 @@ def test_upside_down_and_in_another_unit_it_is_the_same_filter(y, lam, fidelity)
     np.testing.assert_array_equal(total_variation(unit * y, other_lam, fidelity), unit * x)
 
 
-@few(50)
+@settings(max_examples=50)
 @given(READINGS, LAMS, FIDELITY)
 def test_causal_values_are_the_last_of_each_beginning(y, lam, fidelity):
     expected = [total_variation(y[: i + 1], lam, fidelity)[-1] for i in range(len(y))]
     np.testing.assert_array_equal(total_variation(y, lam, fidelity, causal=True), expected)
 
 
-@few(50)
+@settings(max_examples=50)
 @given(hnp.arrays(np.float64, (12, 2), elements=VALUES), st.sets(st.integers(0, 11)).map(sorted), FIDELITY)
 def test_nothing_is_coupled_across_starts_or_channels(y, starts, fidelity):
     pieces = np.split(y, starts)
@@ -170,23 +182,22 @@ def hostile(count):
 
 
 @pytest.mark.parametrize("name", hostile(2))
-@pytest.mark.parametrize("lam", [1e-12, 0.7, 4.0, 314.15, 5000.0, 1e12])
-def test_hostile_readings(name, lam):
-    y = hostile(10_000)[name]
-    assert excess_robust(y, total_variation(y, lam), lam) <= 1e-9 * lam
-    x = total_variation(y, lam, "squares")
-    # x itself is rounded by 1e-16 of its greatest value, 10 000 times
-    assert excess_squares(y, x, lam) <= 1e-11 * np.abs(y).max() * len(y)
-    if lam == 1e12:
-        np.testing.assert_allclose(x, y.mean(), rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(total_variation(y, lam), np.median(y), rtol=1e-15)
+def test_hostile_readings(name):
+    y = hostile(5_000)[name]
+    for lam in (1e-12, 0.7, 4.0, 314.15, 3000.0, 1e12):
+        assert excess_robust(y, total_variation(y, lam), lam) <= 1e-9 * lam
+        x = total_variation(y, lam, "squares")
+        # x itself is rounded by 1e-16 of its greatest value, 10 000 times
+        assert excess_squares(y, x, lam) <= 1e-11 * np.abs(y).max() * len(y)
+    np.testing.assert_allclose(x, y.mean(), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(total_variation(y, lam), np.median(y), rtol=1e-15)
 
 
-def test_very_many_readings():
-    """A million of them under stress."""
-    y = np.random.default_rng(1).normal(size=1_000_000 if few(1).max_examples > 1 else 200_000)
+@pytest.mark.parametrize("count", [50_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_very_many_readings(count):
+    y = np.random.default_rng(1).normal(size=count)
     for lam in (4.0, 3000.0):
-        assert excess_robust(y, total_variation(y, lam), lam) <= 1e-9
+        assert excess_robust(y, total_variation(y, lam), lam) == 0
     assert excess_squares(y, total_variation(y, 10.0, "squares"), 10.0) <= 1e-8
 
 
@@ -205,6 +216,7 @@ def test_shapes_and_kinds_of_arrays(fidelity):
         total_variation(single, 2, fidelity), total_variation(single.astype(float), 2, fidelity)
     )
     assert total_variation(single, 2, fidelity).dtype == np.float64
+    np.testing.assert_array_equal(single, y.astype(np.float32))  # readings are left as they are
     np.testing.assert_array_equal(total_variation([3, 1, 2], 50), [2, 2, 2])
     for shape in ((0,), (0, 3), (3, 0)):
         assert total_variation(np.empty(shape), 2, fidelity).shape == shape
@@ -213,16 +225,8 @@ def test_shapes_and_kinds_of_arrays(fidelity):
     np.testing.assert_allclose(total_variation([0.0, 1.0], 100, fidelity), 0.5)
 
 
-def test_readings_are_left_as_they_are():
-    y = np.array([1.0, np.nan, 5.0, 2.0])
-    before = y.copy()
-    total_variation(y, 1)
-    running_median(y, 3)
-    np.testing.assert_array_equal(y, before)
-
-
-@few(50)
-@given(READINGS, st.sampled_from([1, 3, 5, 15, 99]), st.booleans())
+@settings(max_examples=50)
+@given(READINGS, st.sampled_from([1, 3, 5, 15, 99, 2**31 - 1]), st.booleans())
 def test_running_median_is_numpys_of_each_window(y, width, causal):
     before, after = (width - 1, 0) if causal else (width // 2, width // 2)
     windows = [y[max(i - before, 0) : i + after + 1] for i in range(len(y))]
@@ -275,10 +279,11 @@ def test_what_cannot_be_filtered_is_refused_in_one_line(call, message):
 def test_the_real_recording(published):
     recording = open_recording(published / "para5_long_first4500.mat")
     y = recording.readings
+    y = y[: len(y) // 5]
     x = total_variation(y, 4)
     for c in (0, recording.fibres - 1):
         assert excess_robust(y[:, c], x[:, c], 4) == 0
     stream = TotalVariation(recording.fibres, 4)
-    blocks = [stream.feed(block) for block in np.array_split(y, 180)]
+    blocks = [stream.feed(block) for block in np.array_split(y, 40)]
     assert len(y) - sum(map(len, blocks)) < 40  # readings held back: less than a press
     np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), x)

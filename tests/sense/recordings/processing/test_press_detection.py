@@ -5,39 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from design import Morphology
 from design.common.errors import InputError
 from design.settings import Counts
 from sense import Recording, RigSettings, import_mat, simulate
-from sense.recordings.processing.kernels import level_tracking
-from sense.recordings.processing.press_detection import (
-    SENT_DOWN_S,
-    SENT_UP_S,
-    Finder,
-    Presses,
-    as_commanded,
-    find_presses,
-)
+from sense.recordings.processing.press_alignment import as_detected
+from sense.recordings.processing.press_detection import Finder, Presses, as_commanded, find_presses
 from sense.recordings.simulation.pad_model import Divider
-from tests.helpers.effort import few
-from tests.sense.recordings.processing.spoiled_readings import (
-    breaking,
-    dead,
-    growing_noisy,
-    holed,
-    jumping,
-    missing,
-    noisy,
-    saturating,
-    spiky,
-    swapped,
-    torn,
-)
 
 RATE_HZ = 14.0
+SENT_DOWN_S, SENT_UP_S = 0.16, 0.08
+"""From a command to its first effect, as in the published recording."""
+LOOK_S = 0.03
 EARLY = 3
 """Readings before its command at which a touch may be dated: what the noise was then may count for it."""
 Spans = list[tuple[float, float]]
@@ -59,17 +41,13 @@ def test_presses_of_the_published_recording_are_found(published: Path) -> None:
     # converter, root of the sum of squares. Touches show 2.2 (spread 1.0) readings after the first that followed their
     # command, releases 0.5.
     recording = import_mat(published / "para5_long_first4500.mat")
-    found, false, touches, releases = score(find_presses(recording.readings, recording.times_s), recording)
+    presses = find_presses(recording.readings, recording.times_s)
+    found, false, touches, releases = score(presses, recording)
     assert found >= 0.995
     assert false <= 0.002
     assert np.median(touches) == 2
     assert touches.std() < 1.2
     assert np.mean(np.abs(releases - 0.5) <= 1.5) > 0.995
-
-
-def test_found_presses_stand_for_commanded_ones(published: Path) -> None:
-    recording = import_mat(published / "para5_long_first4500.mat")
-    presses = find_presses(recording.readings, recording.times_s)
     begun, lifted = as_commanded(presses, recording.times_s)
     of = np.searchsorted(recording.begun - EARLY, presses.touched, side="right") - 1
     assert abs(np.mean(begun - recording.begun[of])) < 0.5
@@ -79,18 +57,18 @@ def test_found_presses_stand_for_commanded_ones(published: Path) -> None:
 @pytest.mark.parametrize(
     ("grid", "rig"),
     [
-        (4, RigSettings(presses=200)),
-        (4, RigSettings(presses=200, noise_mv=0)),
-        (4, RigSettings(presses=200, noise_mv=5)),
-        (4, RigSettings(presses=200, drift_mv=150)),
-        (4, RigSettings(presses=200, hysteresis=0.5, creep=0.4)),
-        (4, RigSettings(presses=200, hysteresis=0, creep=0)),
-        (4, RigSettings(presses=200, depth_mm=1)),
-        (4, RigSettings(presses=200, readings_per_press=12)),
-        (4, RigSettings(presses=200, rate_hz=5, readings_per_press=20)),
-        (4, RigSettings(presses=100, rate_hz=100, readings_per_press=200)),
-        (4, RigSettings(presses=50, rate_hz=1000, readings_per_press=2000)),
-        (1, RigSettings(presses=200)),
+        (4, RigSettings(presses=150)),
+        (4, RigSettings(presses=150, noise_mv=0)),
+        (4, RigSettings(presses=150, noise_mv=5)),
+        (4, RigSettings(presses=150, drift_mv=150)),
+        (4, RigSettings(presses=150, hysteresis=0.5, creep=0.4)),
+        (4, RigSettings(presses=150, hysteresis=0, creep=0)),
+        (4, RigSettings(presses=150, depth_mm=1)),
+        (4, RigSettings(presses=150, readings_per_press=12)),
+        (4, RigSettings(presses=150, rate_hz=5, readings_per_press=20)),
+        (4, RigSettings(presses=60, rate_hz=100, readings_per_press=200)),
+        (4, RigSettings(presses=20, rate_hz=1000, readings_per_press=2000)),
+        (1, RigSettings(presses=150)),
         ((2, 254), RigSettings(presses=40)),  # of fibres across 256 pitches nothing would show
     ],
 )
@@ -142,7 +120,7 @@ def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> No
     times, readings = recorded(spans, rate_hz=rate_hz, ramp_s=ramp_s)
     touched, released = find_presses(readings, times)
     assert abs(len(touched) - len(spans)) <= 0.05 * len(spans)
-    allowed_s = ramp_s + 2.5 / rate_hz + 2 * level_tracking.LOOK_S
+    allowed_s = ramp_s + 2.5 / rate_hz + 2 * LOOK_S
     for told, true in zip((times[touched], np.append(times, np.inf)[released]), zip(*spans, strict=True), strict=True):
         off = np.abs(told[:, None] - np.array(true)).min(axis=0)
         assert np.mean(off < allowed_s) >= 0.95
@@ -160,13 +138,7 @@ def test_a_press_without_an_end_lasts_to_the_end() -> None:
 COUNT = 3.3 / 1023
 
 
-def quiet(fibres: int, sd: float, step: float, seed: int) -> np.ndarray:
-    """Readings of a pad nobody touches, with noise of so many V, in steps of so many V (0: none)."""
-    readings = 2 + sd * np.random.default_rng(seed).standard_normal((5000, fibres))
-    return np.rint(readings / step) * step if step else readings
-
-
-@few(50)
+@settings(max_examples=25)
 @given(
     fibres=st.sampled_from([1, 2, 6, 100]),
     sd=st.sampled_from([0.0, 0.1 * COUNT, 0.3 * COUNT, COUNT, 0.1]),
@@ -175,44 +147,57 @@ def quiet(fibres: int, sd: float, step: float, seed: int) -> np.ndarray:
     seed=st.integers(0, 1000),
 )
 def test_noise_is_no_press(fibres: int, sd: float, step: float, rate_hz: float, seed: int) -> None:
-    found = find_presses(quiet(fibres, sd, step, seed), np.arange(5000) / rate_hz)
-    assert len(found.touched) == 0
+    readings = 2 + sd * np.random.default_rng(seed).standard_normal((5000, fibres))
+    readings = np.rint(readings / step) * step if step else readings
+    assert len(find_presses(readings, np.arange(5000) / rate_hz).touched) == 0
 
 
-@pytest.mark.parametrize("readings", [np.full((300, 3), 2.0), np.full((300, 3), np.nan), np.zeros((1, 3))])
+@pytest.mark.parametrize("readings", [np.full((300, 3), np.nan), np.zeros((1, 3))])
 def test_where_nothing_happens_nothing_is_found(readings: np.ndarray) -> None:
     assert len(find_presses(readings, np.arange(len(readings)) / RATE_HZ).touched) == 0
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [dead, missing, saturating, breaking, jumping, noisy, growing_noisy, swapped, spiky, holed, torn],
-    ids=lambda spoil: spoil.__name__,
-)
-def test_presses_are_found_in_spoilt_readings(spoil) -> None:
+def spoilt(kind: str, readings: np.ndarray) -> np.ndarray:
+    """Readings of which some are spoilt: of one fibre, always or later on, or of any at random."""
+    rng, rows = np.random.default_rng(0), len(readings)
+    one = np.arange(readings.shape[1]) == 1
+    later = one & (np.arange(rows)[:, None] >= rows // 2)
+    noise, chance = 0.1 * rng.standard_normal((rows, 1)), rng.random(readings.shape)
+    return {
+        "dead": np.where(one, 1.5, readings),
+        "missing": np.where(one, np.nan, readings),
+        "saturating": np.where(later, 3.3, readings),
+        "breaking": np.where(later, 0.0, readings),
+        "jumping": readings + 0.2 * later,
+        "noisy": readings + one * noise,
+        "growing noisy": readings + later * noise,
+        "spiky": readings + 0.5 * (chance < 2e-3),
+        "holed": np.where(chance < 0.05, np.nan, readings),
+        "torn": np.where(chance[:, :1] < 0.1, np.nan, readings),
+    }[kind]
+
+
+KINDS = ("dead", "missing", "saturating", "breaking", "jumping", "noisy", "growing noisy", "spiky", "holed", "torn")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_presses_are_found_in_spoilt_readings(kind: str) -> None:
     recording = simulate(Morphology.straight(4), RigSettings(presses=300, seed=3))
-    readings = recording.readings.copy()
-    spoil(readings, np.random.default_rng(0))
-    found, false, *_ = score(find_presses(readings, recording.times_s), recording)
+    found, false, *_ = score(find_presses(spoilt(kind, recording.readings), recording.times_s), recording)
     assert found >= 0.98
     assert false <= 0.02
 
 
 @pytest.mark.parametrize("cut", [25, 30])
 def test_a_recording_that_begins_under_a_press_is_set_right(recording: Recording, cut: int) -> None:
-    later = Recording(
-        recording.readings[cut:],
-        recording.times_s[cut:],
-        recording.presses_mm[1:],
-        recording.begun[1:] - cut,
-        recording.lifted[1:] - cut,
-    )
+    presses = recording.presses_mm[1:], recording.begun[1:] - cut, recording.lifted[1:] - cut
+    later = Recording(recording.readings[cut:], recording.times_s[cut:], *presses)
     found, false, *_ = score(find_presses(later.readings, later.times_s), later)
     assert found >= 0.95
     assert false <= 0.05
 
 
-@few(50)
+@settings(max_examples=25)
 @given(cuts=st.lists(st.integers(0, 2000), max_size=20))
 def test_it_does_not_matter_how_readings_are_cut(recording: Recording, cuts: list[int]) -> None:
     readings, times = recording.readings[:2000], recording.times_s[:2000]
@@ -229,14 +214,15 @@ def test_events_are_told_soon(recording: Recording) -> None:
     finder = Finder(recording.fibres)
     lags = [
         at - event.reading
-        for at in range(4000)
+        for at in range(2000)
         for event in finder.feed(recording.times_s[at : at + 1], recording.readings[at : at + 1])
     ]
-    assert len(lags) > 180
+    assert len(lags) > 90
     assert min(lags) >= 1
     assert np.mean(np.array(lags) <= 2) > 0.95
 
 
+@settings(max_examples=25)
 @given(
     scale=st.sampled_from([-4.0, -1.0, 0.25, 2.0]),
     shift=st.sampled_from([-1.0, 0.0, 0.5]),
@@ -253,6 +239,7 @@ def test_offset_polarity_scale_and_clock_make_no_difference(
     assert np.abs(other.released - plain.released).max() <= 1
 
 
+@settings(max_examples=50)
 @given(
     gaps=st.lists(st.integers(1, 6), min_size=2, max_size=30),
     after=st.integers(0, 20),
@@ -273,21 +260,15 @@ def test_presses_found_make_a_recording(gaps: list[int], after: int, rate_hz: fl
     assert ((lifted == presses.touched + 1) | (times[presses.released] - times[lifted] <= SENT_UP_S)).all()
 
 
-@pytest.mark.parametrize(
-    ("times", "readings"),
-    [(np.zeros(3), np.zeros((3, 2))), (np.zeros(2), np.zeros((3, 4))), (np.zeros((2, 2)), np.zeros((2, 4)))],
-)
-def test_readings_that_do_not_fit_are_refused(times: np.ndarray, readings: np.ndarray) -> None:
-    with pytest.raises(InputError, match=r"times have shape .* and readings .*, expected \(n,\) and \(n, 4\)"):
-        Finder(4).feed(times, readings)
-
-
-def test_a_pad_without_fibres_is_refused() -> None:
+def test_what_is_no_stream_of_readings_is_refused() -> None:
+    for times, readings in ((np.zeros(3), (3, 2)), (np.zeros(2), (3, 4)), (np.zeros((2, 2)), (2, 4))):
+        with pytest.raises(InputError, match=r"times have shape .* and readings .*, expected \(n,\) and \(n, 4\)"):
+            Finder(4).feed(times, np.zeros(readings))
     with pytest.raises(InputError, match="fibres is 0, allowed is a whole number from 1 to 512"):
         Finder(0)
-
-
-def test_readings_are_fed_in_the_order_of_their_times() -> None:
+    for value in (np.inf, 1001.0):
+        with pytest.raises(InputError, match="readings hold"):
+            Finder(1).feed([0.0], [[value]])
     finder = Finder(2)
     finder.feed([0.0, 0.1], np.zeros((2, 2)))
     for again in (0.05, 0.1):
@@ -295,3 +276,88 @@ def test_readings_are_fed_in_the_order_of_their_times() -> None:
             finder.feed([again, 0.3], np.zeros((2, 2)))
     finder.feed([], np.zeros((0, 2)))
     finder.feed([0.11], np.zeros((1, 2)))
+
+
+def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Times and readings (R, C) of a pad of which all goes wrong that this room knows of.
+
+    Presses are short, long, in two steps, with the tip moved, or close to each other, of one fibre or of all, now and
+    then the other way round; levels creep, drift and overshoot; readings are spiky, missing, noisier for a time, in
+    steps of a converter, and late now and then.
+    """
+    rng = np.random.default_rng(seed)
+    gaps = np.where(rng.random((presses, 3)) < 0.3, 0.15, rng.uniform(0.4, 3.0, (presses, 3)))
+    down, other, up = (1.5 + np.cumsum(gaps).reshape(-1, 3)).T
+    times = np.cumsum(np.where(rng.random(int((up[-1] + 2) * rate_hz)) < 0.01, 5, rng.uniform(0.9, 1.1)) / rate_hz)
+    readings = np.full((len(times), fibres), 2.0)
+    for start, turn, end in zip(down, other, up, strict=True):
+        first, second = rng.exponential(0.05, (2, fibres)) * (rng.random((2, fibres)) < 0.7)
+        if seed > 7 and rng.random() < 0.2:
+            first *= -1
+        second = np.where(rng.random() < 0.5, first, np.where(rng.random() < 0.5, first * 2, second))
+        for at, step in ((start, first), (turn, second - first), (end, -second)):
+            since = np.maximum(times - at, 0)[:, None]
+            over = 0.15 * np.exp(-since / 1.5) * (step < 0)
+            readings -= step * (np.clip(since / 0.15, 0, 1) * (1 + over + 0.1 * (1 - np.exp(-since / 3))))
+    readings += 0.01 * np.cumsum(rng.standard_normal(readings.shape), axis=0) / rate_hz**0.5 / 3
+    readings += rng.choice([3e-4, 2e-3, 8e-3], fibres) * rng.standard_normal(readings.shape)
+    readings[rng.random(readings.shape) < 3e-3] += 0.4
+    readings[len(times) // 2 : len(times) // 2 + int(2 * rate_hz), 0] = np.nan
+    if seed > 7:
+        third = readings[len(times) // 3 : len(times) // 2]
+        third += 0.03 * rng.standard_normal((len(third), 1))
+        readings[rng.random(readings.shape) < 0.2] = np.nan
+    readings[rng.random(readings.shape) < 0.01] = np.nan
+    return times, np.round(readings / 3.2e-3) * 3.2e-3 if seed % 2 else readings
+
+
+SCENES = {
+    (0, 14.0, 60): (52, 77260, 78864),
+    (1, 14.0, 60): (54, 83609, 84935),
+    (2, 5.0, 60): (40, 21532, 22152),
+    (3, 100.0, 40): (36, 218694, 224817),
+    (4, 300.0, 25): (23, 374517, 393217),
+    (5, 30.0, 60): (59, 170815, 173827),
+    (6, 14.0, 120): (105, 310988, 313704),
+    (7, 14.0, 120): (98, 294192, 297817),
+    (8, 14.0, 120): (87, 249420, 253232),
+    (9, 14.0, 120): (87, 248623, 252247),
+    (10, 30.0, 100): (65, 321638, 329859),
+    (11, 8.0, 120): (60, 100596, 102451),
+    (12, 14.0, 200): (121, 527170, 533804),
+}
+"""How many presses are found in scenes, and the sums of the readings at which they begin and end."""
+
+
+@pytest.mark.parametrize("seed", SCENES, ids=str)
+def test_presses_of_scenes_are_found_where_they_always_were(seed: tuple[int, float, int]) -> None:
+    """Readings at which presses are dated reach models that were learnt from them: a change is to be meant."""
+    times, readings = scene(*seed)
+    found = find_presses(readings, times)
+    assert (len(found.touched), int(found.touched.sum()), int(found.released.sum())) == SCENES[seed]
+
+
+def test_presses_are_aligned_with_what_the_readings_show_of_them(recording: Recording) -> None:
+    begun, lifted = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
+    for found, commanded in ((begun, recording.begun), (lifted, recording.lifted)):
+        off = found - commanded
+        assert np.abs(off).max() <= 6
+        assert 0 < np.abs(off).mean() < 3  # the simulated probe takes up to 0.35 s to be gone
+    assert (lifted > begun).all()
+    assert (begun[1:] >= lifted[:-1]).all()
+
+
+def test_presses_that_are_not_felt_stay_as_commanded(recording: Recording) -> None:
+    silent = recording.readings.copy()
+    first, last = int(recording.begun[10]) - 3, int(recording.begun[12]) - 10
+    silent[first:last] = silent[first - 1]
+    begun, lifted = as_detected(silent, recording.times_s, recording.begun, recording.lifted)
+    np.testing.assert_array_equal(begun[10:12], recording.begun[10:12])
+    np.testing.assert_array_equal(lifted[10:11], recording.lifted[10:11])
+    held = recording.readings.copy()
+    first, last = int(recording.lifted[20]) - 2, int(recording.begun[21]) + 10
+    held[first:last] = held[first - 1]  # two presses show as one, which is neither of them
+    begun, lifted = as_detected(held, recording.times_s, recording.begun, recording.lifted)
+    np.testing.assert_array_equal((begun[20], lifted[20]), (recording.begun[20], recording.lifted[20]))
+    flat = as_detected(np.ones_like(silent), recording.times_s, recording.begun, recording.lifted)
+    np.testing.assert_array_equal(flat, (recording.begun, recording.lifted))

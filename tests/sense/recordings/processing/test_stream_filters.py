@@ -1,15 +1,15 @@
 """Filters of streams: the same values as of the whole, however the readings come in blocks."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from design.common.errors import InputError
-from sense.recordings.processing.filters import running_median, total_variation
-from sense.recordings.processing.stream_filters import RunningMedian, TotalVariation
-from tests.helpers.effort import few
+from sense import RunningMedian, TotalVariation, running_median, total_variation
 
 VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))
 RECORDINGS = hnp.arrays(np.float64, st.tuples(st.integers(0, 40), st.integers(1, 2)), elements=VALUES)
@@ -22,29 +22,21 @@ def streamed(stream, readings, cuts=()):
     return np.concatenate([*(stream.feed(block) for block in np.split(readings, cuts)), stream.finish()])
 
 
-@few(50)
+@settings(max_examples=50)
 @given(RECORDINGS, CUTS, LAMS, FIDELITY)
 def test_total_variation_of_blocks_is_that_of_the_whole(y, cuts, lam, fidelity):
     x = streamed(TotalVariation(y.shape[1], lam, fidelity), y, cuts)
     np.testing.assert_array_equal(x, total_variation(y, lam, fidelity))
 
 
-@few(50)
+@settings(max_examples=50)
 @given(RECORDINGS, CUTS, st.sampled_from([1, 3, 7, 99]), st.booleans())
 def test_running_median_of_blocks_is_that_of_the_whole(y, cuts, width, causal):
     x = streamed(RunningMedian(y.shape[1], width, causal), y, cuts)
     np.testing.assert_array_equal(x, running_median(y, width, causal=causal))
 
 
-@few(50)
-@given(RECORDINGS, RECORDINGS, LAMS, FIDELITY)
-def test_what_is_given_stands_whatever_follows(y, follows, lam, fidelity):
-    given = TotalVariation(y.shape[1], lam, fidelity).feed(y)
-    follows = np.repeat(follows[:, :1], y.shape[1], axis=1)
-    np.testing.assert_array_equal(given, total_variation(np.concatenate([y, follows]), lam, fidelity)[: len(given)])
-
-
-@few(50)
+@settings(max_examples=50)
 @given(RECORDINGS, LAMS, FIDELITY)
 def test_what_is_held_back_could_still_change(y, lam, fidelity):
     """Nothing waits longer than it must: of what is held, the first value does depend on what follows."""
@@ -57,7 +49,7 @@ def test_what_is_held_back_could_still_change(y, lam, fidelity):
             assert first[0] > first[1]
 
 
-@few(50)
+@settings(max_examples=50)
 @given(RECORDINGS, LAMS, FIDELITY)
 def test_latest_is_the_causal_value(y, lam, fidelity):
     stream = TotalVariation(y.shape[1], lam, fidelity)
@@ -79,7 +71,7 @@ def test_at_the_cap_a_channel_is_decided_as_if_it_ended():
         np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), expected)
 
 
-@few(50)
+@settings(max_examples=50)
 @given(RECORDINGS, CUTS, LAMS, FIDELITY, st.integers(1, 12))
 def test_at_the_cap_the_size_of_blocks_makes_no_difference(y, cuts, lam, fidelity, most):
     x = streamed(TotalVariation(y.shape[1], lam, fidelity, most), y, cuts)
@@ -98,15 +90,16 @@ def test_a_dead_channel_holds_the_others_back_up_to_the_cap():
 
 @pytest.mark.parametrize("fidelity", ["robust", "squares"])
 def test_a_long_recording_is_filtered_in_little_memory(fidelity):
-    """200 000 readings in blocks of 1000: less than 3000 are ever held, by the sizes of all arrays of the stream."""
-    rng = np.random.default_rng(0)
-    stream, most, count = TotalVariation(1, 4, fidelity), 0, 0
-    for _ in range(200):
-        count += len(stream.feed(np.cumsum(rng.normal(size=(1000, 1)))[:, None]))
-        channel = stream._channels[0]
-        most = max(most, channel._low.size, channel.decided.size, *(part.size for part in channel._message))
-    assert most < 3000
-    assert count > 199_000
+    """20 000 readings in blocks of 1000: the stream takes little more than a block, and holds few back."""
+    rng, stream = np.random.default_rng(0), TotalVariation(1, 4, fidelity)
+    blocks = [np.cumsum(rng.normal(size=1000))[:, None] for _ in range(20)]
+    stream.feed(blocks[0])
+    tracemalloc.start()
+    assert sum(len(stream.feed(block)) for block in blocks) > 19_000
+    kept, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 60_000
+    assert most < 20_000 * 8
 
 
 @pytest.mark.parametrize("make", [lambda: TotalVariation(2, 4), lambda: RunningMedian(2, 5)])
@@ -123,14 +116,11 @@ def test_what_follows_the_end_begins_anew(make):
     ("call", "message"),
     [
         (lambda: TotalVariation(0, 4), "channels is 0, allowed is a whole number from 1 to 512"),
-        (lambda: TotalVariation(2.0, 4), "channels is 2.0"),  # type: ignore[arg-type]
         (lambda: TotalVariation(2, -1), "lam is -1"),
-        (lambda: TotalVariation(2, 4, "cubes"), "fidelity is 'cubes'"),  # type: ignore[arg-type]
         (lambda: TotalVariation(2, 4, most_held=0), "most_held is 0"),
         (lambda: TotalVariation(2, 4).feed([1, 2]), r"shape \(2,\), expected \(n, 2\)"),
         (lambda: TotalVariation(2, 4).feed([[1, 2, 3]]), r"shape \(1, 3\), expected \(n, 2\)"),
         (lambda: TotalVariation(1, 4).feed([[np.inf]]), "readings hold inf"),
-        (lambda: RunningMedian(0, 3), "channels is 0"),
         (lambda: RunningMedian(1, 2), "width is 2"),
         (lambda: RunningMedian(1, 3).feed([[1, 2]]), r"expected \(n, 1\)"),
     ],

@@ -111,15 +111,11 @@ def test_presses_on_end_and_one_that_is_never_lifted_come_back(eight: Recording,
 
 def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: Path) -> None:
     depth = np.where(np.arange(8) < 4, 2.0, np.nan)
-    findings = ModelFindings(
-        np.full((8, 2), 3.0),
-        np.full((8, 2), [0.5, 0.25]),
-        np.ones(8),
-        depth,
-        depth / 4,
+    places, faults = (
+        (np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])),
         [FaultFound(5, (1,), "open", "fibre 2 is open")],
-        (3,),
     )
+    findings = ModelFindings(*places, np.ones(8), depth, depth / 4, faults, (3,))
     export_bag(eight, tmp_path / "r.mcap", findings)
     found, kinds = others_read(tmp_path / "r.mcap")
     assert kinds["/pad/touches"] == "geometry_msgs/msg/PoseWithCovarianceStamped"

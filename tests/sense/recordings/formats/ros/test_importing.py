@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
@@ -82,20 +81,18 @@ def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, t
 
 
 def test_what_is_edited_counts(eight: Recording, bag: Path, tmp_path: Path) -> None:
-    def moved(topic: str, _: float, message: Any) -> bool:
+    def edited(topic: str, _: float, message: Any) -> bool:
         if topic == PLACE:
-            message.pose.pose.position.x += 0.001
-        return True
-
-    found = import_bag(changed(bag, tmp_path / "moved", moved))
-    np.testing.assert_allclose(found.presses_mm[:, 0], eight.presses_mm[:, 0] + 1)
-
-    def louder(topic: str, _: float, message: Any) -> bool:
+            message.pose.pose.position.x += moved_m
         if topic == READINGS:
-            message.data = message.data + 0.5
+            message.data = message.data + louder_v
         return True
 
-    found = import_bag(changed(bag, tmp_path / "louder", louder))
+    moved_m, louder_v = 0.001, 0.0
+    found = import_bag(changed(bag, tmp_path / "moved", edited))
+    np.testing.assert_allclose(found.presses_mm[:, 0], eight.presses_mm[:, 0] + 1)
+    moved_m, louder_v = 0.0, 0.5
+    found = import_bag(changed(bag, tmp_path / "louder", edited))
     assert found == replace(eight, readings=eight.readings + 0.5)
     assert found.source["note"] == "readings are not those that were exported"
 
@@ -199,30 +196,20 @@ def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -
         import_file(bag.parent, ALL)
 
 
-def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
+def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
     messages = list(lab())
+    mixed = [messages[at] for at in np.random.default_rng(0).permutation(len(messages))]
     for number, part in enumerate((messages[:400], messages[400:])):
         bag = write_bag(tmp_path / f"part_{number}", part)
         (tmp_path / "bag").mkdir(exist_ok=True)
         bag.rename(tmp_path / "bag" / bag.name)
     (tmp_path / "bag" / "metadata.yaml").write_text("")
-    assert import_file(tmp_path / "bag", ALL) == import_file(write_bag(tmp_path / "lab", messages), ALL)
+    expected = import_file(write_bag(tmp_path / "lab", messages), ALL)
+    assert import_file(tmp_path / "bag", ALL) == expected
+    assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected
 
 
-def test_sixty_thousand_readings_go_out_and_come_back_to_the_bit_within_two_seconds(tmp_path: Path) -> None:
-    random = np.random.default_rng(0)
-    begun = 40 * np.arange(1500) + 20
-    times, readings = np.cumsum(random.uniform(0.06, 0.09, 60_000)), random.normal(2, 0.3, (60_000, 8))
-    recording = Recording(readings, times, random.uniform(-20, 20, (1500, 2)), begun, begun + 19)
-    import_bag(write_bag(tmp_path / "imports", lab()), ALL)
-    start = process_time()
-    export_bag(recording, tmp_path / "r.mcap")
-    again = import_bag(tmp_path / "r.mcap")
-    took_s = process_time() - start
-    assert again.digest == recording.digest
-    assert took_s < 2
-
-
+@pytest.mark.slow
 def test_the_published_recording_comes_back_to_the_bit(published: Path, tmp_path: Path) -> None:
     recording = import_mat(published / "para5_long_first4500.mat")
     export_bag(recording, tmp_path / "r.mcap")

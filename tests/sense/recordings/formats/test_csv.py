@@ -1,18 +1,18 @@
-"""Recordings as CSV: every number comes back, and other tables are refused."""
+"""Recordings as CSV, of padforge and of other programs: every number comes back, and other tables are refused."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from design.common.errors import InputError
 from sense import Recording, export_csv, import_csv
-
-
-def test_csv_gives_back_every_number(recording: Recording, tmp_path: Path) -> None:
-    export_csv(recording, tmp_path / "r.csv")
-    assert import_csv(tmp_path / "r.csv") == recording
+from sense.recordings.formats import csv_table
+from sense.recordings.press_plan import read_plan
 
 
 def lines(rows: list[str], header: str = "time_s,a,b,x_mm,y_mm") -> str:
@@ -40,14 +40,12 @@ def test_unknown_places_and_missing_readings_are_told_by_their_cells(tmp_path: P
     assert np.argwhere(np.isnan(recording.readings)).tolist() == [[1, 0], [2, 0], [5, 1]]
 
 
-@pytest.mark.parametrize("header", ["time_s,a,b,c,d,e,f", "time_s,a,b,c,d,e,f,x_mm,y_mm"])
+@pytest.mark.parametrize("header", ["time_s,a,b,c,d", "time_s,a,b,c,d,x_mm,y_mm"])
 def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_path: Path, header: str) -> None:
     table = np.column_stack([recording.times_s, recording.readings])
-    end = "," * (header.count(",") - recording.fibres)
-    names = header.replace("a,b,c,d,e,f", ",".join("abcdefgh"[: recording.fibres]))
     end = ",," if "x_mm" in header else ""
     rows = [",".join(map(str, row)) + end for row in table[:1000].tolist()]
-    (tmp_path / "r.csv").write_text(lines(rows, names))
+    (tmp_path / "r.csv").write_text(lines(rows, header))
     found = import_csv(tmp_path / "r.csv")
     assert not found.known.any()
     assert len(found.begun) == 25
@@ -67,6 +65,7 @@ def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_p
         (lines([*FINE, "6,1,2"]), "line 8 has 3 values, expected 5"),
         (lines([*FINE, "6,1,two,,"]), "line 8 holds no numbers"),
         (lines([*FINE, "6,1,2,3,"]), "line 8 has one of x_mm and y_mm"),
+        (lines([*FINE, "# here", "6,1,2,3,"]), "line 9 has one of x_mm and y_mm"),
         (lines([*FINE, "6,1,-inf,,"]), r"readings hold infinity.*row 6"),
         (lines([*FINE, "2,1,2,,"]), "do not ascend at reading 6"),
         (lines(FINE[1:]), "press 0 goes from reading 0"),
@@ -81,29 +80,17 @@ def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_p
         (lines(["0,1", "0,1"], "time_s,a"), "do not ascend at reading 1"),
         (lines(["0,,", "1,,"], "time_s,a,b"), "readings are all missing"),
         (lines(["0,1,,1"], "time_s,x_mm,y_mm,a"), "line 2 has one of x_mm and y_mm"),
+        (lines([*FINE, "6,1,1e30,,"]), "readings hold 1e.*allowed is"),
+        (lines([*FINE, "6,1,2,1e200,8"]), "presses hold 1e.*allowed is"),
+        (lines([*FINE, "1e300,1,2,,"]), "times hold 1e.*allowed is"),
         (lines(FINE, "\x00" * 500), r"header is '\\x00.{0,40}', expected time_s"),
     ],
 )
 def test_other_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "r.csv").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=rf"r\.csv: .*{message}") as refused:
         import_csv(tmp_path / "r.csv")
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
-def test_csv_may_begin_with_a_byte_order_mark(tmp_path: Path, encoding: str) -> None:
-    (tmp_path / "r.csv").write_text(lines(FINE), encoding=encoding)
-    assert import_csv(tmp_path / "r.csv").presses_mm.tolist() == [[3, 4], [-1, 0]]
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [("6,1,1e30,,", "readings hold 1e"), ("6,1,2,1e200,8", "presses hold 1e"), ("1e300,1,2,,", "times hold 1e")],
-)
-def test_implausible_numbers_are_refused(tmp_path: Path, row: str, message: str) -> None:
-    (tmp_path / "r.csv").write_text(lines([*FINE, row]))
-    with pytest.raises(InputError, match=rf"r\.csv: {message}.*allowed is"):
-        import_csv(tmp_path / "r.csv")
+    assert "\n" not in str(refused.value)
 
 
 LAB = """# bench 2
@@ -148,34 +135,20 @@ def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path: Path, mappin
         import_csv(tmp_path / "lab.csv", mapping)
 
 
-def test_the_form_of_padforge_may_be_written_with_semicolons_and_decimal_commas(tmp_path: Path) -> None:
-    (tmp_path / "r.csv").write_text(lines(FINE))
-    rows = [";".join(cell and f"{cell},0" for cell in row.split(",")) for row in FINE]
-    (tmp_path / "s.csv").write_text(lines(rows, "time_s;a;b;x_mm;y_mm"))
-    assert import_csv(tmp_path / "s.csv") == import_csv(tmp_path / "r.csv")
-
-
-def test_digits_that_only_python_reads_are_no_numbers(tmp_path: Path) -> None:
-    for cell in ("1_0", "\u0661"):
-        (tmp_path / "r.csv").write_text(lines([*FINE, f"6,1,{cell},,"]), encoding="utf-8")
-        with pytest.raises(InputError, match="line 8 holds no numbers"):
-            import_csv(tmp_path / "r.csv")
-
-
 MEASURED = ("depth_mm", "reached_mm", "force_n")
 
 
-def test_depth_and_force_have_columns_where_they_are_known(recording: Recording, tmp_path: Path) -> None:
-    count = len(recording.begun)
+def test_every_number_comes_back_and_measures_have_columns_where_they_are_known(
+    brief: Recording, tmp_path: Path
+) -> None:
+    count = len(brief.begun)
+    forces = np.where(np.arange(count) < 9, np.nan, 2.5)
     for change, columns in (
         ({"depths_mm": np.empty(0)}, []),
-        ({}, ["depth_mm"]),
-        (
-            {"reached_mm": np.linspace(4, 5, count), "forces_n": np.where(np.arange(count) < 9, np.nan, 2.5)},
-            [*MEASURED],
-        ),
+        ({"depths_mm": np.full(count, 5.0)}, ["depth_mm"]),
+        ({"depths_mm": np.full(count, 5.0), "reached_mm": np.linspace(4, 5, count), "forces_n": forces}, [*MEASURED]),
     ):
-        changed = replace(recording, **change)
+        changed = replace(brief, **change)
         export_csv(changed, tmp_path / "r.csv")
         with (tmp_path / "r.csv").open() as file:
             assert file.readline().strip().split(",")[7:] == columns
@@ -198,3 +171,114 @@ def test_an_unknown_place_is_unknown_in_any_unit(tmp_path: Path, unit: str, valu
     (tmp_path / "lab.csv").write_text("\n".join(["t,a,px,py", *rows]) + "\n")
     recording = import_csv(tmp_path / "lab.csv", f"time=t,fibres=a,x=px:{unit},y=py:{unit}")
     np.testing.assert_allclose(recording.presses_mm, [[np.nan, np.nan], [2 * value, -value]])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace(",", ";").replace("-1", "-1,0"),
+        lambda text: text.replace(",", ";").replace("-1", "-1.0"),
+        lambda text: text.replace(",", "\t").replace("-1", "-1,0"),
+        lambda text: "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in text.split()),
+        lambda text: text.replace(",", " , ").replace("\n", "\r\n") + "\r\n\r\n",
+        lambda text: text.strip().replace("\n", "\r"),
+        lambda text: "# of a probe\n\n# 2024, spring; warm\n" + text.replace("\n3", "\n# knocked at\n3"),
+        lambda text: f"# by hand\n# {text}",
+        lambda text: "#" + text.replace(",", ";").replace("-1", "-1e0"),
+    ],
+)
+def test_programs_write_the_same_table_in_many_ways(tmp_path: Path, change) -> None:
+    (tmp_path / "plain.csv").write_text(lines(FINE))
+    (tmp_path / "r.csv").write_text(change(lines(FINE)), encoding="utf-8", newline="")
+    assert import_csv(tmp_path / "r.csv") == import_csv(tmp_path / "plain.csv")
+
+
+def test_names_may_hold_separators_in_quotes_and_other_columns_anything(tmp_path: Path) -> None:
+    rows = ["0,12:30,1,0", "1,1_0,2,1", "2,,2,1", "3,?,1,0"]
+    (tmp_path / "r.csv").write_text("\n".join(['"t;s;x",note,"a;b",down', *rows]))
+    found = import_csv(tmp_path / "r.csv", "time=t;s;x,fibres=a;b,press=down")
+    assert found.readings.tolist() == [[1], [2], [2], [1]]
+
+
+CELLS = ["1_0", "\u0661", "\uff11", "0x10", "1 2", '"1,5"', "two", "1e", "--1", "?", "1d5", "?5", "5?"]
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_what_only_some_programs_take_for_a_number_is_refused_with_its_line(tmp_path: Path, separator: str) -> None:
+    for cell in CELLS if separator == "," else [cell for cell in CELLS if cell != '"1,5"']:
+        for comment in ("", "# here\n"):
+            rows = [separator.join(row) for row in (("x_mm", "y_mm"), ("1", "2"), ("3", cell))]
+            text = "\n".join([*rows[:2], comment + rows[2]])
+            (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+            with pytest.raises(InputError, match=rf"t\.csv: line {3 + bool(comment)} holds no numbers"):
+                read_plan(tmp_path / "t.csv", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"x_mm,y_mm\n1,\xff\n", "not a CSV file"),
+        (b"\xff\xfe", "not a CSV file"),
+        (b"x_mm,y_mm\n" + b"1" * (2**23 + 2**21), "a line has more than"),
+        (b"a" * 3_000_000, "not a CSV file .field larger"),
+        (b"x_mm,y_mm\n1," + b'"' + b"2" * 200_000, "line 2 is not CSV"),
+        (b'x_mm,y_mm\n1,"2\n', "line 2 is not CSV .unexpected end"),
+        (b'x_mm,y_mm\n1,"2"3\n', "line 2 is not CSV"),
+        (b'x_mm,"y_mm\n1,2\n', "not a CSV file .unexpected end"),
+    ],
+)
+def test_what_is_no_table_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "t.csv").write_bytes(content)
+    with pytest.raises(InputError, match=rf"t\.csv: {message}") as refused:
+        read_plan(tmp_path / "t.csv", 1.0)
+    assert len(str(refused.value)) < 300 + len(str(tmp_path))
+
+
+def test_more_than_is_allowed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_table, "MOST_VALUES", 100)
+    (tmp_path / "t.csv").write_text("x_mm,y_mm\n" + "1,2\n" * 51)
+    with pytest.raises(InputError, match="more than 100 values"):
+        read_plan(tmp_path / "t.csv", 1.0)
+
+
+def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path) -> None:
+    """Of 10 MB most are notes; a line that is no number is named by its number wherever it stands."""
+    rows = [f"{at},{at % 7},{at % 40 // 20},{'n' * 1000}" for at in range(10_000)]
+    (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
+    found = import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
+    assert found.times_s.tolist() == list(range(10_000))
+    rows[9000] = rows[9000].replace("9000", "9OOO")
+    (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
+    with pytest.raises(InputError, match="line 9002 holds no numbers"):
+        import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
+
+
+PLAIN = st.one_of(
+    st.floats(-1e3, 1e3).map(repr),
+    st.sampled_from(["", "nan", "inf", "-Infinity", " 1", "2 ", "1e5", ".5", "5.", "+1", "1_0", '"1"', "a", "?"]),
+    st.text(max_size=4),
+)
+
+
+@settings(max_examples=40)
+@given(
+    rows=st.lists(st.lists(PLAIN, min_size=2, max_size=2), min_size=1, max_size=8),
+    separator=st.sampled_from(",;\t"),
+    end=st.sampled_from(["\n", "\r\n"]),
+)
+def test_a_comment_makes_no_difference_to_what_is_read(tmp_path_factory, rows, separator, end) -> None:
+    """Lines as plain as those of most files are read at once, others one by one."""
+
+    def results(comment: str) -> Iterator[str]:
+        path = tmp_path_factory.getbasetemp() / "t.csv"
+        told = [separator.join(("time_s", "a", "x_mm", "y_mm")), *(separator.join(["1", "1", *row]) for row in rows)]
+        text = end.join([*told, *comment.split()])
+        path.write_text(text.encode("utf-8", "replace").decode(), encoding="utf-8", newline="")
+        table = csv_table.CsvTable(path)
+        try:
+            yield repr(table.columns([0, 1, 2, 3], unknown=[2, 3]).tolist())
+        except InputError as error:
+            yield str(error)
+
+    assert [*results("")] == [*results("#comment")]
