@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -98,6 +98,7 @@ def random_weights(fibres: int, rng: np.random.Generator) -> dict[str, NDArray[n
     return {name: (0.5 * rng.standard_normal(shape)).astype(np.float32) for name, shape in shapes.items()}
 
 
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), fibres=st.integers(1, 5))
 def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int, fibres: int) -> None:
     rng = np.random.default_rng(seed)
