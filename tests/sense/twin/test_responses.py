@@ -33,7 +33,7 @@ def noisy(printed: Twin) -> Twin:
 
 @pytest.fixture(scope="module")
 def recording(noisy: Twin) -> Recording:
-    return simulate(noisy, RigSettings(presses=1000, creep=0, seed=1))
+    return simulate(noisy, RigSettings(presses=800, creep=0, seed=1))
 
 
 def test_where_all_of_a_press_deviates_alike_it_tells_what_its_answer_tells(noisy: Twin, recording: Recording) -> None:
