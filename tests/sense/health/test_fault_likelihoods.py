@@ -70,7 +70,8 @@ def test_ratios_are_those_of_densities(seed: int) -> None:
         y, m, s = targets[q, c, :COMPONENTS], mean[q, c, :COMPONENTS], honest[:COMPONENTS]
 
         healthy, floor = log_density(y, m, s), model.floor[c]
-        others = [math.exp(log_density(y, *each)) for each in zip(model.other_mean[:, c], model.other_spread[:, c], strict=True)]
+        library = zip(model.other_mean[:, c], model.other_spread[:, c], strict=True)
+        others = [math.exp(log_density(y, *each)) for each in library]
         odd = (sum(others) / LIBRARY + math.exp(log_density(y, m, 4 * s))) / 2
         log_noise = math.log(noise_of(traces[q, c]) / model.noise[c] + 0.25)
         loud = (log_noise - model.noise_centre[c]) / model.noise_spread[c]

@@ -86,7 +86,7 @@ def test_damaged_files_are_refused(model: HealthModel, tmp_path: Path, name: str
         (tmp_path / name).symlink_to("/dev/zero")
     elif spoilt != "missing":
         (tmp_path / name).write_bytes(torn if isinstance(spoilt, str) else spoilt)
-    with pytest.raises(InputError, match="not the weights|cannot be read|JSON|a file") as caught:
+    with pytest.raises(InputError, match=r"not the weights|cannot be read|JSON|a file") as caught:
         health_in(tmp_path)
     assert "\n" not in str(caught.value)
 

@@ -26,6 +26,7 @@ from tests.sense.health.pads import (
     PRESSES,
     Fault,
     drifting,
+    faulty,
     floating,
     later,
     learn,
@@ -177,6 +178,15 @@ def test_presses_follow_each_other_within_the_readings(begun: list[int], lifted:
 def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthModel) -> None:
     for alarms in (1e-3, 1e-5):
         assert np.exp(-replace(model, false_alarms=alarms).threshold) == pytest.approx(alarms / len(HYPOTHESES))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pads_at_their_worst_are_examined(pad: Recording, model: HealthModel, seed: int) -> None:
+    end = int(pad.begun[60])
+    readings = faulty(np.random.default_rng(seed), pad.readings[:end])
+    for finding in examine(model, readings, pad.times_s[:end], pad.begun[:60], pad.lifted[:60]):
+        assert 0 <= finding.since <= finding.press < 60
+        assert finding.score >= 5
 
 
 def test_findings_are_told_in_one_line_each() -> None:

@@ -81,9 +81,8 @@ def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recordin
     spoilt = recording.readings.copy()
     spoilt[:, 2] = np.random.default_rng(1).uniform(0, 3, len(spoilt))
     deaf = retrained(replace(recording, readings=spoilt))
-    assert [each["mean_mm"] == other["mean_mm"] for each, other in zip(plain["by_subset"], deaf["by_subset"])] == [
-        each["lost"] == [2] for each in plain["by_subset"]
-    ]
+    for each, other in zip(plain["by_subset"], deaf["by_subset"], strict=True):
+        assert (each["mean_mm"] == other["mean_mm"]) == (each["lost"] == [2])
     test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
     far = recording.presses_mm.copy()
     far[test] = 2e4  # whoever had learnt from one of them would find all of it elsewhere

@@ -107,16 +107,21 @@ def test_channels_that_are_missing_are_said_to_read_nothing(recording: Recording
     ]
 
 
-NOTHING = np.random.default_rng(0).normal(2.0, 0.002, (20_000, 4))
+def of_59(one: Recording) -> dict[str, np.ndarray]:
+    return {"presses_mm": np.where(np.arange(300)[:, None] < 59, one.presses_mm, np.nan)}
+
+
+def silent(one: Recording) -> dict[str, np.ndarray]:
+    return {"readings": np.random.default_rng(0).normal(2.0, 0.002, one.readings.shape)}
 
 
 @pytest.mark.parametrize(
     ("spoil", "pad", "message"),
     [
-        (lambda one: {"presses_mm": np.where(np.arange(300)[:, None] < 59, one.presses_mm, np.nan)}, PLAN, "59 presses of"),
+        (of_59, PLAN, "59 presses of known place"),
         (lambda one: {"presses_mm": one.presses_mm / 4 + 5}, PLAN, "the presses lie within"),
-        (lambda one: {"readings": NOTHING[: len(one.readings)]}, PLAN, "no channel of the recording answers"),
-        (lambda one: {}, Morphology.straight(1, pitch_mm=20.0), "3 channels .* answer to presses, the pad has 2 fibres"),
+        (silent, PLAN, "no channel of the recording answers"),
+        (lambda one: {}, Morphology.straight(1, pitch_mm=20.0), "3 channels .* to presses, the pad has 2 fibres"),
     ],
 )
 def test_recordings_that_tell_nothing_are_refused(recording: Recording, spoil, pad: Morphology, message: str) -> None:
