@@ -9,13 +9,11 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
-from sense import Recording
 from sense.health import fault_likelihoods
 from sense.health.alarm_thresholds import Tail, climb
 from sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, FaultLikelihoods, noise_of
-from sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE, traces_of
-from sense.health.health_model import HealthModel
-from tests.sense.health.pads import LEARNT, Array
+from sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE
+from tests.sense.health.pads import Array
 
 PRESSES, FIBRES = 5, 3
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
@@ -185,16 +183,6 @@ def test_noise_is_that_of_the_quiet_thirds_and_spikes_are_none(seed: int, size: 
     steep = traces.copy()
     steep[:, :, 10:20] += 1000 * size * np.arange(10)
     assert (noise_of(steep) == found).all()
-
-
-def test_a_step_is_found_with_its_sign_and_smooth_answers_are_none(model: HealthModel, pad: Recording) -> None:
-    traces = traces_of(pad.readings, pad.begun, pad.lifted)[LEARNT:]
-    healthy = np.abs(model.evidence.steps(traces))
-    for size in (0.1, -0.1):
-        stepped = traces + size * (np.arange(TRACE) >= 24)
-        found = model.evidence.steps(stepped)
-        assert (np.sign(found) == np.sign(size)).all()
-        assert np.abs(found).min() > np.quantile(healthy, 0.99)
 
 
 def test_a_tail_is_read_by_the_number_of_fibres_lost() -> None:

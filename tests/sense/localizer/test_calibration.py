@@ -100,6 +100,11 @@ def test_the_document_says_what_was_measured(calibrated: tuple[Localizer, dict],
     assert row["std_mm"] == pytest.approx(np.std(means))
     assert row["max_mm"] == pytest.approx(np.max(means))
     assert document["errors"][0]["std_mm"] == 0
+    assert len(document["idle_share"]) == 4
+    cells = document["by_place"]
+    mean = sum(cell["presses"] * cell["mean_mm"] for cell in cells) / document["test_presses"]
+    assert mean == pytest.approx(document["errors"][0]["mean_mm"])
+    assert localizer.normalization.centre.shape == (4, 9 + 8 + 3)  # windows, and gains of the phases
 
 
 def test_evaluation_counts_held_back_presses_of_its_own_recording_and_all_of_another(
@@ -112,8 +117,11 @@ def test_evaluation_counts_held_back_presses_of_its_own_recording_and_all_of_ano
     other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
     assert other["test_presses"] == 300
     assert other["split"] == "none"
-    with pytest.raises(InputError, match="lost is 4, allowed is a whole number from 0 to 3"):
-        evaluate(localizer, recording, [4])
+    for lost, said in (([4], "lost is 4, allowed is a whole number from 0 to 3"), ([], "lost names no number")):
+        with pytest.raises(InputError, match=said):
+            evaluate(localizer, recording, lost)
+    with pytest.raises(InputError, match="test press 300 of the localizer: no such press, allowed are 0 to 299"):
+        evaluate(replace(localizer, test=(0, 300)), recording, [0])
 
 
 @pytest.mark.parametrize(
@@ -130,14 +138,6 @@ def test_options_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         calibrate(recording, SHORT.model_copy(update=change), **given)
-
-
-@pytest.mark.parametrize(("features", "size"), [("causal", 9 + 2), ("early", 6 + 1), ("published", 3)])
-def test_other_inputs_can_be_learnt_from_too(recording: Recording, features: str, size: int) -> None:
-    """Windows, and gains of the phases that they are of."""
-    localizer, document = calibrate(recording, SHORT.model_copy(update={"features": features}))
-    assert localizer.normalization.centre.shape == (4, size)
-    assert np.isfinite(document["errors"][0]["mean_mm"])
 
 
 def test_the_published_preset_knows_all_fibres_only(recording: Recording, tmp_path: Path) -> None:
@@ -170,16 +170,6 @@ def test_radii_hold_their_shares_on_presses_never_seen(calibrated: tuple[Localiz
     assert row["within_r90"] > 0.9 - 0.25
 
 
-def test_errors_by_place_make_up_the_mean(calibrated: tuple[Localizer, dict]) -> None:
-    document = calibrated[1]
-    cells = document["by_place"]
-    assert sum(cell["presses"] for cell in cells) == document["test_presses"]
-    mean = sum(cell["presses"] * cell["mean_mm"] for cell in cells) / document["test_presses"]
-    assert mean == pytest.approx(document["errors"][0]["mean_mm"])
-    assert len(document["idle_share"]) == 4
-    assert all(0 <= share <= 1 for share in document["idle_share"])
-
-
 @pytest.mark.slow
 def test_a_short_training_on_the_published_recording_is_already_near(published: Path) -> None:
     recording = import_mat(published / "para5_long_first4500.mat")
@@ -209,13 +199,6 @@ def test_readings_at_the_limits_give_finite_errors(recording: Recording, volts: 
     found, document = calibrate(replace(recording, readings=volts * signs, presses_mm=places), SHORT)
     for row in (*document["errors"], *evaluate(found, recording)["errors"]):
         assert np.isfinite(list(row.values())).all()
-
-
-def test_levels_and_test_presses_that_are_not_there_are_refused(localizer: Localizer, recording: Recording) -> None:
-    with pytest.raises(InputError, match="lost names no number of fibres"):
-        evaluate(localizer, recording, [])
-    with pytest.raises(InputError, match="test press 300 of the localizer: no such press, allowed are 0 to 299"):
-        evaluate(replace(localizer, test=(0, 300)), recording, [0])
 
 
 def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(localizer: Localizer, recording: Recording) -> None:

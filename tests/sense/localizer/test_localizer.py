@@ -99,16 +99,6 @@ def test_a_recording_is_up_to_a_quarter_faster_or_slower(
             localizer.inputs(other)
 
 
-def test_readings_far_from_all_learnt_ones_give_finite_places(localizer: Localizer, recording: Recording) -> None:
-    readings = 1000.0 * np.random.default_rng(0).choice([-1, 1], recording.readings.shape)
-    spread = np.full_like(localizer.normalization.spread, 1e-40)
-    still = replace(localizer.normalization, spread=spread, middle_mm=np.zeros(2), span_mm=1e5)
-    found = replace(localizer, normalization=still)
-    places = found.locate(found.inputs(replace(recording, readings=readings)))
-    assert np.isfinite(places.places_mm).all()
-    assert np.isfinite(places.r90_mm).all()
-
-
 def test_depth_and_force_come_with_widths_that_grow_as_fibres_are_lost(
     deep_localizer: Localizer, deep_recording: Recording
 ) -> None:

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fine_tuning
 from sense.localizer.calibration.affine_correction import fit_correction
-from sense.localizer.calibration.fine_tuning import FAR_NOISE, MOVED, _Presses, adapt
+from sense.localizer.calibration.fine_tuning import adapt
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
 from sense.localizer.calibration.recalibration import _CrossValidation, recalibrate
-from sense.localizer.calibration.training import INPUT_NOISE
 from sense.localizer.evaluation import distances
 from sense.localizer.localizer import Found
 from sense.localizer.response.response_model import looked_up
@@ -203,23 +201,6 @@ def test_the_more_was_learnt_before_the_less_new_presses_count(
         shifts.append((found - plain).mean())
     assert shifts[0] > 0.03
     assert abs(shifts[1]) < 0.2 * shifts[0]
-
-
-def test_presses_are_moved_nearby_or_to_anywhere_on_the_pad() -> None:
-    """Of a fibre that reads the place itself, from presses all made at one place."""
-    grid = np.linspace(-1, 1, 9, dtype=np.float32)
-    table = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)[:, :, None]
-    at = np.tile(np.array([0.25, -0.5], dtype=np.float32), (5, 1))
-    presses = _Presses(
-        TrainingPresses(at[:, None], np.ones((5, 1), bool), at), table, 0, torch.Generator().manual_seed(0), None
-    )
-    entries, places = presses.nearby()
-    assert (entries[0, :, :2] - places).std().item() == pytest.approx(INPUT_NOISE, rel=0.2)
-    np.testing.assert_allclose(places.std(dim=0), [MOVED] * 2, rtol=0.2)
-    np.testing.assert_allclose(places.mean(dim=0), at[0], atol=0.05)
-    far = torch.cat([presses.anywhere()[0, :, :2] for _ in range(20)]).numpy()
-    np.testing.assert_allclose(far.mean(axis=0), 0, atol=0.06)
-    np.testing.assert_allclose(np.square(far).mean(axis=0), 1 / 3 + FAR_NOISE**2, rtol=0.06)
 
 
 def test_the_command_writes_a_whole_model(

@@ -42,7 +42,7 @@ LEAST: dict[str, Callable[[], Study]] = {
     "force": lambda: force_study(PADS, noise_counts=(1.0,), learning=Learning(60, 40, hidden=4, epochs=3)),
     "shape": lambda: shape_study(PADS, presses=100, test=60, hidden=4, epochs=3),
     "multicontact": lambda: multicontact_study(PADS, presses=100, test=60, hidden=5, members=2, epochs=3),
-    "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=8),
+    "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
     "sensitivity": lambda: sensitivity.sensitivity_study(PADS, radii=(0.6, 1.0), sides=(4,)),
 }
 
@@ -59,9 +59,9 @@ def test_a_study_broken_off_goes_on_ends_the_same_and_is_told(
     monkeypatch.setattr(drift, "MEMBERS", 2)
     monkeypatch.setattr(drift, "FILTERS", {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)})
     for module in (scaling, sensitivity):
-        monkeypatch.setattr(module, "HIDDEN", 4)
+        monkeypatch.setattr(module, "HIDDEN", 12)
         monkeypatch.setattr(module, "TEST", 50)
-    monkeypatch.setattr(scaling, "EPOCHS", 3)
+    monkeypatch.setattr(scaling, "EPOCHS", 20)
     monkeypatch.setattr(sensitivity, "SIDE", 8)
     monkeypatch.setattr(sensitivity, "MEMBERS", 2)
     whole = run(LEAST[name](), tmp_path / "whole", jobs=1)
