@@ -92,7 +92,7 @@ def test_a_healthy_pad_is_left_in_peace(pad: Recording, model: HealthModel) -> N
 @pytest.mark.parametrize("after", [0, 3])
 def test_a_healthy_pad_is_left_in_peace_where_the_last_release_was_not_recorded(model: HealthModel, after: int) -> None:
     """A simulated recording ends when the probe is sent up; others some readings later."""
-    for seed in range(9, 13):
+    for seed in range(9, 12):
         rig = sense_settings.RigSettings(presses=31, seed=seed, drift_mv=10)
         pad = simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT)
         end = pad.lifted[29] + after
@@ -170,7 +170,7 @@ def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthMod
         assert np.exp(-replace(model, false_alarms=alarms).threshold) == pytest.approx(alarms / len(HYPOTHESES))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_pads_at_their_worst_are_examined(pad: Recording, model: HealthModel, seed: int) -> None:
     end = int(pad.begun[60])
     readings = faulty(np.random.default_rng(seed), pad.readings[:end])
@@ -241,6 +241,7 @@ def test_fibres_that_read_one_value_or_stand_at_the_end_of_their_range_are_dead(
     assert dead_fibres(readings).tolist() == [1, 2, 4, 5, 7]
 
 
+@pytest.mark.slow
 def test_health_learnt_from_few_presses_calls_no_fibre_weak(pad: Recording) -> None:
     model = learn(pad.readings, pad, FEW)
     end = int(pad.begun[FEW])

@@ -41,14 +41,14 @@ def error(localizer: Localizer, recording: Recording, presses: slice, lost: tupl
     return float(distances(found.places_mm, recording.presses_mm[presses]).mean())
 
 
-NEW, LATER = slice(0, 60), slice(60, 300)
+NEW, LATER = slice(0, 50), slice(60, 300)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Iterator[None]:
     """Few steps of adapting, which are slow."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(fine_tuning, "STEPS", 15)
+        patched.setattr(fine_tuning, "STEPS", 12)
         yield
 
 

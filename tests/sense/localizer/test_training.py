@@ -40,6 +40,10 @@ def test_the_spread_of_members_adds_to_what_they_expect() -> None:
     place, sd = network.pooled(outputs)
     assert place[0].tolist() == pytest.approx([0.1, 0.0])
     assert sd[0].tolist() == pytest.approx([np.sqrt(2 * 0.04 + 0.16), np.sqrt(2 * 0.04)])
+    outputs[1, 0, 2:] = np.log(0.4)  # a member that is half as sure counts for a quarter
+    place, sd = network.pooled(outputs)
+    assert place[0].tolist() == pytest.approx([-0.14, 0.0])
+    assert sd[0].tolist() == pytest.approx([np.sqrt(0.8 * 0.1056 + 0.2 * 0.7296), np.sqrt(0.8 * 0.08 + 0.2 * 0.32)])
 
 
 @settings(max_examples=20)

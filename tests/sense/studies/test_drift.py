@@ -132,6 +132,7 @@ def test_under_strong_drift_taking_the_rest_off_wins(document: dict[str, Any]) -
         assert slow < bare
 
 
+@pytest.mark.slow
 def test_without_drift_there_is_nothing_to_take_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drift, "FILTERS", {name: FILTERS[name] for name in (RAW, AS_PUBLISHED)})
     still = STRONG.model_copy(update={"drift_mv": 0.0})

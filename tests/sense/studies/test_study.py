@@ -137,6 +137,9 @@ def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> No
 
     with pytest.raises(ZeroDivisionError):
         run(replace(one(tasks=0), draw=draw), tmp_path)
+    unwritable = Findings([{"a": 1}], [], {"map": object()})
+    with pytest.raises(TypeError, match="JSON"):
+        run(replace(one(tasks=0), conclude=lambda states: unwritable), tmp_path)
     assert not list(tmp_path.iterdir())
 
 

@@ -113,7 +113,7 @@ def test_what_is_missing_does_not_count():
     assert found.certainty[1] == 0
 
 
-@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize("missing", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_channels_and_frame_are_found_first_of_all(printed, answers, missing) -> None:
     """Also where presses lack a channel: these do not count."""
     if missing:

@@ -159,6 +159,7 @@ def test_how_the_pad_lay_counts_what_rig_had_said_of_it(found: bool, told: bool 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_tries")
 def test_a_rectangle_is_identified_whichever_way_it_lay() -> None:
     """Turned by a quarter, presses span its height where its width was planned."""
