@@ -265,20 +265,19 @@ def test_health_is_learnt_from_the_presses_that_were_not_held_back(
 
 
 @pytest.mark.parametrize(
-    ("readings", "presses", "options", "message"),
+    ("scale", "presses", "false_alarms", "message"),
     [
-        ("as read", LEAST_PRESSES - 1, {}, f"299 whole presses, health is learnt from {LEAST_PRESSES}"),
-        ("still", LEARNT, {}, "all 6 fibres are dead"),
-        ("as read", LEARNT, {"false_alarms": 0}, "false alarms a press are 0"),
+        (1, LEAST_PRESSES - 1, 1e-5, f"299 whole presses, health is learnt from {LEAST_PRESSES}"),
+        (0, LEARNT, 1e-5, "all 6 fibres are dead"),
+        (1, LEARNT, 0.0, "false alarms a press are 0"),
     ],
 )
 def test_what_cannot_be_learnt_from_is_refused(
-    pad: Recording, readings: str, presses: int, options: dict[str, float], message: str
+    pad: Recording, scale: float, presses: int, false_alarms: float, message: str
 ) -> None:
-    values = pad.readings if readings == "as read" else np.ones_like(pad.readings)
-    edges = pad.begun[:presses], pad.lifted[:presses]
+    edges, rng = (pad.begun[:presses], pad.lifted[:presses]), np.random.default_rng(0)
     with pytest.raises(InputError, match=message):
-        fit_health_model(values, pad.times_s, *edges, rng=np.random.default_rng(0), **options)
+        fit_health_model(scale * pad.readings, pad.times_s, *edges, rng=rng, false_alarms=false_alarms)
 
 
 @pytest.mark.parametrize(

@@ -158,14 +158,6 @@ def test_a_window_is_scaled_by_the_mean_of_its_own_spread_and_its_fibres() -> No
     assert scaling.entries("published") == FIBRES * WINDOWS
 
 
-def test_scaled_inputs_do_not_depend_on_the_gain() -> None:
-    inputs, places = made(30)
-    louder = replace(inputs, windows=700 * inputs.windows)
-    (plain, table), (scaled, same) = (Normalization.fit(each, places) for each in (inputs, louder))
-    assert np.allclose(plain.inputs(inputs).inputs, scaled.inputs(louder).inputs, atol=1e-4)
-    assert np.allclose(table, same, atol=1e-3)
-
-
 def test_places_are_counted_from_the_middle_in_halves_of_the_longer_side() -> None:
     inputs, places = made()
     places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]

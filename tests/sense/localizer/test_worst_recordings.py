@@ -9,7 +9,7 @@ import pytest
 from design.common.errors import InputError
 from sense import Localizer, Recording, calibrate, evaluate, locate, recalibrate
 from sense.localizer.calibration import fine_tuning
-from sense.localizer.features import FEATURES, press_inputs
+from sense.localizer.features import FEATURES
 from sense.localizer.response.response_model import ResponseModel
 from sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
@@ -92,18 +92,6 @@ def test_the_worst_recordings_are_followed_or_refused(localizer: Localizer, brie
         else:
             require_finite(now, one, document)
             assert (now.factors >= localizer.factors).all()
-
-
-@pytest.mark.parametrize("features", FEATURES)
-@pytest.mark.parametrize("seed", range(5))
-def test_inputs_of_presses_scale_with_volts_and_keep_fibres_apart(brief: Recording, features: str, seed: int) -> None:
-    one, order = worst(seed, brief), np.random.default_rng(seed).permutation(4)
-    raw = press_inputs(one.readings, one.begun, one.lifted, features)
-    moved = press_inputs(one.readings[:, order], one.begun, one.lifted, features)
-    np.testing.assert_array_equal(moved.windows, raw.windows[:, order])
-    np.testing.assert_array_equal(moved.alive, raw.alive[:, order])
-    doubled = press_inputs(one.readings * 2, one.begun, one.lifted, features)
-    np.testing.assert_allclose(doubled.windows, 2 * raw.windows, atol=1e-300)
 
 
 @pytest.mark.slow
