@@ -221,6 +221,7 @@ def test_the_command_writes_a_whole_model(
     assert not Path("later").exists()
 
 
+@pytest.mark.slow
 def test_a_localizer_of_several_depths_follows_presses_of_known_and_of_unknown_depth(
     deep_localizer: Localizer, deep_recording: Recording
 ) -> None:

@@ -60,6 +60,7 @@ def test_caution_keeps_fibres_nearer_to_their_plan_and_is_less_sure(answers, fit
     assert cautious.unsure(0).mean() > fitted.unsure(0).mean()
 
 
+@pytest.mark.slow
 def test_the_true_wiring_is_more_probable_than_another(start, answers, fitted):
     swapped = LaidPad.on_plan(start.plan, start.fibres[::-1], start.frame, 0.5)
     other = fit(fit(swapped, answers, Freedom()).pad, answers, FREE)
