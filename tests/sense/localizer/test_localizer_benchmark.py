@@ -31,6 +31,5 @@ def test_slopes_are_those_of_the_error_and_steps_along_them_lower_it() -> None:
     slope, step = network.weights[0].grad[2, 1].item(), 1e-6  # type: ignore[index]
     network.weights[0].data[2, 1] += step
     assert (network.slope().item() - at) / step == pytest.approx(slope, rel=1e-3)
-    for train in (bench._bfgs, bench._adam):
-        few, many = (np.mean((train(x, y, steps)(x) - y) ** 2) for steps in (1, 20))
-        assert many < few
+    few, many = (np.mean((bench._adam(x, y, steps)(x) - y) ** 2) for steps in (1, 20))
+    assert many < few

@@ -171,7 +171,7 @@ def test_what_was_learnt_beside_the_place_survives_its_files(
 
 
 @pytest.mark.parametrize("name", ["localizer.json", "localizer.safetensors"])
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(0, 255), cut=st.integers(0, 300))
 def test_damaged_bytes_are_refused_in_one_line_or_read(
     localizer: Localizer, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int

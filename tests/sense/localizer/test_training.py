@@ -19,7 +19,7 @@ from sense.settings import Features
 from sense.settings import LocalizerSettings as Options
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4))
 def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -92,9 +92,7 @@ def test_without_the_release_networks_learn_for_twice_as_many_steps(features: Fe
     assert set(totals) == {longer * options.members * 3 * training.LEAST_BATCHES}
 
 
-@pytest.mark.parametrize(
-    ("capabilities", "off"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0), ({}, 0.0)]
-)
+@pytest.mark.parametrize(("capabilities", "off"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0)])
 def test_training_computes_as_finely_as_the_processor_is_fast(
     monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], off: float
 ) -> None:

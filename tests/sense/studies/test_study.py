@@ -61,7 +61,7 @@ def test_a_study_broken_off_goes_on_ends_the_same_and_is_told(
     for module in (scaling, sensitivity):
         monkeypatch.setattr(module, "HIDDEN", 12)
         monkeypatch.setattr(module, "TEST", 50)
-    monkeypatch.setattr(scaling, "EPOCHS", 12)
+    monkeypatch.setattr(scaling, "EPOCHS", 8)
     monkeypatch.setattr(sensitivity, "SIDE", 8)
     monkeypatch.setattr(sensitivity, "MEMBERS", 2)
     whole = run(LEAST[name](), tmp_path / "whole", jobs=1)

@@ -87,7 +87,7 @@ def test_the_twin_answers_as_was_measured(found: Identification) -> None:
 def test_what_a_symmetric_pad_cannot_tell_is_a_doubt_and_always_the_same() -> None:
     pad = Morphology.straight(2)
     printed = printed_pad(pad, np.random.default_rng(0), laid_mm=0.2, dead=0)
-    recording = simulate(printed, RigSettings(presses=200, seed=1))  # of seed 0 it is just not as good
+    recording = simulate(printed, RigSettings(presses=150, seed=1))  # of seed 0 it is just not as good
     found, again = (identify(recording, pad, seed=1) for _ in range(2))
     assert np.array_equal(again.fit.pad.values, found.fit.pad.values)
     assert found.doubts
