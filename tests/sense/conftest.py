@@ -10,14 +10,16 @@ from design import Morphology
 from sense import Localizer, Recording, calibrate
 from sense import settings as sense_settings
 from sense.recordings.simulation.published_protocol import simulate
+from tests.helpers.once import Once
 
 QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)
 
 
 @pytest.fixture(scope="session")
-def recording() -> Recording:
+def recording(once: Once) -> Recording:
     """300 presses on a pad whose fibres wind."""
-    return simulate(Morphology.random(2, knots=3, seed=5), sense_settings.RigSettings(presses=300, seed=1))
+    rig = sense_settings.RigSettings(presses=300, seed=1)
+    return once("recording", lambda folder: simulate(Morphology.random(2, knots=3, seed=5), rig))
 
 
 @pytest.fixture(scope="session")
@@ -29,8 +31,8 @@ def brief(recording: Recording) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def calibrated(recording: Recording) -> tuple[Localizer, dict]:
-    return calibrate(recording, QUICK)
+def calibrated(once: Once, recording: Recording) -> tuple[Localizer, dict]:
+    return once("calibrated", lambda folder: calibrate(recording, QUICK))
 
 
 @pytest.fixture(scope="session")
@@ -39,20 +41,21 @@ def localizer(calibrated: tuple[Localizer, dict]) -> Localizer:
 
 
 @pytest.fixture(scope="session")
-def deep_recording() -> Recording:
+def deep_recording(once: Once) -> Recording:
     """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter.
 
     How strongly it responds is what tells of the depth.
     """
     depths = tuple(np.random.default_rng(4).uniform(0.5, 5, 400).tolist())
     rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths, scatter=0)
-    recording = simulate(Morphology.random(2, knots=3, seed=5), rig)
+    recording = once("deep-recording", lambda folder: simulate(Morphology.random(2, knots=3, seed=5), rig))
     return replace(recording, forces_n=3.0 * recording.depths_mm)
 
 
 @pytest.fixture(scope="session")
-def deeply_calibrated(deep_recording: Recording) -> tuple[Localizer, dict]:
-    return calibrate(deep_recording, QUICK.model_copy(update={"members": 1, "epochs": 40}))
+def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[Localizer, dict]:
+    options = QUICK.model_copy(update={"members": 1, "epochs": 40})
+    return once("deeply-calibrated", lambda folder: calibrate(deep_recording, options))
 
 
 @pytest.fixture(scope="session")

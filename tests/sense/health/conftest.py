@@ -8,19 +8,20 @@ from sense import Recording
 from sense import settings as sense_settings
 from sense.health.health_model import HealthModel
 from sense.recordings.simulation.published_protocol import simulate
+from tests.helpers.once import Once
 from tests.sense.health.pads import PRESSES, learn
 
 
 @pytest.fixture(scope="session")
-def pad() -> Recording:
+def pad(once: Once) -> Recording:
     """The first PRESSES on a simulated pad of six fibres."""
     rig = sense_settings.RigSettings(presses=900, seed=1, drift_mv=10)
-    whole = simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT)
+    whole = once("health-pad", lambda folder: simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT))
     end = int(whole.begun[PRESSES])
     presses = {name: getattr(whole, name)[:PRESSES] for name in ("presses_mm", "begun", "lifted")}
     return Recording(whole.readings[:end], whole.times_s[:end], **presses)
 
 
 @pytest.fixture(scope="session")
-def model(pad: Recording) -> HealthModel:
-    return learn(pad.readings, pad)
+def model(once: Once, pad: Recording) -> HealthModel:
+    return once("health-model", lambda folder: learn(pad.readings, pad))

@@ -65,3 +65,33 @@ def drifting(readings: Array, at: int, rng: np.random.Generator) -> None:
 def weak(readings: Array, at: int, rng: np.random.Generator) -> None:
     rest = np.median(readings[at - 400 : at, 1])
     readings[at:, 1] = rest + 0.5 * (readings[at:, 1] - rest)
+
+
+def faulty(rng: np.random.Generator, readings: Array) -> Array:
+    """Readings (R, C) of which one to three fibres fail, or all of them, from some reading or the first on."""
+    readings = readings.copy()
+    rows, fibres = readings.shape
+    for _ in range(rng.integers(1, 4)):
+        fibre, since = int(rng.integers(fibres)), int(rng.integers(rows) * rng.integers(2))
+        part = readings[since:, fibre]
+        match rng.integers(9):
+            case 0:
+                part[:] = rng.choice([0.0, 3.3, np.nan, 1e-300, 5e-324, 1e3, -1e3])
+            case 1:  # saturated
+                np.clip(part, 1.8, 1.85, out=part)
+            case 2:
+                part[rng.random(len(part)) < rng.choice([0.01, 0.5, 0.99])] = np.nan
+            case 3:
+                other = int(rng.integers(fibres))
+                readings[since:, [fibre, other]] = readings[since:, [other, fibre]]
+            case 4:
+                part *= rng.choice([1e-300, 1e-9, 1e-3, -1.0, 300.0])
+            case 5:
+                part += rng.standard_normal(len(part)) * rng.choice([1e-12, 1.0, 100.0])
+            case 6:  # spikes
+                part[rng.random(len(part)) < 0.01] = rng.choice([1e3, -1e3])
+            case 7:
+                part += np.linspace(0, rng.choice([1.0, -100.0]), len(part))
+            case _:
+                readings[since:] = rng.choice([0.0, 1.0, 999.0])
+    return readings.clip(-1e3, 1e3)

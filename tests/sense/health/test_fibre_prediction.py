@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sense import Recording
 from sense.health import fibre_prediction
 from sense.health.fibre_prediction import (
     COMPONENTS,
@@ -23,8 +22,6 @@ from sense.health.fibre_prediction import (
     shapes_of,
     traces_of,
 )
-from sense.health.health_model import HealthModel
-from tests.sense.health.pads import LEARNT, PRESSES
 
 FIBRES = 2
 
@@ -98,6 +95,7 @@ def random_weights(fibres: int, rng: np.random.Generator) -> dict[str, NDArray[n
     return {name: (0.5 * rng.standard_normal(shape)).astype(np.float32) for name, shape in shapes.items()}
 
 
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), fibres=st.integers(1, 5))
 def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int, fibres: int) -> None:
     rng = np.random.default_rng(seed)
@@ -147,18 +145,3 @@ def test_what_was_not_recorded_of_a_release_is_missing() -> None:
     # One that the next press cuts short is filled.
     cut_off, _ = traces_of(readings, begun, np.array([45, 70]))[:, 0]
     assert cut_off[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]
-
-
-def test_the_others_tell_what_a_fibre_answers(pad: Recording, model: HealthModel) -> None:
-    traces = traces_of(pad.readings, pad.begun, pad.lifted)
-    history = fibre_prediction.History.none(6)
-    rows = [model.shapes.advance(press, history) for press in traces]
-    inputs, targets = model.shapes.scaled(np.stack([a for a, _ in rows]), np.stack([b for _, b in rows]))
-    new = slice(LEARNT, None)
-    mean, spread = expected(model.weights, inputs[new], np.ones((PRESSES - LEARNT, 6), dtype=bool))
-    error = targets[new] - mean
-    # The first component is nearly all of an answer.
-    assert (error[:, :, 0] ** 2).mean() < 0.5 * (targets[new, :, 0] ** 2).mean()
-    inside = (np.abs(error) < 2 * spread * model.evidence.scale).mean()
-    # Two spreads of Student's t with 5 degrees of freedom hold 0.898.
-    assert 0.8 < inside < 0.96

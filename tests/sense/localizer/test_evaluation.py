@@ -7,7 +7,7 @@ import pytest
 
 from design.common.errors import InputError
 from sense import Recording
-from sense.localizer.evaluation import by_place, conformal, distances, error_row, errors_by_loss, idle_share
+from sense.localizer.evaluation import by_place, conformal, error_row, errors_by_loss, idle_share
 from sense.localizer.localizer import Found, Measured
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
@@ -17,10 +17,6 @@ def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0)
     """The four presses found to the side by so many mm."""
     away = np.column_stack([amounts, np.zeros(4)])
     return Found(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
-
-
-def test_distances_are_euclidean() -> None:
-    np.testing.assert_allclose(distances(np.array([[3.0, 4.0], [1.0, 1.0]]), np.array([[0, 0], [1, 3.0]])), [5, 2])
 
 
 def test_a_row_of_errors_is_made_of_the_means_of_each_set_and_of_all_presses() -> None:
@@ -57,7 +53,7 @@ def test_radii_grow_by_a_quantile_a_rank_higher_than_their_share() -> None:
     assert conformal([few], places[:5])[2] == pytest.approx((1.5 * ranks[:5]).max())
 
 
-@pytest.mark.parametrize("presses", [9, 14, 23, 40])
+@pytest.mark.parametrize("presses", [9, 40])
 def test_radii_hold_what_they_say_on_average_also_of_few_presses_with_several_sets_lost(presses: int) -> None:
     rng = np.random.default_rng(presses)
 
@@ -67,18 +63,18 @@ def test_radii_hold_what_they_say_on_average_also_of_few_presses_with_several_se
         return [Found(np.column_stack([each, 0 * each]), np.ones((count, 2)), one, one) for each in off]
 
     shares = []
-    for _ in range(400):
+    for _ in range(200):
         _, r50, r90 = conformal(drawn(presses), np.zeros((presses, 2)))
         fresh = np.concatenate([each.places_mm[:, 0] for each in drawn(100)])
         shares.append([(fresh <= r50).mean(), (fresh <= r90).mean()])
     half, most = np.mean(shares, axis=0)
-    assert 0.49 < half < 0.51 + 1 / presses
-    assert 0.89 < most < 0.91 + 1 / presses
+    assert 0.48 < half < 0.52 + 1 / presses
+    assert 0.885 < most < 0.915 + 1 / presses
 
 
 def test_errors_by_place_are_those_of_a_fifth_of_either_side() -> None:
     pressed = np.array([[0.0, 0.0], [1.9, 0.9], [2.1, 0.0], [10.0, 5.0], [9.9, 4.9]])
-    found = pressed + np.array([[1, 0], [3, 0], [0, 2], [0, 0], [0, 4]])
+    found = pressed + np.array([[1, 0], [3, 0], [1.2, 1.6], [0, 0], [0, 4]])
     rows = by_place(found, pressed)
     keys = ("x_mm", "y_mm", "presses", "mean_mm", "max_mm")
     np.testing.assert_allclose(

@@ -1,83 +1,73 @@
-"""Inputs of the localizer: where windows lie, and that they stay within their press and fibre."""
+"""Inputs of the localizer: where windows lie, that they stay within their press and fibre, and how they are scaled."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sense.localizer.features import (
-    DOWN,
-    FEATURES,
-    PAST,
-    PASTS,
-    REST,
-    SIZES,
-    SLOW,
-    UP,
-    bridged,
-    history,
-    press_inputs,
-    published_inputs,
-    window_inputs,
-)
+from sense.localizer.features import FEATURES, PAST, PASTS, REST, SIZES, SLOW, Inputs, bridged, history, press_inputs
+from sense.localizer.normalization import MAX_INPUT, Normalization
 
-PRESSES, FIBRES = 5, 3
+PRESSES, FIBRES, WINDOWS = 5, 3, 4
 BEGUN = 40 * np.arange(PRESSES) + 20
 LIFTED = BEGUN + 20
-FREE = np.concatenate([[0], LIFTED[:-1]])
-NEXT = np.append(BEGUN[1:], 40 * PRESSES)
 
 
 def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((40 * PRESSES, FIBRES))
 
 
-def test_windows_are_means_minus_the_rest_before_the_press() -> None:
-    readings = noise()
-    found = window_inputs(readings, BEGUN, LIFTED)
-    assert found.shape == (PRESSES, FIBRES, len(DOWN) + len(UP))
-    press = 2
-    rest = readings[90:100].mean(axis=0)
-    assert np.allclose(found[press, :, 7], readings[112:116].mean(axis=0) - rest)
-    assert np.allclose(found[press, :, len(DOWN) + 6], readings[129:134].mean(axis=0) - rest)
+def windows_of(readings: np.ndarray, features: str) -> np.ndarray:
+    return press_inputs(readings, BEGUN, LIFTED, features).windows
 
 
-def test_published_inputs_are_medians_before_in_and_after() -> None:
+def test_windows_are_means_less_the_rest_and_published_inputs_are_medians() -> None:
     readings = noise()
-    found = published_inputs(readings, BEGUN, LIFTED)
+    found, rest = windows_of(readings, "full")[2], readings[90:100].mean(axis=0)
+    assert np.allclose(found[:, 7], readings[112:116].mean(axis=0) - rest)
+    assert np.allclose(found[:, 9 + 6], readings[129:134].mean(axis=0) - rest)
     expected = [np.median(readings[at - 7 : at + 8], axis=0) for at in (90, 110, 130)]
-    assert np.allclose(found[2], np.stack(expected, axis=1))
+    assert np.allclose(windows_of(readings, "published")[2], np.stack(expected, axis=1))
 
 
-INPUTS = {"full": window_inputs, "published": published_inputs}
+def test_of_a_ramp_every_window_gives_its_middle() -> None:
+    """Readings that count themselves: a press from 5000 to 5020, its rest 5.5 before it."""
+    ramp = np.arange(5100.0)[:, None]
+    begun, lifted = np.array([5000]), np.array([5020])
+    down = [1, 2, 3, 4, 5, 6.5, 9.5, 13.5, 17.5]
+    up = [20, 21, 22, 23, 24.5, 27, 31, 36.5]
+    past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
+    slow = [-402, -2010]
+    for features, windows in (("full", down + up), ("causal", down), ("early", down[:6])):
+        found = press_inputs(ramp, begun, lifted, features)
+        np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
+        np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
+    np.testing.assert_allclose(press_inputs(ramp, begun, lifted, "published").windows[0, 0], [4990 - 0, 5010, 5030])
 
 
-@pytest.mark.parametrize("name", INPUTS)
-def test_a_press_is_told_by_its_own_readings_only(name: str) -> None:
+@pytest.mark.parametrize(("name", "end"), [("full", 140), ("published", 140), ("causal", 120), ("early", 108)])
+def test_a_press_is_told_by_its_own_readings_and_a_fibre_by_its_own(name: str, end: int) -> None:
+    """Up to the next press; without the release, up to its end; early, of the first 8 readings alone."""
     readings, press = noise(), 2
-    before = INPUTS[name](readings, BEGUN, LIFTED)[press]
-    readings[: FREE[press]] = 99
-    readings[NEXT[press] :] = 99
-    assert np.array_equal(INPUTS[name](readings, BEGUN, LIFTED)[press], before)
-
-
-@pytest.mark.parametrize("name", INPUTS)
-def test_a_fibre_s_inputs_come_from_that_fibre_only(name: str) -> None:
-    readings = noise()
-    before = INPUTS[name](readings, BEGUN, LIFTED)
+    before = windows_of(readings, name)
     readings[:, 1] = noise(1)[:, 1]
-    after = INPUTS[name](readings, BEGUN, LIFTED)
+    after = windows_of(readings, name)
     assert np.array_equal(after[:, [0, 2]], before[:, [0, 2]])
     assert not np.array_equal(after[:, 1], before[:, 1])
+    readings[:80] = readings[end:] = 99
+    assert np.array_equal(windows_of(readings, name)[press], after[press])
 
 
+@settings(max_examples=20)
 @given(offset=st.floats(-2, 2), gain=st.floats(0.1, 10))
 def test_windows_forget_the_rest_and_keep_the_scale(offset: float, gain: float) -> None:
-    plain = window_inputs(noise(), BEGUN, LIFTED)
-    assert np.allclose(window_inputs(gain * noise() + offset, BEGUN, LIFTED), gain * plain)
+    assert np.allclose(windows_of(gain * noise() + offset, "full"), gain * windows_of(noise(), "full"))
 
 
 @pytest.mark.parametrize("name", FEATURES)
+@settings(max_examples=20)
 @given(gaps=st.lists(st.integers(1, 30), min_size=2, max_size=20), after=st.integers(0, 30))
 def test_presses_of_any_length_have_inputs_within_the_readings(name: str, gaps: list[int], after: int) -> None:
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
@@ -90,58 +80,31 @@ def test_presses_of_any_length_have_inputs_within_the_readings(name: str, gaps: 
     assert found.alive.all()
 
 
-def test_a_press_up_to_its_end_knows_nothing_of_its_release() -> None:
-    readings, press = noise(), 2
-    before = {name: press_inputs(readings, BEGUN, LIFTED, name).windows[press] for name in ("causal", "early")}
-    readings[LIFTED[press] :] = 99
-    after = {name: press_inputs(readings, BEGUN, LIFTED, name).windows[press] for name in ("causal", "early")}
-    assert all(np.array_equal(before[name], after[name]) for name in before)
-    readings[BEGUN[press] + 8 :] = 77
-    assert np.array_equal(press_inputs(readings, BEGUN, LIFTED, "early").windows[press], before["early"])
-
-
 def test_history_is_what_came_before_relative_to_the_rest() -> None:
     readings = np.random.default_rng(3).standard_normal((6000, 2))
-    begun = np.array([300, 5000])
+    begun = np.array([20, 5000])
     found = history(readings, begun)
     rest = readings[5000 + REST[0] : 5000].mean(axis=0)
     for number, (first, end) in enumerate(PAST):
         assert np.allclose(found[1, :, number], readings[5000 + first : 5000 + end].mean(axis=0) - rest)
     samples = readings[5000 - SLOW[0] : 5000 : SLOW[0] // 200]
     assert np.allclose(found[1, :, len(PAST)], np.median(samples, axis=0) - rest)
+    # before the first reading there is the first reading
+    assert np.allclose(found[0, :, len(PAST) - 1], readings[0] - readings[10:20].mean(axis=0))
     readings[5000:] = 99
     assert np.array_equal(history(readings, begun), found)
-
-
-def test_history_before_the_first_reading_is_the_first_reading() -> None:
-    readings = np.arange(40.0)[:, None] + np.zeros((1, 2))
-    found = history(readings, np.array([20]))
-    assert np.allclose(found[0, 0, len(PAST) - 1], readings[0, 0] - readings[10:20, 0].mean())
 
 
 def test_short_gaps_are_bridged_and_do_not_spread() -> None:
     readings = noise()
     holed = readings.copy()
-    holed[105] = np.nan
-    holed[:3, 1] = np.nan
+    holed[105] = holed[:3, 1] = np.nan
     filled = bridged(holed)
     assert np.allclose(filled[105], (readings[104] + readings[106]) / 2)
     assert np.array_equal(filled[:3, 1], np.repeat(readings[3, 1], 3))
     there = ~np.isnan(holed)
     assert np.array_equal(filled[there], readings[there])
     assert press_inputs(holed, BEGUN, LIFTED, "full").alive.all()
-
-
-def test_a_fibre_without_readings_counts_as_lost_in_those_presses_only() -> None:
-    readings = noise()
-    readings[95:130, 1] = np.nan
-    found = press_inputs(readings, BEGUN, LIFTED, "full")
-    assert np.array_equal(~found.alive, np.outer(np.arange(PRESSES) == 2, np.arange(FIBRES) == 1))
-    readings[:, 2] = np.nan
-    found = press_inputs(readings, BEGUN, LIFTED, "full")
-    assert not found.alive[:, 2].any()
-    assert np.isfinite(found.windows).all()
-    assert np.isfinite(found.history).all()
 
 
 @pytest.mark.parametrize(
@@ -159,19 +122,60 @@ def test_a_fibre_counts_where_three_quarters_of_what_is_looked_at_are_there(
             assert press_inputs(readings, BEGUN, LIFTED, features).alive[2, 1] == there
     readings = noise()
     readings[50 : 100 + first, 1] = readings[100 + end : 140, 1] = np.nan
-    assert press_inputs(readings, BEGUN, LIFTED, features).alive[2, 1]
+    readings[:, 2] = np.nan
+    found = press_inputs(readings, BEGUN, LIFTED, features)
+    assert found.alive[2].tolist() == [True, True, False]
+    assert np.isfinite(found.windows).all()
+    assert np.isfinite(found.history).all()
 
 
-def test_of_a_ramp_every_window_gives_its_middle() -> None:
-    """Readings that count themselves: a press from 5000 to 5020, its rest 5.5 before it."""
-    ramp = np.arange(5100.0)[:, None]
-    begun, lifted = np.array([5000]), np.array([5020])
-    down = [1, 2, 3, 4, 5, 6.5, 9.5, 13.5, 17.5]
-    up = [20, 21, 22, 23, 24.5, 27, 31, 36.5]
-    past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
-    slow = [-402, -2010]
-    for features, windows in (("full", down + up), ("causal", down), ("early", down[:6])):
-        found = press_inputs(ramp, begun, lifted, features)
-        np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
-        np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
-    np.testing.assert_allclose(press_inputs(ramp, begun, lifted, "published").windows[0, 0], [4990 - 0, 5010, 5030])
+def made(presses: int = 300) -> tuple[Inputs, np.ndarray]:
+    """Presses without a history, each fibre and window of a size of its own, the last fibre dead in some of them."""
+    rng = np.random.default_rng(0)
+    sizes = rng.uniform(0.1, 2.0, (FIBRES, WINDOWS))
+    windows = 3 + sizes * rng.standard_normal((presses, FIBRES, WINDOWS))
+    alive = np.ones((presses, FIBRES), dtype=bool)
+    alive[::4, 2] = False
+    windows[::4, 2] = 1e3
+    return Inputs(windows, np.empty((presses, FIBRES, 0)), alive), rng.uniform((-20, 0), (30, 10), (presses, 2))
+
+
+def test_a_window_is_scaled_by_the_mean_of_its_own_spread_and_its_fibres() -> None:
+    inputs, places = made()
+    scaling, table = Normalization.fit(inputs, places)
+    for fibre in range(FIBRES):
+        own = inputs.windows[inputs.alive[:, fibre], fibre]
+        variance = own.var(axis=0)
+        np.testing.assert_allclose(scaling.centre[fibre], own.mean(axis=0))
+        np.testing.assert_allclose(scaling.spread[fibre], np.sqrt(np.sqrt(variance) * np.sqrt(variance.mean())))
+    scaled, expected = scaling.inputs(inputs), (inputs.windows[1] - scaling.centre) / scaling.spread
+    np.testing.assert_allclose(scaled.inputs[1], expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(scaled.alive, inputs.alive)
+    scaling.refuse_unsound(table)
+    for sign in (1, -1):  # what lies far off is held
+        assert (scaling.scaled(sign * np.full((1, FIBRES, WINDOWS), 1e9)) == sign * MAX_INPUT).all()
+    assert scaling.entries("masked") == FIBRES * WINDOWS + FIBRES
+    assert scaling.entries("published") == FIBRES * WINDOWS
+
+
+def test_places_are_counted_from_the_middle_in_halves_of_the_longer_side() -> None:
+    inputs, places = made()
+    places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]
+    scaling, _ = Normalization.fit(inputs, places)
+    np.testing.assert_allclose(scaling.middle_mm, [5, 5])
+    assert scaling.span_mm == 25
+    np.testing.assert_allclose(scaling.targets(places[:4]), [[-1, -0.2], [1, 0.2], [1, -0.2], [0, 0]], atol=1e-6)
+    np.testing.assert_allclose(scaling.places_mm(scaling.targets(places)), places, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["silent", "never there", "rounding"])
+def test_a_fibre_that_tells_nothing_is_scaled_to_finite_numbers(kind: str) -> None:
+    inputs, places = made(10)
+    windows, alive = inputs.windows.copy(), inputs.alive.copy()
+    windows[:, 1] = 3.3 + (1e-15 * windows[:, 1] if kind == "rounding" else 0)
+    alive[:, 1] = kind != "never there"
+    inputs = replace(inputs, windows=windows, alive=alive)
+    scaling, table = Normalization.fit(inputs, places)
+    assert np.isfinite(scaling.inputs(inputs).inputs).all()
+    assert np.isfinite(table).all()
+    assert (scaling.spread[1] == 1).all()

@@ -1,11 +1,14 @@
+"""Studies of larger surfaces and of other objects than were learnt from, in small."""
+
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from design import InputError, Morphology, signals
-from sense.studies import scaling
+from sense.studies import scaling, sensitivity
 from sense.studies.scaling import around, scaling_study, shares, spread_presses
+from sense.studies.sensitivity import sensitivity_study
 from sense.studies.study import run
 
 
@@ -13,6 +16,7 @@ def rows_of(document: dict, **wanted) -> list[dict]:
     return [row for row in document["rows"] if wanted.items() <= row.items()]
 
 
+@pytest.mark.slow
 def test_one_network_for_all_tiles_keeps_its_error_as_the_surface_grows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -45,11 +49,25 @@ def test_presses_are_spread_over_all_cells() -> None:
     assert set(map(tuple, np.floor(places - 1).astype(int))) == {(x, y) for x in range(8) for y in range(8)}
 
 
-def test_a_grid_that_tiles_do_not_fill_is_refused() -> None:
+def test_tiles_that_do_not_fill_a_grid_or_are_no_squares_are_refused() -> None:
     with pytest.raises(InputError, match="grids has 6, expected multiples of 4"):
         scaling_study({"square": Morphology.straight(4)}, grids=(4, 6))
-
-
-def test_a_tile_that_is_no_square_is_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"wide has 1 \+ 2 fibres, pitch 8 mm, expected tiles of M \+ M fibres"):
         scaling_study({"wide": Morphology.straight((1, 2), 8.0)}, grids=(4,))
+
+
+@pytest.mark.slow
+def test_a_larger_object_is_located_better_and_a_strange_one_worse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("SIDE", 16), ("TEST", 300), ("MEMBERS", 2), ("HIDDEN", 15)):
+        monkeypatch.setattr(sensitivity, name, value)
+    document = run(sensitivity_study({"square": Morphology.straight(3)}, radii=(0.6, 1.0), sides=(4, 30)), tmp_path)
+    assert len(document["rows"]) == 16
+
+    def mean(trained: tuple, met: tuple) -> float:
+        wanted = dict(zip(("trained_radius", "trained_sides", "radius", "sides"), (*trained, *met), strict=True))
+        return next(row["mean"] for row in document["rows"] if wanted.items() <= row.items())
+
+    assert mean((1.0, 30), (1.0, 30)) < 0.5 * mean((0.6, 30), (0.6, 30))
+    assert mean((1.0, 30), (0.6, 30)) > 1.5 * mean((0.6, 30), (0.6, 30))

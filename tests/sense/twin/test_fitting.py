@@ -1,10 +1,16 @@
-"""Fitted pads are near the truth, and say how sure that is."""
+"""Fitted pads are near the truth and say how sure that is; wirings, noise and scatter are found again."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sense.twin.fitting import Freedom, fit
 from sense.twin.laid_pad import AWAY, COUNTS, LaidPad, Plan
+from sense.twin.responses import Responses
+from sense.twin.scatter import response_scatter
+from sense.twin.smooth import smooth_function
+from sense.twin.wiring import assigned, wirings
 
 from .conftest import PLAN, responses_of
 
@@ -54,7 +60,76 @@ def test_caution_keeps_fibres_nearer_to_their_plan_and_is_less_sure(answers, fit
     assert cautious.unsure(0).mean() > fitted.unsure(0).mean()
 
 
+@pytest.mark.slow
 def test_the_true_wiring_is_more_probable_than_another(start, answers, fitted):
     swapped = LaidPad.on_plan(start.plan, start.fibres[::-1], start.frame, 0.5)
     other = fit(fit(swapped, answers, Freedom()).pad, answers, FREE)
     assert fitted.evidence > other.evidence + 50
+
+
+@pytest.mark.parametrize(("share", "common", "floor"), [(0.0, 0.0, 0.01), (0.18, 0.36, 0.01), (0.18, 0.9, 0.002)])
+def test_share_common_and_floor_of_the_scatter_are_found(printed, fitted, share, common, floor) -> None:
+    """What of the scatter of responses grows with them, on presses whose scatter is known."""
+    still = replace(printed, channels=tuple(replace(channel, noise_v=0.0) for channel in printed.channels))
+    exact = responses_of(still, 900)
+    rng, full_scale = np.random.default_rng(4), np.abs(exact.volts).max()
+    own, shared = rng.standard_normal(exact.volts.shape), rng.standard_normal((len(exact), 1))
+    gain = 1 + share * (np.sqrt(1 - common) * own + np.sqrt(common) * shared)
+    volts = exact.volts * gain + floor * full_scale * rng.standard_normal(exact.volts.shape)
+    noise_v = (volts - exact.volts).std(axis=0)
+    found = response_scatter(fitted.pad, Responses(exact.places_mm, volts, exact.there), noise_v)
+    assert found.share == pytest.approx(share, abs=0.03)
+    # a floor far below what grows is hidden by it, but never mistaken for much
+    assert found.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35, abs=0.25 * noise_v.mean())
+    if share:
+        assert found.common == pytest.approx(common, abs=0.15)
+
+
+def test_too_few_presses_tell_nothing_that_grows(printed, start) -> None:
+    assert response_scatter(start, responses_of(printed, 20), np.ones(len(start.fibres))).share == 0.0
+
+
+PLACES = np.random.default_rng(0).uniform(-20, 20, (500, 2))
+NOISE = np.random.default_rng(1).standard_normal((500, 2))
+FUNCTION = 3 * np.sin(PLACES[:, 0] / 9) + np.cos(PLACES[:, 1] / 7)
+
+
+def test_noise_is_told_from_a_function_of_place():
+    found = smooth_function(
+        Responses(PLACES, np.column_stack([FUNCTION + 0.2 * NOISE[:, 0], NOISE[:, 1]]), np.ones((500, 2), bool)), 10
+    )
+    assert found.noise == pytest.approx([0.2, 1.0], rel=0.12)
+    assert found.certainty[0] > 100
+    assert found.certainty[1] < 5
+
+
+def test_what_is_missing_does_not_count():
+    there = np.ones((500, 2), bool)
+    there[::2, 0] = False
+    there[:, 1] = np.arange(500) < 9
+    volts = np.where(there, (FUNCTION + 0.2 * NOISE[:, 0])[:, None], 1e6)
+    found = smooth_function(Responses(PLACES, volts, there), 10)
+    assert found.noise[0] == pytest.approx(0.2, rel=0.15)
+    assert np.isnan(found.noise[1])
+    assert found.certainty[1] == 0
+
+
+@pytest.mark.parametrize("missing", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_channels_and_frame_are_found_first_of_all(printed, answers, missing) -> None:
+    """Also where presses lack a channel: these do not count."""
+    if missing:
+        volts, there = answers.volts.copy(), answers.there.copy()
+        volts[::3, 0], there[::3, 0] = 5.0, False
+        answers = Responses(answers.places_mm, volts, there)
+    found = wirings(Plan.of(PLAN), answers, np.random.default_rng(0))[0]
+    assert found.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
+    assert found.frame.mirrored
+    assert np.hypot(*np.subtract(found.frame.shift_mm, printed.frame.shift_mm)) < 1.0
+    assert found.match > 0.9
+
+
+def test_every_channel_gets_another_fibre_and_all_have_one_sign():
+    alike = -np.array([[0.9, 0.8], [0.8, 0.1], [-1.0, -1.0]])
+    match, fibres = assigned(alike)
+    assert fibres == (1, 0)
+    assert match == np.mean([0.8**2, 0.8**2])

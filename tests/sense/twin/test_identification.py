@@ -21,17 +21,28 @@ from sense.twin.identified_pad import Identification
 from .conftest import PLAN
 
 
+@pytest.fixture
+def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two wirings are fitted, of six that are refined; pads that are asked for in full have 8 of 24."""
+    monkeypatch.setattr(identification, "TRIED", 2)
+    monkeypatch.setattr(wiring, "REFINED", 6)
+
+
 @pytest.fixture(scope="module")
 def recording(printed: Twin) -> Recording:
-    return simulate(printed, RigSettings(presses=500, seed=3))
+    return simulate(printed, RigSettings(presses=300, seed=3))
 
 
 @pytest.fixture(scope="module")
 def found(recording: Recording) -> Identification:
-    return identify(recording, PLAN, seed=1)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(identification, "TRIED", 2)
+        patched.setattr(wiring, "REFINED", 6)
+        return identify(recording, PLAN, seed=1)
 
 
-def test_wiring_frame_and_reach_are_found(printed: Twin, found: Identification) -> None:
+def require_printed(found: Identification, printed: Twin) -> None:
+    """See that wiring, frame and reach are those of the pad that was printed."""
     twin = found.twin({"command": "test"})
     assert [channel.fibre for channel in twin.channels] == [channel.fibre for channel in printed.channels]
     assert twin.frame.mirrored
@@ -45,13 +56,22 @@ def test_wiring_frame_and_reach_are_found(printed: Twin, found: Identification) 
     assert not found.doubts
 
 
+def test_wiring_frame_and_reach_are_found(printed: Twin, found: Identification) -> None:
+    require_printed(found, printed)
+
+
+@pytest.mark.slow
+def test_wiring_frame_and_reach_are_found_among_all_that_are_tried(printed: Twin) -> None:
+    require_printed(identify(simulate(printed, RigSettings(presses=500, seed=3)), PLAN, seed=1), printed)
+
+
 def test_gains_and_noise_are_those_of_the_pad(printed: Twin, found: Identification) -> None:
     for channel, true in zip(found.twin().channels, printed.channels, strict=True):
         if true.fibre is not None:
             assert channel.gain_v == pytest.approx(true.gain_v, rel=0.25)
-            # 425 presses know it within 7 %, and the pad that is fitted takes up some 5 % of it; what the rest drifts
+            # 255 presses know it within 9 %, and the pad that is fitted takes up some 5 % of it; what the rest drifts
             # within a press comes on top
-            assert 0.85 * true.noise_v < channel.noise_v < 3 * true.noise_v
+            assert 0.8 * true.noise_v < channel.noise_v < 3 * true.noise_v
 
 
 def test_the_twin_answers_as_was_measured(found: Identification) -> None:
@@ -63,10 +83,11 @@ def test_the_twin_answers_as_was_measured(found: Identification) -> None:
     assert told == pytest.approx(fitted, abs=0.05 * np.abs(fitted).max())
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_what_a_symmetric_pad_cannot_tell_is_a_doubt_and_always_the_same() -> None:
     pad = Morphology.straight(2)
     printed = printed_pad(pad, np.random.default_rng(0), laid_mm=0.2, dead=0)
-    recording = simulate(printed, RigSettings(presses=200, seed=1))  # of seed 0 it is just not as good
+    recording = simulate(printed, RigSettings(presses=150, seed=1))  # of seed 0 it is just not as good
     found, again = (identify(recording, pad, seed=1) for _ in range(2))
     assert np.array_equal(again.fit.pad.values, found.fit.pad.values)
     assert found.doubts
@@ -74,46 +95,38 @@ def test_what_a_symmetric_pad_cannot_tell_is_a_doubt_and_always_the_same() -> No
     assert abs(found.fit.pad.frame.turn_deg) < 20  # of all that are as good, the least turned
 
 
-def _channels(recording: Recording, spoil) -> Recording:
-    readings = recording.readings.copy()
-    spoil(readings)
-    return replace(recording, readings=readings)
-
-
-def test_channels_that_are_missing_or_dead_are_said_to_read_nothing(recording: Recording, printed: Twin) -> None:
+@pytest.mark.usefixtures("few_tries")
+def test_channels_that_are_missing_are_said_to_read_nothing(recording: Recording, printed: Twin) -> None:
     live = next(channel.channel for channel in printed.channels if channel.fibre is not None)
-    found = identify(_channels(recording, lambda readings: readings.__setitem__((slice(None), live), np.nan)), PLAN)
-    assert found.twin().channels[live].fibre is None
-    others = [c.fibre for c in found.twin().channels if c.channel != live]
-    assert others == [c.fibre for c in printed.channels if c.channel != live]
+    readings = recording.readings.copy()
+    readings[:, live] = np.nan
+    found = identify(replace(recording, readings=readings), PLAN).twin()
+    assert found.channels[live].fibre is None
+    assert [c.fibre for c in found.channels if c.channel != live] == [
+        c.fibre for c in printed.channels if c.channel != live
+    ]
 
 
-def test_too_few_presses_are_refused(recording: Recording) -> None:
-    few = {name: getattr(recording, name)[:10] for name in ("presses_mm", "begun", "lifted", "depths_mm")}
-    with pytest.raises(InputError, match="10 presses of known place"):
-        identify(replace(recording, **few), PLAN)
+def of_59(one: Recording) -> dict[str, np.ndarray]:
+    return {"presses_mm": np.where(np.arange(300)[:, None] < 59, one.presses_mm, np.nan)}
 
 
-def test_presses_in_one_corner_are_refused(recording: Recording) -> None:
-    corner = recording.presses_mm / 4 + 5
-    with pytest.raises(InputError, match="the presses lie within"):
-        identify(replace(recording, presses_mm=corner), PLAN)
+def silent(one: Recording) -> dict[str, np.ndarray]:
+    return {"readings": np.random.default_rng(0).normal(2.0, 0.002, one.readings.shape)}
 
 
-def test_places_that_are_unknown_are_refused(recording: Recording) -> None:
-    with pytest.raises(InputError, match="0 presses of known place"):
-        identify(replace(recording, presses_mm=np.full_like(recording.presses_mm, np.nan)), PLAN)
-
-
-def test_a_recording_that_answers_to_nothing_is_refused(recording: Recording) -> None:
-    noise = np.random.default_rng(0).normal(2.0, 0.002, recording.readings.shape)
-    with pytest.raises(InputError, match="no channel of the recording answers"):
-        identify(replace(recording, readings=noise), PLAN)
-
-
-def test_a_pad_with_fewer_fibres_than_channels_answer_is_refused(recording: Recording) -> None:
-    with pytest.raises(InputError, match="3 channels of the recording answer to presses, the pad has 2 fibres"):
-        identify(recording, Morphology.straight(1, pitch_mm=20.0))
+@pytest.mark.parametrize(
+    ("spoil", "pad", "message"),
+    [
+        (of_59, PLAN, "59 presses of known place"),
+        (lambda one: {"presses_mm": one.presses_mm / 4 + 5}, PLAN, "the presses lie within"),
+        (silent, PLAN, "no channel of the recording answers"),
+        (lambda one: {}, Morphology.straight(1, pitch_mm=20.0), "3 channels .* to presses, the pad has 2 fibres"),
+    ],
+)
+def test_recordings_that_tell_nothing_are_refused(recording: Recording, spoil, pad: Morphology, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        identify(replace(recording, **spoil(recording)), pad)
 
 
 TOLD = {
@@ -146,10 +159,10 @@ def test_how_the_pad_lay_counts_what_rig_had_said_of_it(found: bool, told: bool 
     )
 
 
-def test_a_rectangle_is_identified_whichever_way_it_lay(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_tries")
+def test_a_rectangle_is_identified_whichever_way_it_lay() -> None:
     """Turned by a quarter, presses span its height where its width was planned."""
-    monkeypatch.setattr(identification, "TRIED", 2)
-    monkeypatch.setattr(wiring, "REFINED", 6)
     plan = Morphology.random((1, 2), 3, 3, (8.0, 12.0))
     printed = printed_pad(plan, np.random.default_rng(1), laid_mm=0.2, dead=0)
     lying = replace(printed, frame=replace(printed.frame, turn_deg=93.0))

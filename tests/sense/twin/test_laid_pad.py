@@ -1,4 +1,4 @@
-"""A laid pad: its derivatives, its scale, and what is frame and what is course."""
+"""A laid pad and what its channels answer: derivatives against differences, closed forms, frame and course."""
 
 from dataclasses import replace
 
@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from design.pad.twin import Frame
+from sense.twin.kernels.response import along_fibre, channel_response
 from sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, Plan, own_values
 from sense.twin.responses import Responses
 
 from .conftest import PLAN
 
+F, J, K, STEP = 60, 7, 6, 0.25
 PLACES = np.random.default_rng(2).uniform(-10, 10, (40, 2))
 
 
@@ -55,13 +57,10 @@ def test_what_all_fibres_share_of_their_way_is_the_frames(pad):
     off = replace(pad, values=shared)
     settled = off.settled()
     assert np.abs(settled.own[:, AWAY]).max() < 1e-6
+    turned = pad.settled()  # and so is a turn
+    assert turned.predict(PLACES) == pytest.approx(pad.predict(PLACES), abs=0.02 * np.ptp(pad.predict(PLACES)))
     assert settled.predict(PLACES) == pytest.approx(off.predict(PLACES), abs=1e-9)
     assert settled.frame.shift_mm == pytest.approx([1.0 - 0.2 * PLAN.unit_mm, -2.0 + 0.1 * PLAN.unit_mm], abs=0.5)
-
-
-def test_a_turn_that_all_fibres_share_is_the_frames(pad):
-    turned = pad.settled()
-    assert turned.predict(PLACES) == pytest.approx(pad.predict(PLACES), abs=0.02 * np.ptp(pad.predict(PLACES)))
 
 
 def test_gains_and_rests_are_those_of_the_answers(pad):
@@ -70,3 +69,51 @@ def test_gains_and_rests_are_those_of_the_answers(pad):
     other = pad.values.copy()
     other[SHARED:].reshape(-1, OWN)[:, :2] = [1.0, 0.0]
     assert replace(pad, values=other).with_gains(answers).own[:, :2] == pytest.approx(own)
+
+
+@pytest.fixture
+def case() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    at = np.linspace(0, 4, F + 1)
+    line = np.column_stack([at, 0.4 * np.sin(2 * at)])
+    along = np.diff(line, axis=0)
+    length = np.hypot(*along.T)
+    return {
+        "course": (line[1:] + line[:-1]) / 2,
+        "tangent": along / length[:, None],
+        "length": length,
+        "aside": 0.1 * rng.standard_normal((2, J)),
+        "sensitivity": 0.2 * rng.standard_normal((1, J)),
+        "places": np.column_stack([rng.uniform(0, 4, 9), rng.uniform(-1, 1, 9)]),
+        "profile": rng.standard_normal((2, K)),
+    }
+
+
+def test_a_fibre_that_is_moved_as_a_whole_answers_as_the_press_moved_back(case):
+    moved = {**case, "aside": np.tile([[0.3], [-0.2]], J)}
+    back = {**case, "aside": np.zeros((2, J)), "places": case["places"] - [0.3, -0.2]}
+    assert channel_response(**moved, step=STEP)[0] == pytest.approx(channel_response(**back, step=STEP)[0], abs=1e-12)
+
+
+def test_a_fibre_that_is_laid_longer_counts_for_its_length(case):
+    straight = {**case, "course": np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])}
+    straight |= {"tangent": np.tile([1.0, 0.0], (F, 1)), "length": np.full(F, 1 / F), "sensitivity": np.zeros((1, J))}
+    straight |= {"profile": np.ones((2, K)) * [[1.0], [0.0]], "places": np.array([[0.5, 0.0]])}
+    stretched = {**straight, "aside": np.vstack([0.1 * (np.arange(J) - 1) / (J - 3), np.zeros(J)])}
+    plain = {**straight, "aside": np.zeros((2, J))}
+    # within one step of the press all splines of weight 1 add up to 1, so the signal is the length
+    assert channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
+    assert channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
+
+
+def test_nothing_is_felt_beyond_the_end_of_the_reach(case):
+    far = {**case, "places": np.array([[2.0, 0.4 + 0.5 + (K + 1) * STEP]])}
+    far["aside"] = np.zeros((2, J))
+    assert not any(np.any(part) for part in channel_response(**far, step=STEP))
+
+
+def test_a_curve_along_a_fibre_can_be_constant_and_changes_as_it_says():
+    (value, change), _, _ = along_fibre(np.array([np.full(J, 2.0), np.arange(J, dtype=float)]), F)
+    assert value[0] == pytest.approx(2.0)
+    assert change[0] == pytest.approx(0.0, abs=1e-12)
+    assert np.diff(value[1]) == pytest.approx(change[1][0])

@@ -8,7 +8,7 @@ import pytest
 from design import Morphology, Twin
 from design.pad.twin import TwinReadings
 from sense import Recording, RigSettings, simulate
-from sense.twin.responses import information, of_one_depth
+from sense.twin.responses import information, of_one_depth, responses
 
 QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
 
@@ -33,7 +33,7 @@ def noisy(printed: Twin) -> Twin:
 
 @pytest.fixture(scope="module")
 def recording(noisy: Twin) -> Recording:
-    return simulate(noisy, RigSettings(presses=1000, creep=0, seed=1))
+    return simulate(noisy, RigSettings(presses=800, creep=0, seed=1))
 
 
 def test_where_all_of_a_press_deviates_alike_it_tells_what_its_answer_tells(noisy: Twin, recording: Recording) -> None:
@@ -59,6 +59,16 @@ def test_presses_so_short_that_windows_share_readings_tell_of_their_places_too()
     found = information(recording, np.arange(recording.fibres))
     assert np.isfinite(found).all()
     assert (found > 0).any()
+
+
+def test_an_answer_is_what_is_held_less_the_rest() -> None:
+    """Readings of 2 V, of 5 V while the tip comes to rest, and of 3 V then."""
+    recording = simulate(Morphology.straight(2), RigSettings(presses=80, seed=0))
+    readings = np.full_like(recording.readings, 2.0)
+    for down, up in zip(recording.begun, recording.lifted, strict=True):
+        readings[down : down + 4], readings[down + 4 : up] = 5.0, 3.0
+    found = responses(replace(recording, readings=readings), np.arange(80) < 60)
+    np.testing.assert_allclose(found.volts, 1.0, atol=0.02)  # of which memory takes a little
 
 
 def test_presses_as_deep_as_most_are_kept_the_deeper_of_two_kinds_and_all_of_unknown_depth() -> None:

@@ -1,18 +1,13 @@
 """Several contacts at once, in small: pairs without an order are found better, and as well whichever is named first."""
 
-import json
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from design import Morphology, signals
 from design.common.computing import one_torch_thread
 from sense.studies.multicontact.pairs import LABELLED, WAYS, learnt, moments, pairs_of_moments, unordered_distances
 from sense.studies.multicontact.study import COUNTED, multicontact_study
-from sense.studies.study import Study, run, study_lines
+from sense.studies.study import run
 
 PAD = Morphology.random(4, 3, 0)
 PADS = {"square": Morphology.straight(4), "random": PAD}
@@ -20,13 +15,10 @@ BAR = 0.7
 """Of the error of fixed labels, what that of a free order may be at most."""
 
 
-def small() -> Study:
-    return multicontact_study(PADS, presses=1000, test=300, hidden=20, members=2, epochs=15)
-
-
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    return run(small(), tmp_path_factory.mktemp("multicontact"))
+    study = multicontact_study(PADS, presses=1000, test=300, hidden=20, members=2, epochs=15)
+    return run(study, tmp_path_factory.mktemp("multicontact"))
 
 
 @pytest.fixture
@@ -34,6 +26,7 @@ def places() -> np.ndarray:
     return np.random.default_rng(1).uniform(1, 4, (400, 2, 2))
 
 
+@pytest.mark.slow
 def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels(document: dict) -> None:
     rows = {(row["pad"], row["way"]): row for row in document["rows"]}
     assert list(rows) == [(label, way) for label in PADS for way in [*WAYS, COUNTED]]
@@ -51,6 +44,7 @@ def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels(docu
             assert row["error_by_labels_mm"] is None
 
 
+@pytest.mark.slow
 def test_the_error_by_distance_has_the_mean_of_the_table(document: dict) -> None:
     located = [row for row in document["rows"] if row["way"] != COUNTED]
     for row, curve in zip(located, document["curves"], strict=True):
@@ -63,6 +57,7 @@ def test_the_error_by_distance_has_the_mean_of_the_table(document: dict) -> None
             assert np.all(np.array(curve["error_mm"]) < np.array(curve["apart_mm"]) / 4, where=np.arange(16) >= at)
 
 
+@pytest.mark.slow
 def test_contacts_are_counted_better_than_guessed(document: dict) -> None:
     counted = [row for row in document["rows"] if row["way"] == COUNTED]
     for row, each in zip(counted, document["confusions"], strict=True):
@@ -98,27 +93,3 @@ def test_what_is_learnt_without_an_order_does_not_depend_on_it(way: str, places:
 def test_moments_hold_all_of_a_pair_but_its_order(places: np.ndarray) -> None:
     np.testing.assert_array_equal(moments(places), moments(places[:, ::-1]))
     assert unordered_distances(pairs_of_moments(moments(places)), places).max() < 1e-7
-
-
-def test_a_resumed_study_gives_the_same(tmp_path: Path) -> None:
-    def least() -> Study:
-        study = multicontact_study({"random": PAD}, presses=100, test=60, hidden=5, members=2, epochs=3)
-        return replace(study, draw=lambda document: Figure())
-
-    def broken_off(done: int, total: int, name: str) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(least(), tmp_path / "broken", jobs=1, progress=broken_off)
-    seen: list[int] = []
-    again = run(least(), tmp_path / "broken", resume=True, progress=lambda done, total, name: seen.append(done))
-    assert seen[0] >= 2
-    assert again == run(least(), tmp_path / "whole")
-
-
-def test_the_study_is_told_in_a_table_sentences_and_json(document: dict) -> None:
-    json.dumps(document, allow_nan=False)
-    text = "\n".join(study_lines(document))
-    for label in PADS:
-        assert f"{label}: " in text

@@ -1,17 +1,13 @@
-"""The study of force, in small: what it finds is better than guessing, and the same when resumed."""
-
-import json
-from dataclasses import replace
-from pathlib import Path
+"""The studies of force and of shape, in small: what they find is better than guessing."""
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from design import InputError, Morphology
 from design.pad.indentation import Indenter
 from sense.studies.indentation.force import COUNTS, Learning, force_study, readings
-from sense.studies.study import Study, run, study_lines
+from sense.studies.indentation.shape import FOOTPRINTS, SETS, _circumradius, shape_study
+from sense.studies.study import run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 
@@ -22,6 +18,7 @@ def force(tmp_path_factory: pytest.TempPathFactory) -> dict:
     return run(force_study(PADS, noise_counts=(1.0, 30.0), learning=learning), tmp_path_factory.mktemp("force"))
 
 
+@pytest.mark.slow
 def test_depth_and_force_are_found_better_than_guessed(force: dict) -> None:
     for row in force["rows"]:
         assert 0 < row["depth_mm"] < 0.7 * row["depth_guessed_mm"]
@@ -31,6 +28,7 @@ def test_depth_and_force_are_found_better_than_guessed(force: dict) -> None:
         assert row["place_one_depth_mm"] < row["place_mm"]
 
 
+@pytest.mark.slow
 def test_noise_costs_accuracy(force: dict) -> None:
     for quiet, loud in zip(force["rows"][::2], force["rows"][1::2], strict=True):
         assert quiet["pad"] == loud["pad"]
@@ -38,6 +36,7 @@ def test_noise_costs_accuracy(force: dict) -> None:
         assert quiet["place_one_depth_mm"] < loud["place_one_depth_mm"]
 
 
+@pytest.mark.slow
 def test_rows_are_alike_and_the_force_is_that_of_the_depth(force: dict) -> None:
     assert len({tuple(row) for row in force["rows"]}) == 1
     assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == [
@@ -62,25 +61,28 @@ def test_readings_are_whole_counts_within_the_full_scale() -> None:
     assert noisy.std() == pytest.approx(4, rel=0.1)
 
 
-def test_a_resumed_study_gives_the_same(tmp_path: Path) -> None:
-    def least() -> Study:
-        study = force_study(PADS, noise_counts=(1.0,), learning=Learning(presses=60, test=40, hidden=4, epochs=3))
-        return replace(study, draw=lambda document: Figure())
-
-    def broken_off(done: int, total: int, name: str) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(least(), tmp_path / "broken", jobs=1, progress=broken_off)
-    seen: list[int] = []
-    again = run(least(), tmp_path / "broken", resume=True, progress=lambda done, total, name: seen.append(done))
-    assert seen[0] >= 2
-    assert again == run(least(), tmp_path / "whole")
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    return run(shape_study(PADS, presses=500, test=200, hidden=12, epochs=25), tmp_path_factory.mktemp("shape"))
 
 
-def test_the_study_is_told_in_a_table_sentences_and_json(force: dict) -> None:
-    json.dumps(force, allow_nan=False)
-    text = "\n".join(study_lines(force))
-    for row in force["rows"]:
-        assert row["pad"] in text
+@pytest.mark.slow
+def test_shapes_are_named_better_than_by_chance(shapes: dict) -> None:
+    assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, of) for label in PADS for of in SETS]
+    assert len({tuple(row) for row in shapes["rows"]}) == 1
+    for row, each in zip(shapes["rows"], shapes["confusions"], strict=True):
+        counts = np.array(each["counts"])
+        assert counts.sum() == 200
+        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 200)
+        assert row["accuracy_percent"] > row["guessed_percent"] + 5
+        assert row["worst_percent"] == pytest.approx((100 * np.diag(counts) / counts.sum(axis=1)).min())
+        assert row["worst"] in SETS[row["shapes"]]
+        assert 0 < row["place_mm"] < 11.25 * 0.38
+        assert 0 < row["place_shape_known_mm"] < 11.25 * 0.38
+
+
+def test_footprints_of_a_size_have_one_area() -> None:
+    for sides in FOOTPRINTS.values():
+        radius = _circumradius(sides)
+        area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
+        assert area == pytest.approx(np.pi)

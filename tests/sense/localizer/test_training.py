@@ -1,4 +1,4 @@
-"""Training: masks lose no more than they may, and presses are moved as the fitted table says."""
+"""Networks and their training: NumPy says what torch says, masks lose no more than they may, presses are moved."""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -6,18 +6,47 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sense import settings as sense_settings
+from sense.localizer import network
 from sense.localizer.calibration import training
 from sense.localizer.calibration.networks import masked_network
 from sense.localizer.calibration.networks.masked_network import draw_alive
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
 from sense.localizer.response.response_model import looked_up
 from sense.settings import Features
+from sense.settings import LocalizerSettings as Options
 
 
+@settings(max_examples=5)
+@given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4))
+def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    weights = masked_network.initial(3 * 5 + 3, Options(layers=layers, hidden=24), generator)
+    inputs = torch.randn(7, 3, 5, generator=generator)
+    alive = torch.rand(7, 3, generator=generator) < 0.6
+    expected = masked_network.forward(weights, masked_network.masked(inputs, alive)[None]).detach().numpy()
+    plain = {name: weight.detach().numpy() for name, weight in weights.items()}
+    found = network.forward(plain, network.masked(inputs.numpy(), alive.numpy()))
+    assert found.dtype == np.float32
+    assert np.allclose(found, expected, atol=2e-5)
+
+
+def test_the_spread_of_members_adds_to_what_they_expect() -> None:
+    outputs = np.zeros((2, 1, 4), dtype=np.float32)
+    outputs[:, 0, 0] = [-0.3, 0.5]
+    outputs[:, 0, 2:] = np.log(0.2)
+    place, sd = network.pooled(outputs)
+    assert place[0].tolist() == pytest.approx([0.1, 0.0])
+    assert sd[0].tolist() == pytest.approx([np.sqrt(2 * 0.04 + 0.16), np.sqrt(2 * 0.04)])
+    outputs[1, 0, 2:] = np.log(0.4)  # a member that is half as sure counts for a quarter
+    place, sd = network.pooled(outputs)
+    assert place[0].tolist() == pytest.approx([-0.14, 0.0])
+    assert sd[0].tolist() == pytest.approx([np.sqrt(0.8 * 0.1056 + 0.2 * 0.7296), np.sqrt(0.8 * 0.08 + 0.2 * 0.32)])
+
+
+@settings(max_examples=20)
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
 def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed: int) -> None:
     lost = min(lost, fibres - 1)
@@ -25,17 +54,6 @@ def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed:
     gone = (~alive).sum(dim=1)
     assert gone.max() <= lost
     assert set(gone.unique().tolist()) == set(range(lost + 1))
-
-
-@given(seed=st.integers(0, 999), x=st.floats(-1, 1), y=st.floats(-1, 1))
-def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float) -> None:
-    """Against a bilinear function, which linear interpolation gives exactly."""
-    a, b, c, d = np.random.default_rng(seed).standard_normal(4)
-    grid = np.linspace(-1, 1, 9)
-    u, v = np.meshgrid(grid, grid, indexing="ij")
-    table = torch.from_numpy((a + b * u + c * v + d * u * v)[:, :, None])
-    found = looked_up(table, torch.tensor([[x, y]], dtype=torch.float64), torch)
-    assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
 
 
 def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,7 +70,7 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
         return looked_up(table, places, xp)
 
     monkeypatch.setattr(masked_network, "looked_up", spy)
-    options = sense_settings.LocalizerSettings(hidden=8, layers=1, lost=0, batch=256)
+    options = Options(hidden=8, layers=1, lost=0, batch=256)
     monkeypatch.setattr(training, "MOVED", 0.1)
     member = training._Training(samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
     for _ in range(8):
@@ -68,22 +86,20 @@ def test_without_the_release_networks_learn_for_twice_as_many_steps(features: Fe
     places = rng.uniform(-1, 1, (40, 2)).astype(np.float32)
     table = rng.standard_normal((5, 5, 2, 3)).astype(np.float32)
     samples = TrainingPresses(np.zeros((40, 2, 3), np.float32), np.ones((40, 2), bool), places)
-    options = sense_settings.LocalizerSettings(features=features, hidden=8, layers=1, epochs=3, batch=16)
+    options = Options(features=features, hidden=8, layers=1, epochs=3, batch=16)
     totals: list[int] = []
     training.train_members(samples, table, options, rng, lambda done, total: totals.append(total))
     assert set(totals) == {longer * options.members * 3 * training.LEAST_BATCHES}
 
 
-@pytest.mark.parametrize(
-    ("capabilities", "off"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0), ({}, 0.0)]
-)
+@pytest.mark.parametrize(("capabilities", "off"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0)])
 def test_training_computes_as_finely_as_the_processor_is_fast(
     monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], off: float
 ) -> None:
     """Outputs and slopes are single, and up to a few per cent those of single precision, or exactly these."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
     generator = torch.Generator().manual_seed(0)
-    weights = masked_network.initial(30, sense_settings.LocalizerSettings(), generator)
+    weights = masked_network.initial(30, Options(), generator)
     x = torch.randn(1, 64, 30, generator=generator)
 
     def outputs_and_slopes(forward: Callable[..., torch.Tensor]) -> list[torch.Tensor]:

@@ -7,6 +7,7 @@ from design.benchmarking import harness
 from sense.twin import benchmark as bench
 
 
+@pytest.mark.slow
 def test_every_way_predicts_and_the_twin_does_it_best(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"PRESSES": (250,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
     for name, value in small.items():

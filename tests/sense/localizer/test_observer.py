@@ -1,20 +1,17 @@
 """The observer: of linear answers it finds what least squares find, of others what a fine grid finds."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from design.common.errors import InputError
-from sense import Localizer
 from sense.localizer.response.observer import BEFOREHAND, TOLD, Observer
 
-SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 4000, 0.05
+SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Answer = Callable[[np.ndarray], np.ndarray]
 
 
@@ -30,7 +27,7 @@ def waves(places: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=1).reshape(len(places), FIBRES, WINDOWS)
 
 
-def fitted(answer: Answer, noise: float = NOISE, seed: int = 0) -> tuple[Observer, np.ndarray, np.ndarray]:
+def fitted(answer: Answer, noise: float = NOISE, seed: int = 0) -> "Fitted":
     """An observer of a pad that answers so, with new presses: inputs and places."""
     rng = np.random.default_rng(seed)
     grid = np.linspace(-1, 1, SIDE)
@@ -43,9 +40,22 @@ def fitted(answer: Answer, noise: float = NOISE, seed: int = 0) -> tuple[Observe
     return observer, inputs[PRESSES:], places[PRESSES:]
 
 
+Fitted = tuple[Observer, np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def observed() -> Fitted:
+    return fitted(waves)
+
+
+@pytest.fixture(scope="module")
+def observed_line() -> Fitted:
+    return fitted(linear)
+
+
 @pytest.mark.parametrize("lost", [(), (0,), (1, 3), (0, 1, 2)])
-def test_linear_answers_are_solved_as_by_least_squares(lost: tuple[int, ...]) -> None:
-    observer, inputs, places = fitted(linear)
+def test_linear_answers_are_solved_as_by_least_squares(observed_line: Fitted, lost: tuple[int, ...]) -> None:
+    observer, inputs, places = observed_line
     inner = (np.abs(places) < 0.7).all(axis=1)
     inputs, places = inputs[inner], places[inner]
     alive = np.ones((len(inputs), FIBRES), dtype=bool)
@@ -62,11 +72,11 @@ def test_linear_answers_are_solved_as_by_least_squares(lost: tuple[int, ...]) ->
     np.testing.assert_allclose(variance, bound / (1 + BEFOREHAND), rtol=0.15)
 
 
-def test_other_answers_are_found_as_on_a_fine_grid() -> None:
-    observer, inputs, places = fitted(waves)
+def test_other_answers_are_found_as_on_a_fine_grid(observed: Fitted) -> None:
+    observer, inputs, places = observed
     inputs, places = inputs[:40], places[:40]
     found, _ = observer(inputs, np.ones((40, FIBRES), dtype=bool))
-    fine = np.linspace(-1, 1, 401)
+    fine = np.linspace(-1, 1, 201)
     at = np.stack(np.meshgrid(fine, fine, indexing="ij"), axis=-1).reshape(-1, 2)
     answers = waves(at).reshape(len(at), -1)
     likeliest = np.stack([at[((answers - press.ravel()) ** 2).sum(axis=1).argmin()] for press in inputs])
@@ -109,28 +119,23 @@ def test_a_grid_position_stands_for_its_whole_cell() -> None:
     np.testing.assert_allclose(np.exp(4 * (told[:, 6:8] - 1)), np.maximum(share @ nodes**2 - mean**2, 1e-4), rtol=0.12)
 
 
-@given(seed=st.integers(0, 999))
-def test_what_lost_fibres_give_is_not_looked_at(seed: int) -> None:
-    observer, inputs, _ = OBSERVED
-    rng = np.random.default_rng(seed)
-    alive = rng.random((20, FIBRES)) < 0.6
-    press = inputs[rng.integers(len(inputs), size=20)]
-    spoilt = np.where(alive[:, :, None], press, rng.choice([np.nan, np.inf, 1e4]))
-    for one, other in zip(observer(press, alive), observer(spoilt, alive), strict=True):
-        assert np.isfinite(one).all()
-        assert np.array_equal(one, other)
-
-
+@settings(max_examples=10)
 @given(seed=st.integers(0, 999), size=st.sampled_from([0.1, 1.0, 1e4]))
-def test_torch_finds_what_numpy_finds(seed: int, size: float) -> None:
+def test_lost_fibres_are_not_looked_at_and_torch_finds_what_numpy_finds(
+    observed: Fitted, seed: int, size: float
+) -> None:
     """Of presses of the pad; others, however large, are put somewhere on it by both."""
-    observer, inputs, _ = OBSERVED
+    observer, inputs, _ = observed
     rng = np.random.default_rng(seed)
     alive = rng.random((20, FIBRES)) < 0.7
     press = inputs[rng.integers(len(inputs), size=20)].astype(np.float32)
+    spoilt = np.where(alive[:, :, None], press, rng.choice([np.nan, np.inf, 1e4]))
+    expected = observer(press.astype(np.float64), alive)
+    for one, other in zip(expected, observer(spoilt, alive), strict=True):
+        assert np.isfinite(one).all()
+        assert np.array_equal(one, other)
     in_torch = observer.changed(torch.from_numpy)
     found, told = in_torch(torch.from_numpy(press), torch.from_numpy(alive), torch)
-    expected = observer(press.astype(np.float64), alive)
     np.testing.assert_allclose(found.numpy(), expected[0], atol=2e-3)
     np.testing.assert_allclose(told.numpy(), expected[1], atol=1e-2)
     assert told.shape == (20, TOLD)
@@ -163,8 +168,8 @@ def test_presses_at_one_place_or_on_a_line_will_do(places: np.ndarray) -> None:
     assert np.isfinite(told).all()
 
 
-def test_places_may_be_called_otherwise() -> None:
-    observer, inputs, _ = OBSERVED
+def test_places_may_be_called_otherwise(observed: Fitted) -> None:
+    observer, inputs, _ = observed
     turn, shift, alive = np.array([[0.9, -0.2], [0.3, 1.1]]), np.array([0.1, -0.4]), np.ones((30, FIBRES), dtype=bool)
     place, told = observer(inputs[:30], alive)
     moved, as_before = observer.moved(turn, shift).moved(turn, shift)(inputs[:30], alive)
@@ -172,8 +177,8 @@ def test_places_may_be_called_otherwise() -> None:
     assert np.array_equal(told, as_before)
 
 
-def test_it_is_kept_to_the_last_bit_and_refused_where_it_is_another() -> None:
-    observer, inputs, _ = OBSERVED
+def test_it_is_kept_to_the_last_bit_and_refused_where_it_is_another(observed: Fitted) -> None:
+    observer, inputs, _ = observed
     arrays, alive = observer.arrays(), np.ones((9, FIBRES), dtype=bool)
     again = Observer.of(arrays)
     again.refuse_unsound(FIBRES, WINDOWS)
@@ -186,24 +191,3 @@ def test_it_is_kept_to_the_last_bit_and_refused_where_it_is_another() -> None:
             Observer.of(spoilt).refuse_unsound(FIBRES, WINDOWS)
     with pytest.raises(InputError, match="curvatures of -"):
         Observer.of(arrays | {"observer.answers": -arrays["observer.answers"]}).refuse_unsound(FIBRES, WINDOWS)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda of: {"corrector": {}},
-        lambda of: {"corrector": of.weights},
-        lambda of: {"corrector": {name: weight * np.nan for name, weight in of.corrector.items()}},
-        lambda of: {"observer": replace(of.observer, grid=of.observer.grid[1:])},
-        lambda of: {"observer": replace(of.observer, terms=of.observer.terms * np.inf)},
-    ],
-    ids=["no corrector", "another's", "not finite", "a smaller grid", "infinite"],
-)
-def test_an_observer_that_does_not_fit_is_refused(localizer: Localizer, tmp_path: Path, change) -> None:
-    assert localizer.observer is not None
-    replace(localizer, **change(localizer)).save(tmp_path)
-    with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
-        Localizer.load(tmp_path)
-
-
-OBSERVED = fitted(waves)

@@ -1,7 +1,6 @@
 """Learning curves: the power law is found again, forecasts follow, and broken off it ends at once."""
 
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,18 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import padforge
 from design.common.errors import InputError
 from sense import Recording
 from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
 from sense.settings import LocalizerSettings as Options
+from tests.stress.door import call
 
-QUICK = Options(hidden=24, layers=1, epochs=2, batch=64)
+QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
 
 
+@settings(max_examples=20)
 @given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
 def test_a_power_law_is_found_again(floor: float, factor: float, exponent: float) -> None:
     presses = np.array([50.0, 100, 200, 400, 800])
@@ -30,6 +30,7 @@ def test_a_power_law_is_found_again(floor: float, factor: float, exponent: float
     np.testing.assert_allclose(power_law(ahead, found), power_law(ahead, (floor, factor, exponent)), rtol=1e-3)
 
 
+@settings(max_examples=20)
 @given(errors=st.lists(st.floats(0.1, 10), min_size=5, max_size=5))
 def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
     presses = np.array([50.0, 100, 200, 400, 800])
@@ -68,16 +69,13 @@ def test_the_command_finds_the_same_and_writes_a_document_and_a_figure(
     document: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     recording.save(tmp_path / "rec", {})
     monkeypatch.chdir(tmp_path)
-    Path("pad.toml").write_text("[localizer]\nhidden = 24\nlayers = 1\nepochs = 2\nbatch = 64\n")
-    monkeypatch.setattr(sys, "argv", ["padforge", "sense", "learning-curve", "rec", "--out", "out", "--json"])
-    with pytest.raises(SystemExit) as caught:
-        padforge.main()
-    assert not caught.value.code
-    found = json.loads(capsys.readouterr().out)
+    Path("pad.toml").write_text("[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\n")
+    ended = call("sense", "learning-curve", "rec", "--out", "out", "--json")
+    assert ended.code == 0
+    found = json.loads(ended.out)
     assert found == json.loads(Path("out/learning_curve.json").read_text())
     assert found | {"provenance": None} == json.loads(json.dumps(document)) | {"provenance": None}
     assert Path("out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"

@@ -1,0 +1,174 @@
+"""Lost fibres: one test for both ways, and resumed work is the same work."""
+
+import errno
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design.common.errors import InputError
+from sense import Localizer, Recording, evaluate
+from sense.localizer.calibration import fibre_loss_study as loss_study
+from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
+from sense.settings import LocalizerSettings as Options
+from tests.stress.door import Ended, call
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A published network of three neurons, and a coarse map of the answers, which is not what is tested."""
+    monkeypatch.setattr("sense.localizer.calibration.networks.published_training.HIDDEN", 3)
+    monkeypatch.setattr("sense.localizer.response.response_model.BUMPS", 7)
+
+
+def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
+    document, expected = fibre_loss_study(recording, localizer, lost=2), evaluate(localizer, recording, (0, 1, 2))
+    (way,) = document["ways"].items()
+    assert way[0] == ONE
+    assert {name: way[1][name] for name in ("errors", "by_subset")} == {
+        name: expected[name] for name in ("errors", "by_subset")
+    }
+    assert way[1]["maps"][0] == {"lost": [], "by_place": expected["by_place"]}
+    worst = max((each for each in expected["by_subset"] if len(each["lost"]) == 2), key=lambda each: each["mean_mm"])
+    assert way[1]["maps"][2]["lost"] == worst["lost"]
+    cells = way[1]["maps"][2]["by_place"]
+    assert np.average(
+        [cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells]
+    ) == pytest.approx(worst["mean_mm"])
+    assert document["test_presses"] == expected["test_presses"]
+
+
+def test_both_ways_stand_side_by_side_and_a_chosen_set_is_mapped_beside_the_worst_ones(
+    localizer: Localizer, recording: Recording
+) -> None:
+    """Of more fibres, too, than are lost in the errors."""
+    document = fibre_loss_study(recording, localizer, retrain=True, lost=1, failed=(3, 1, 3))
+    plain = fibre_loss_study(recording, localizer, retrain=True, lost=1)
+    assert list(document["ways"]) == [ONE, MANY]
+    for name, way in document["ways"].items():
+        assert [row["subsets"] for row in way["errors"]] == [1, 4]
+        assert [each["lost"] for each in way["by_subset"]] == [[], [0], [1], [2], [3]]
+        *worst, chosen = way["maps"]
+        assert chosen["lost"] == [1, 3]
+        assert {**way, "maps": worst} == plain["ways"][name]
+    assert document["test_presses"] == len(localizer.test)
+    assert document["training_presses"] == 300 - len(localizer.test)
+    json.dumps(document, allow_nan=False)
+    assert len(loss_study.fibre_loss_lines(document)) == 6
+    expected = evaluate(localizer, recording, (2,))["by_subset"]
+    (mean_mm,) = (each["mean_mm"] for each in expected if each["lost"] == [1, 3])
+    cells = document["ways"][ONE]["maps"][-1]["by_place"]
+    weights = [cell["presses"] for cell in cells]
+    assert np.average([cell["mean_mm"] for cell in cells], weights=weights) == pytest.approx(mean_mm)
+    for failed, message in (
+        ((4,), "failed fibre is 4, allowed is a whole number from 0 to 3"),
+        ((0, 1, 2, 3), "failed are all 4 fibres, at least one must be left"),
+    ):
+        with pytest.raises(InputError, match=message):
+            fibre_loss_study(recording, localizer, failed=failed)
+
+
+def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recording: Recording) -> None:
+    def retrained(changed: Recording) -> dict:
+        return fibre_loss_study(changed, retrain=True, lost=1)["ways"][MANY]
+
+    plain = retrained(recording)
+    spoilt = recording.readings.copy()
+    spoilt[:, 2] = np.random.default_rng(1).uniform(0, 3, len(spoilt))
+    deaf = retrained(replace(recording, readings=spoilt))
+    for each, other in zip(plain["by_subset"], deaf["by_subset"], strict=True):
+        assert (each["mean_mm"] == other["mean_mm"]) == (each["lost"] == [2])
+    test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
+    far = recording.presses_mm.copy()
+    far[test] = 2e4  # whoever had learnt from one of them would find all of it elsewhere
+    moved = retrained(replace(recording, presses_mm=far))
+    centre = np.hypot(*(2e4 - recording.presses_mm[test]).T).mean()
+    assert moved["errors"][0]["mean_mm"] == pytest.approx(centre, abs=30)
+
+
+def stop_at(number: int) -> Callable[[int, int], None]:
+    def interrupted(done: int, total: int) -> None:
+        if done == number:
+            raise KeyboardInterrupt
+
+    return interrupted
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The sets of lost fibres that networks have been trained for since."""
+    real, trained = loss_study._train_without, []
+
+    def counted(lost: tuple[int, ...], *rest: object) -> object:
+        trained.append(lost)
+        return real(lost, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loss_study, "_train_without", counted)
+    return trained
+
+
+def test_broken_off_work_goes_on_and_gives_the_same(recording: Recording, tmp_path: Path, trained: list) -> None:
+    wanted = {"retrain": True, "lost": 1, "failed": (0, 1)}
+    whole = fibre_loss_study(recording, **wanted)
+    kept = tmp_path / "unfinished"
+    with pytest.raises(KeyboardInterrupt):
+        fibre_loss_study(recording, **wanted, keep_in=kept, progress=stop_at(2))
+    finished = len(list(kept.glob("start_*.npz")))
+    assert finished >= 2
+    with pytest.raises(InputError, match="begun with fibre-loss"):
+        fibre_loss_study(recording, retrain=True, lost=1, options=Options(seed=1), keep_in=kept)
+    trained.clear()
+    for _ in range(2):
+        assert fibre_loss_study(recording, **wanted, keep_in=kept) == whole
+        assert len(trained) == 6 - finished
+    with pytest.raises(InputError, match="neither a localizer nor retraining"):
+        fibre_loss_study(recording)
+
+
+@pytest.fixture
+def here(localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The current folder holds a `model` and a recording `rec`."""
+    localizer.save(tmp_path / "model")
+    recording.save(tmp_path / "rec", {})
+    monkeypatch.chdir(tmp_path)
+
+
+def loss(*arguments: str) -> Ended:
+    return call("sense", "fibre-loss", "rec", *arguments)
+
+
+@pytest.mark.usefixtures("here")
+def test_the_command_writes_a_document_and_a_figure() -> None:
+    ended = loss("--model", "model", "--retrain", "--lost", "1", "--failed", "2,4", "--out", "out", "--json")
+    assert (ended.code, json.loads(ended.out)["ways"][ONE]["maps"][-1]["lost"]) == (0, [1, 3])
+    assert json.loads(ended.out) == json.loads(Path("out", "fibre_loss.json").read_text())
+    assert Path("out", "fibre_loss.png").read_bytes()[:4] == b"\x89PNG"
+    assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
+    for arguments, said in (
+        (("--out", "other"), "neither --model nor --retrain"),
+        (("--model", "model", "--failed", "5"), "padforge: fibre 5: no such fibre, allowed are 1 to 4\n"),
+    ):
+        ended = loss(*arguments)
+        assert (ended.code, ended.out, ended.err.count("\n")) == (2, "", 1)
+        assert said in ended.err
+    assert not Path("other").exists()
+
+
+@pytest.mark.usefixtures("here")
+def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    command = ("--retrain", "--lost", "1", "--out", "out")
+    with monkeypatch.context() as broken:
+        broken.setattr("sense.report.fibre_loss_figure.draw_fibre_loss", full)
+        ended = loss(*command)
+    assert (ended.code, len(trained)) == (2, 5), ended
+    assert len(list(Path("out", "unfinished").glob("start_*.npz"))) == 5
+    assert not Path("out", "fibre_loss.json").exists()
+    ended = loss(*command)
+    assert (ended.code, len(trained)) == (0, 5), ended
+    assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]

@@ -1,0 +1,245 @@
+"""Files of a localizer: every bit is kept, one line refuses what is none, and a save is whole or nothing."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from design.common.errors import InputError
+from sense import Localizer, Recording
+from tools.kills import killed
+
+Change = Callable[[Any], dict[str, Any]]
+
+
+def edited(document: dict, path: str, value: object) -> dict:
+    """`document` with the entry at `path`, keys and indices with dots between them, replaced."""
+    *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    place = document
+    for part in way:
+        place = place[part]
+    place[last] = value
+    return document
+
+
+def refuse_edited(localizer: Localizer, folder: Path, path: str, value: object, said: str) -> None:
+    localizer.save(folder)
+    document = edited(json.loads((folder / "localizer.json").read_text()), path, value)
+    (folder / "localizer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=said) as caught:
+        Localizer.load(folder)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        ("features", "smell", "features"),
+        ("scaling", {}, "scaling"),
+        ("features", "published", r"scaling\.centre_v"),
+        ("fibres", 3, r"scaling\.centre_v"),
+        ("fibres", 0, "fibres"),
+        ("fibres", True, "fibres"),
+        ("method", "guess", "method"),
+        ("method", "published", "features"),
+        ("factors", [], "factors"),
+        ("factors.0", [1.0, 1.0], "factors"),
+        ("factors.0.0", -1.0, "factors"),
+        ("scaling.memory", [], r"scaling\.memory"),
+        ("scaling.memory.0.0", [1.0], r"scaling\.memory"),
+        ("scaling.memory.0.0.0", np.nan, "memory"),
+        ("scaling.usual_v.0", [1.0], r"scaling\.usual_v"),
+        *(("rate_hz", value, "rate_hz") for value in (0, -1.0, "13", np.nan, np.inf, 1e-300, None)),
+        *(
+            (f"scaling.{key}.0.0", value, key)
+            for key in ("centre_v", "spread_v")
+            for value in (np.nan, np.inf, 1e9, "1")
+        ),
+        ("scaling.spread_v.0.0", 0.0, "spread_v"),
+        ("scaling.spread_v.0", [1.0], "spread_v"),
+        ("scaling.centre_v", [], "centre_v"),
+        *(("scaling.middle_mm", value, "middle_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
+        *(("scaling.span_mm", value, "span_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
+        ("split", "alphabetical", "split"),
+        *(("test", value, "test") for value in ([], [0.5], ["a"], [-1], [True], {}, [3, 3], [7])),
+        ("errors", [{}], r"errors\.0\.lost"),
+        ("errors", "none", "errors"),
+        ("learnt_from", 7, "learnt_from"),
+        ("provenance", [], "provenance"),
+        ("more", 1, "more"),
+    ],
+)
+def test_a_document_with_a_value_out_of_bounds_is_refused(
+    localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
+) -> None:
+    refuse_edited(localizer, tmp_path, path, value, rf"localizer\.json: .*{named}")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        ("scaling.measures", [{"name": "force_n", "middle": 1.0, "span": 1.0}], "force_n of method masked"),
+        ("scaling.measures.0.name", "width_mm", "measures"),
+        ("scaling.measures.0.span", 0.0, "span"),
+        ("scaling.measures.0.middle", np.nan, "middle"),
+        ("scaling.measures", [], "factors have .5. values a row, expected 3"),
+        ("factors.0", [1.0, 1.0, 1.0], "factors have .3, 5. values"),
+    ],
+)
+def test_measures_that_cannot_be_are_refused(
+    deep_localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
+) -> None:
+    refuse_edited(deep_localizer, tmp_path, path, value, named)
+
+
+FITS = r"localizer\.safetensors: no weights of the localizer"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda w: {**w, "last.b": w["last.b"] * np.float32(np.nan)},
+        lambda w: {**w, "first.w": w["first.w"] + np.float32(1e30)},
+        lambda w: {**w, "first.w": w["first.w"][:, 1:]},
+        lambda w: {**w, "first.w": w["first.w"][:0]},
+        lambda w: {**w, "hidden.b": w["hidden.b"].astype(np.float64)},
+        lambda w: {name: weight for name, weight in w.items() if name != "last.w"},
+        lambda w: {},
+    ],
+)
+def test_weights_that_do_not_fit_the_document_are_refused(localizer: Localizer, tmp_path: Path, change: Change) -> None:
+    replace(localizer, weights=change(dict(localizer.weights))).save(tmp_path)
+    with pytest.raises(InputError, match=FITS):
+        Localizer.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda of: {"corrector": {}},
+        lambda of: {"corrector": of.weights},
+        lambda of: {"corrector": {name: weight * np.nan for name, weight in of.corrector.items()}},
+        lambda of: {"observer": replace(of.observer, grid=of.observer.grid[1:])},
+        lambda of: {"observer": replace(of.observer, terms=of.observer.terms * np.inf)},
+    ],
+    ids=["no corrector", "another's", "not finite", "a smaller grid", "infinite"],
+)
+def test_an_observer_that_does_not_fit_is_refused(localizer: Localizer, tmp_path: Path, change: Change) -> None:
+    assert localizer.observer is not None
+    replace(localizer, **change(localizer)).save(tmp_path)
+    with pytest.raises(InputError, match=FITS):
+        Localizer.load(tmp_path)
+
+
+def test_files_keep_every_bit(localizer: Localizer, recording: Recording, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    found = Localizer.load(tmp_path)
+    presses = localizer.inputs(recording)
+    assert np.array_equal(found.inputs(recording).inputs, presses.inputs)
+    again, before = found.locate(presses, [2]), localizer.locate(presses, [2])
+    assert np.array_equal(again.places_mm, before.places_mm)
+    assert np.array_equal(again.r90_mm, before.r90_mm)
+    assert (found.errors, found.test) == (localizer.errors, localizer.test)
+    found.save(tmp_path / "again")
+    for name in ("localizer.json", "localizer.safetensors"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
+    document = json.loads((tmp_path / "localizer.json").read_text())
+    assert "measures" not in document["scaling"]  # one of a single depth says nothing of any
+    assert not [key for row in document["errors"] for key in row if key.startswith(("depth", "force"))]
+
+
+def test_what_was_learnt_beside_the_place_survives_its_files(
+    deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path
+) -> None:
+    deep_localizer.save(tmp_path)
+    again = Localizer.load(tmp_path)
+    assert again.normalization.measures == deep_localizer.normalization.measures
+    presses = deep_localizer.inputs(deep_recording)
+    found = again.locate(presses).measures
+    for name, before in deep_localizer.locate(presses).measures.items():
+        assert np.array_equal(before.values, found[name].values)
+        assert np.array_equal(before.r90, found[name].r90)
+
+
+@pytest.mark.parametrize("name", ["localizer.json", "localizer.safetensors"])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(0, 255), cut=st.integers(0, 300))
+def test_damaged_bytes_are_refused_in_one_line_or_read(
+    localizer: Localizer, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int
+) -> None:
+    """A byte is changed, and some behind it are lost."""
+    localizer.save(tmp_path)
+    content = bytearray((tmp_path / name).read_bytes())
+    where = int(at * len(content))
+    content[where] ^= flip
+    del content[where + 1 : where + 1 + cut]
+    sound = (tmp_path / name).read_bytes() == content
+    (tmp_path / name).write_bytes(content)
+    try:
+        read = Localizer.load(tmp_path)
+    except InputError as error:
+        said = str(error)
+        assert "\n" not in said
+    else:
+        assert sound or name == "localizer.json"
+        assert np.isfinite(read.locate(read.inputs(brief)).places_mm).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, object()])
+def test_a_save_that_fails_leaves_the_model_that_was_there(localizer: Localizer, tmp_path: Path, value: object) -> None:
+    localizer.save(tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    other = {name: weight + 1 for name, weight in localizer.weights.items()}
+    with pytest.raises(InputError, match="cannot be written as JSON"):
+        replace(localizer, weights=other, provenance={"note": value}).save(tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    (tmp_path / "localizer.json").unlink()
+    (tmp_path / "localizer.json").mkdir()
+    before = (tmp_path / "localizer.safetensors").read_bytes()
+    with pytest.raises(InputError, match="is a folder, expected a file or nothing"):
+        replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()}).save(tmp_path)
+    assert (tmp_path / "localizer.safetensors").read_bytes() == before
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        localizer.save(tmp_path / "file")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
+def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_localizer(
+    localizer: Localizer, tmp_path: Path
+) -> None:
+    later = replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()})
+    name, found = next(iter(localizer.weights)), []
+    for number in count():
+        folder = tmp_path / str(number)
+        replace(localizer, split="random").save(folder)
+        ended = not killed(lambda folder=folder: replace(later, split="chronological").save(folder), number, folder)
+        loaded = Localizer.load(folder)
+        is_new = np.array_equal(loaded.weights[name], later.weights[name])
+        assert is_new == (loaded.split == "chronological")
+        found.append(is_new)
+        if ended:
+            break
+    assert (found[0], found[-1]) == (False, True)
+
+
+@pytest.mark.parametrize("folder", [None, 3, ["a"], np.ones(3), ""])
+def test_a_model_is_kept_in_a_folder_and_nothing_else(localizer: Localizer, folder: Any) -> None:
+    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+        Localizer.load(folder)
+    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+        localizer.save(folder)

@@ -1,0 +1,168 @@
+"""The pad's response: a smooth map and a linear memory are found again from presses made of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sense.localizer.calibration.networks.training_presses import TrainingPresses, as_unseen
+from sense.localizer.response.response_model import (
+    BUMPS,
+    RIDGE_HISTORY,
+    STEPS,
+    WIDTH,
+    ResponseModel,
+    bumps,
+    leverages,
+    looked_up,
+    settled,
+)
+
+FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 9000
+Made = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def answer(places: np.ndarray) -> np.ndarray:
+    x, y = places.T
+    waves = [np.sin(2 * x + k) * np.cos((1 + k) * y) for k in range(FIBRES * WINDOWS)]
+    return 0.5 * np.stack(waves, axis=1).reshape(len(places), FIBRES, WINDOWS)
+
+
+@pytest.fixture
+def made() -> Made:
+    """Places, windows with noise, history and the memory of a pad that answers by sines of the place."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-1, 1, (PRESSES, 2))
+    history = rng.standard_normal((PRESSES, FIBRES, PASTS)) * [1.0, 0.1, 10.0] + 2
+    memory = rng.standard_normal((FIBRES, PASTS, WINDOWS)) * np.array([1.0, 10.0, 0.1])[:, None]
+    windows = answer(places) + np.einsum("qcj,cjf->qcf", history - history.mean(axis=0), memory)
+    return places, windows + 0.05 * rng.standard_normal(windows.shape), history, memory
+
+
+def test_map_and_memory_are_found_again(made: Made) -> None:
+    places, windows, history, memory = made
+    found = ResponseModel.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
+    spread = history.std(axis=0)[:, :, None]
+    kept = PRESSES / (PRESSES + RIDGE_HISTORY)  # the rest is the ridge's
+    assert np.abs((found.memory - kept * memory) * spread).max() < 0.02
+    assert found.usual == pytest.approx(history.mean(axis=0))
+    inner = slice(STEPS // 4, -STEPS // 4)
+    grid = np.linspace(-1, 1, STEPS + 1)[inner]
+    at = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)
+    expected = answer(at.reshape(-1, 2)).reshape(len(grid), len(grid), FIBRES, WINDOWS)
+    assert np.abs(found.table[inner, inner] - expected).max() < 0.08
+    # settled windows depend on the place only
+    left = settled(windows, history, found.memory / kept, found.usual) - answer(places)
+    assert left.std() < 0.06
+    history[:] = history[:1]  # which tells nothing then
+    still = ResponseModel.fit(places[:500], windows[:500], history[:500], np.ones((500, FIBRES), dtype=bool))
+    assert not still.memory.any()
+
+
+def test_gains_are_told_by_the_history() -> None:
+    """Of a fibre that answers by 0.3 more for a spread of its history while the probe rests, by 0.1 when it left."""
+    rng = np.random.default_rng(0)
+    places, history = rng.uniform(-1, 1, (FEW, 2)), rng.standard_normal((FEW, FIBRES, PASTS))
+    stronger = np.zeros((FIBRES, PASTS, WINDOWS))
+    stronger[0, 0], stronger[0, 1] = [0.3, 0.3, 0.0, 0.0], [0.0, 0.0, 0.1, 0.1]
+    windows = answer(places) * (1 + np.einsum("qcj,cjf->qcf", history, stronger))
+    alive, phases = np.ones((FEW, FIBRES), dtype=bool), (slice(0, 2), slice(2, 4))
+    found = ResponseModel.fit(places, windows, history, alive, phases=phases)
+    assert found.table.shape[3] == WINDOWS + len(phases)
+    assert not found.table[..., WINDOWS:].any()
+    shown = settled(windows, history, found.memory, found.usual)
+    assert shown.shape == (FEW, FIBRES, WINDOWS + len(phases))
+    rested, left = shown[:, 0, WINDOWS:].T
+    assert np.corrcoef(rested, history[:, 0, 0])[0, 1] > 0.95
+    assert rested.std() == pytest.approx(FEW / (FEW + RIDGE_HISTORY) * 0.3, rel=0.15)
+    assert np.corrcoef(left, history[:, 0, 1])[0, 1] > 0.8
+    assert np.abs(shown[:, 1, WINDOWS:]).max() < 0.1
+
+
+def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
+    places, windows, history, _ = (part[:FEW] for part in made)
+    alive = np.ones((FEW, FIBRES), dtype=bool)
+    alive[::3, 0] = False
+    before = ResponseModel.fit(places, windows, history, alive)
+    windows[::3, 0], history[::3, 0] = 99.0, -99.0
+    after = ResponseModel.fit(places, windows, history, alive)
+    assert np.array_equal(before.table, after.table)
+    assert np.array_equal(before.memory, after.memory)
+    assert after.usual[0] == pytest.approx(history[alive[:, 0], 0].mean(axis=0))
+    alive[:, 1] = False
+    gone = ResponseModel.fit(places, windows, history, alive)
+    assert not gone.table[:, :, 1].any()
+    assert np.isfinite(gone.table).all()
+
+
+def test_answers_in_proportion_to_the_depth_are_one_table() -> None:
+    """A fibre that answers 0.1 V per mm at any place, from presses of 1 to 4 mm, none of which is of 2 mm."""
+    rng = np.random.default_rng(0)
+    places, depths = rng.uniform(-1, 1, (600, 2)), rng.choice([1.0, 3.0, 4.0], 600)
+    windows = (0.1 * depths)[:, None, None]
+    model = ResponseModel.fit(places, windows, np.zeros((600, 1, 1)), np.ones((600, 1), bool), depths / 2)
+    np.testing.assert_allclose(model.table[10:-10, 10:-10], 0.2, rtol=0.06)
+    assert model.table.mean() == pytest.approx(0.2, rel=0.02)
+
+
+def test_bumps_are_gaussians_on_a_grid_over_the_pad() -> None:
+    places = np.array([[0.3, -0.8], [-1.0, 1.0]])
+    line = np.linspace(-1, 1, BUMPS)
+    for place, found in zip(places, bumps(places), strict=True):
+        away = np.array([(place[0] - x) ** 2 + (place[1] - y) ** 2 for x in line for y in line])
+        assert found == pytest.approx(np.exp(-away / (2 * (0.1 * WIDTH) ** 2)))
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 999), x=st.floats(-1, 1), y=st.floats(-1, 1))
+def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float) -> None:
+    """Against a bilinear function, which linear interpolation gives exactly."""
+    a, b, c, d = np.random.default_rng(seed).standard_normal(4)
+    grid = np.linspace(-1, 1, 9)
+    u, v = np.meshgrid(grid, grid, indexing="ij")
+    found = looked_up((a + b * u + c * v + d * u * v)[:, :, None], np.array([[x, y]]))
+    assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
+
+
+def pressed() -> tuple[np.ndarray, np.ndarray]:
+    """Places that the table has an entry for, some of them pressed twice, and what fibres gave there."""
+    rng = np.random.default_rng(0)
+    places = rng.integers(-STEPS // 2, STEPS // 2, (90, 2)) / (STEPS / 2)
+    places[1::9] = places[0::9]
+    return places, np.sin(3 * places[:, :1, None] + np.arange(3)) + rng.standard_normal((90, FIBRES, 3))
+
+
+def table_of(places: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    nothing, alive = np.empty((len(places), FIBRES, 0)), np.ones((len(places), FIBRES), dtype=bool)
+    return ResponseModel.fit(places, windows, nothing, alive).table.astype(np.float32)
+
+
+def test_presses_are_as_far_off_as_from_a_table_fitted_without_them() -> None:
+    places, windows = pressed()
+    alive = np.ones((90, FIBRES), dtype=bool)
+    table = table_of(places, windows)
+    presses = TrainingPresses(windows.astype(np.float32), alive, places.astype(np.float32))
+    flat = table.reshape(*table.shape[:2], -1)
+    rest = as_unseen(presses, table).inputs - looked_up(flat, places).reshape(windows.shape)
+    for press in (0, 4, 17):
+        others = (places != places[press]).any(axis=1)
+        without = table_of(places[others], windows[others])
+        expected = looked_up(without.reshape(*table.shape[:2], -1), places[[press]]).reshape(FIBRES, 3)
+        same = (places == places[press]).all(axis=1)
+        # Of several presses at one place, left out together, their mean stands to the table as each of them does here.
+        np.testing.assert_allclose(rest[same].mean(axis=0), windows[same].mean(axis=0) - expected, atol=0.02, rtol=0.02)
+    # What no table expects is left as it was.
+    more = np.pad(windows, ((0, 0), (0, 0), (0, 1)), constant_values=0.7).astype(np.float32)
+    padded = np.pad(table, ((0, 0), (0, 0), (0, 0), (0, 1)))
+    found = as_unseen(TrainingPresses(more, alive, places.astype(np.float32)), padded).inputs
+    assert np.array_equal(found[:, :, -1], more[:, :, -1])
+
+
+def test_leverages_are_shares_that_add_up_to_what_a_fit_can_tell() -> None:
+    places, _ = pressed()
+    found = leverages(places)
+    assert found.min() > 0
+    assert found.max() < 1
+    twice = leverages(np.concatenate([places, places]))
+    assert (twice[:90] > found).all()
+    assert np.array_equal(twice[:90], twice[90:])

@@ -1,0 +1,107 @@
+"""Readings as pads give them at their worst: results are finite, or one line says why there is none."""
+
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+
+from design.common.errors import InputError
+from sense import Localizer, Recording, calibrate, evaluate, locate, recalibrate
+from sense.localizer.calibration import fine_tuning
+from sense.localizer.features import FEATURES
+from sense.localizer.response.response_model import ResponseModel
+from sense.settings import LocalizerSettings
+from tests.sense.health.pads import faulty
+
+TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, lost=2, test_share=0.3)
+
+
+def worst(seed: int, recording: Recording) -> Recording:
+    """Its readings with faults, and its presses oddly placed, timed or short."""
+    rng = np.random.default_rng(seed)
+    places, begun, lifted = recording.presses_mm.copy(), recording.begun.copy(), recording.lifted.copy()
+    times_s = recording.times_s
+    match rng.integers(7):
+        case 0:
+            places[:] = places[0]
+        case 1:  # on a line
+            places[:, 1] = 0
+        case 2:
+            places[rng.random(len(places)) < rng.choice([0.1, 0.6])] = np.nan
+        case 3:  # twice
+            places[1::2] = places[::2]
+        case 4:
+            places *= rng.choice([1e-12, 1e-300, 2e3])
+        case 5:
+            places[-1] = 1e5
+    if rng.random() < 0.3:  # a pause
+        times_s = times_s + np.where(np.arange(len(times_s)) > len(times_s) // 2, rng.choice([10.0, 1e6]), 0.0)
+    if rng.random() < 0.3:  # as short as they may be
+        lifted = begun + 1
+    if rng.random() < 0.2:  # at the very ends
+        begun[0], lifted[-1] = 1, len(times_s)
+    return Recording(faulty(rng, recording.readings), times_s, places, begun, lifted)
+
+
+def numbers(document: Any) -> list[float]:
+    if isinstance(document, dict):
+        return [number for value in document.values() for number in numbers(value)]
+    if isinstance(document, list | tuple):
+        return [number for value in document for number in numbers(value)]
+    return [float(document)] if isinstance(document, int | float) else []
+
+
+def require_finite(localizer: Localizer, recording: Recording, document: Any = ()) -> None:
+    found = locate(localizer, recording)
+    assert np.isfinite(np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm])).all()
+    assert (found.sd_mm > 0).all()
+    assert (found.r50_mm > 0).all()
+    assert np.isfinite(numbers(document)).all()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_worst_recordings_are_located_and_evaluated(localizer: Localizer, brief: Recording, seed: int) -> None:
+    one = worst(seed, brief)
+    require_finite(localizer, one, evaluate(localizer, one, (0, 3)) if one.known.any() else ())
+
+
+@pytest.mark.parametrize(("seed", "features"), enumerate([*FEATURES, *FEATURES]))
+def test_the_worst_recordings_teach_or_are_refused(brief: Recording, seed: int, features: str) -> None:
+    one = worst(seed, brief)
+    try:
+        localizer, document = calibrate(one, TINY.model_copy(update={"features": features}))
+    except InputError as error:
+        said = str(error)
+        assert "\n" not in said
+    else:
+        require_finite(localizer, one, document)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_the_worst_recordings_are_followed_or_refused(localizer: Localizer, brief: Recording, seed: int) -> None:
+    one = worst(seed, brief)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(fine_tuning, "STEPS", 15)
+        try:
+            now, document = recalibrate(localizer, one)
+        except InputError as error:
+            said = str(error)
+            assert "\n" not in said
+        else:
+            require_finite(now, one, document)
+            assert (now.factors >= localizer.factors).all()
+
+
+@pytest.mark.slow
+def test_many_presses_take_memory_in_parts() -> None:
+    """The bumps of all of them at once would take 350 MB, and as much again beside their history."""
+    rng, presses = np.random.default_rng(0), 100_000
+    windows, alive = rng.standard_normal((presses, 1, 3)), np.ones((presses, 1), dtype=bool)
+    tracemalloc.start()
+    try:
+        ResponseModel.fit(rng.uniform(-1, 1, (presses, 2)), windows, np.empty((presses, 1, 0)), alive)
+        assert tracemalloc.get_traced_memory()[1] < 300e6
+    finally:
+        tracemalloc.stop()
