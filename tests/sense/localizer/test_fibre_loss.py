@@ -14,7 +14,7 @@ from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fibre_loss_study as loss_study
 from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
 from sense.settings import LocalizerSettings as Options
-from tests.stress.door import Ended, call
+from tests.helpers.door import Ended, call
 
 
 @pytest.fixture(autouse=True)

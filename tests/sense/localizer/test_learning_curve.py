@@ -15,7 +15,7 @@ from design.common.errors import InputError
 from sense import Recording
 from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
 from sense.settings import LocalizerSettings as Options
-from tests.stress.door import call
+from tests.helpers.door import call
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
 

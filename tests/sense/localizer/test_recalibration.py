@@ -18,7 +18,7 @@ from sense.localizer.calibration.recalibration import _CrossValidation, recalibr
 from sense.localizer.evaluation import distances
 from sense.localizer.localizer import Found
 from sense.localizer.response.response_model import looked_up
-from tests.stress.door import call
+from tests.helpers.door import call
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])
 GAINS = np.array([0.8, 1.2, 1.1, 0.9])

@@ -26,7 +26,7 @@ from sense.studies.multicontact.study import multicontact_study
 from sense.studies.pads import described, load_pads
 from sense.studies.robustness import robustness_study
 from sense.studies.study import Findings, Study, Task, run, study_lines
-from tests.stress.door import call
+from tests.helpers.door import call
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 LEAST: dict[str, Callable[[], Study]] = {
