@@ -1,18 +1,25 @@
-"""Signals of a measured reach as a search takes them: beside the exact ones, and elements no more than are felt."""
+"""Signals of a measured reach: exact ones against adaptive quadrature, and those that a search takes beside them."""
 
-from typing import Literal
+import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.optimize import brentq
 
-from design import Contact, Morphology, signals
+from design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from design.criteria.differentiable import pchip_slopes, press_signals
-from design.pad.contact import fibre_axes
+from design.pad.contact import fibre_axes, signals_and_spans
 from design.pad.kernels.measured_signals import PRECISION, fibre_elements, spacing_of
 from design.pad.kernels.press import MANHATTAN
 from design.pad.knots import kernel_ends
 from design.settings import DEFAULT_PITCH_MM, Layout
+from tests.design.pad.wild_pads import LENGTHS, SEEDS, longest_signals, wild_pads, wild_presses
 
 REACHES = {
     "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),
@@ -23,7 +30,7 @@ REACHES = {
 """In grid units."""
 
 
-def contact_of(reach, length: Literal["manhattan", "euclidean"] = "euclidean"):
+def contact_of(reach, length="euclidean"):
     """The contact on pads of the default pitch."""
     return Contact(reach=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
 
@@ -51,6 +58,75 @@ def searched(pad, presses, contact):
         .numpy()
         .T
     )
+
+
+def measured_oracle(pad, press, length, fibre):
+    """One signal under the broad reach: adaptive quadrature between the circles on which the spline's pieces meet."""
+    axis = 0 if fibre < pad.grid else 1
+    knots = pad.knots[fibre]
+    curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
+    slope = curve.derivative()
+    distance, weight = np.array(REACHES["broad"]).T
+    spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
+
+    def square(t):
+        return (t - press[axis]) ** 2 + (curve(t) - press[1 - axis]) ** 2
+
+    def density(t):
+        run = 1 + abs(slope(t)) if length == "manhattan" else np.hypot(1, slope(t))
+        return spline(square(t)) * run if square(t) < distance[-1] ** 2 else 0.0
+
+    total = 0.0
+    for begin, end in pairwise(knots[:, axis]):
+        at = np.linspace(begin, end, 1500)
+        ends = {begin, end}
+        for d in distance[1:]:
+            sign = np.sign(square(at) - d**2)
+            ends |= {
+                brentq(lambda t, d=d: square(t) - d**2, at[i], at[i + 1], xtol=1e-15)
+                for i in np.flatnonzero(np.diff(sign))
+            }
+        total += sum(quad(density, *piece, epsabs=1e-13, epsrel=1e-12)[0] for piece in pairwise(sorted(ends)))
+    return total
+
+
+@pytest.mark.parametrize("length", ["manhattan", "euclidean"])
+def test_signals_of_a_measured_reach_equal_the_oracle(length):
+    for knots in (0, 5):
+        rng = np.random.default_rng(knots)
+        pad, contact = Morphology.random(2, knots, rng), contact_of(REACHES["broad"], length)
+        presses = rng.uniform(0, 3, (2, 2))
+        found = signals(pad, presses, contact)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            expected = [[measured_oracle(pad, press, length, fibre) for fibre in range(4)] for press in presses]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), found)
+        sampled = signals_quantized(pad, presses, contact, samples=200_001)
+        np.testing.assert_allclose(sampled, found, atol=1e-3)
+
+
+def test_a_measured_reach_is_not_felt_beyond_its_end():
+    contact = contact_of(REACHES["broad"])
+    found, looked_at = signals_and_spans(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
+    assert looked_at == 4  # fibres 1 and 2 of both families
+    assert not found[1].any()
+    assert found[0, 0] == found[0, 4] > 0 > found[0, 1] == found[0, 5]
+    assert not found[0, [2, 3, 6, 7]].any()
+
+
+@given(wild_pads((1, 2), (0, 6)), st.sampled_from([1e-2, 1.0, 5.0, 20.0, 200.0]), st.integers(8, 20), SEEDS)
+@settings(max_examples=20)
+def test_signals_of_any_reach_on_wild_pads_lie_within_the_whole_fibre_at_its_heaviest(pad, end_mm, points, seed):
+    rng, distance = np.random.default_rng(seed), np.linspace(0, end_mm, points)
+    waves = np.cos(np.pi * rng.uniform(0, 2) * distance / end_mm) * (1 - distance / end_mm) ** 2
+    weight = rng.choice([-1e3, -1.0, 1e-3, 1.0]) * waves
+    for length in LENGTHS:
+        contact = Contact(reach=np.column_stack([distance, weight]).tolist(), length=length)
+        found = signals(pad, wild_presses(pad, seed), contact)
+        spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
+        heaviest = np.abs(spline(np.linspace(0, end_mm, 2000) ** 2)).max()
+        assert (np.abs(found) <= longest_signals(pad, length) * heaviest * 1.01 + 1e-9).all()
 
 
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
@@ -108,10 +184,3 @@ def test_elements_lie_only_where_a_press_may_feel_them():
     assert moved[0, :4].all()
     assert not moved[:, 5:].any()
     assert not moved[3:40].any()
-
-
-def test_elements_are_as_close_as_a_reach_is_steep_whatever_its_size():
-    broad, steep = REACHES["broad"], REACHES["nearly a disc"]
-    assert spacing_of(steep) / steep[-1][0] < spacing_of(broad) / broad[-1][0]
-    larger = tuple((3 * d, 5 * w) for d, w in broad)
-    assert spacing_of(larger) == pytest.approx(3 * spacing_of(broad))
