@@ -110,23 +110,6 @@ def test_what_has_become_worse_is_found(before, now, what):
     assert [change.what for change in worsenings(document(**before), document(**now))] == what
 
 
-def test_tiny_work_is_slower_in_company_only():
-    def two(*seconds):
-        made = document(seconds=seconds[0])
-        made["rows"].append(made["rows"][0] | {"case": "b", "seconds": seconds[1], "paces": seconds[1] / 1e-3})
-        return made
-
-    before = two(1e-4, 2e-4)
-    assert not worsenings(before, two(1.4e-4, 2e-4))
-    assert {change.key[0] for change in worsenings(before, two(1.4e-4, 2.8e-4))} == {"a", "b"}
-
-
-def test_work_on_a_machine_that_is_busy_throughout_is_no_slower_than_the_work_beside_it():
-    now = document(seconds=1.5)
-    now["rows"][0]["paces"] = 1.05e3
-    assert not worsenings(document(), now)
-
-
 def test_a_change_is_told_in_one_line():
     (change,) = worsenings(document(), document(seconds=1.5))
     assert str(change) == "x, a, ours: slower, 1.50x (1 before, 1.5 now)"

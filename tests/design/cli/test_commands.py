@@ -22,7 +22,7 @@ from design.report.twin_settings import settings_for_twin
 from design.settings import PadSettings, SearchSettings
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
-QUICK = "[pad]\ngrid = 1\n" + QUICK_SEARCH
+QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")
 
 
 @pytest.fixture
@@ -39,41 +39,37 @@ def designed(*arguments, spec):
     return ended.output.splitlines(), json.loads(Path("out/pad/design.json").read_text())
 
 
-def test_straight_fibres_are_told_beside_what_was_found_which_is_read_again(here):
+def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_read_again(here):
     told, document = designed(spec=QUICK)
-    pad, asked = Morphology.straight(1), {"lost": 1, "size": PadSettings(grid=1)}
+    pad, asked = Morphology.straight(2), {"lost": 1, "size": PadSettings(grid=2)}
     straight = [
         *expected_errors(pad, Contact(), SearchSettings(lost=1), asked["size"]),
         *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
     ]
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
     assert set(document["straight"]) == {name for name in document["terms"] if "_lost_" in name}
-    found = [11.25 * value for term, value in document["terms"].items() if term.startswith("expected_error")]
-    assert told[1].startswith(f"  expected error {found[0]:.2f} / {found[1]:.2f} mm with 0 / 1 fibres failed")
-    assert told[2].split() == f"{11.25 * straight[0]:.2f} / {11.25 * straight[1]:.2f} mm with straight fibres".split()
-    again = found_before(Path("out/pad"))
-    assert again is not None
-    assert (again.terms, again.straight) == (document["terms"], document["straight"])
-    assert again.found_by == document["found_by"]
+    result = found_before(Path("out/pad"))
+    assert result is not None
+    assert (result.terms, result.straight) == (document["terms"], document["straight"])
+    assert document["found_by"] == result.found_by == "straight fibres"
+    assert search_lines(result, Path("out/pad"))[1:] == told[1:]
+    first, second = (11.25 * value for value in straight[:2])
+    assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 fibres failed")
+    assert told[3:] == [
+        "  these are straight fibres: nothing better was found; more steps or time may find it",
+        "  all rules hold",
+    ]
+    terms = {name: value / 2 if name.startswith("expected_error") else value for name, value in result.terms.items()}
+    better = search_lines(replace(result, terms=terms, found_by="start 1"), Path("out/pad"))
+    assert better[1].startswith(f"  expected error {first / 2:.2f} / {second / 2:.2f} mm with 0 / 1 fibres failed")
+    assert better[2].split() == f"{first:.2f} / {second:.2f} mm with straight fibres".split()
+    alike = search_lines(replace(result, found_by="start 1"), Path("out/pad"))
+    assert alike[3] == "  no better than straight fibres, as far as such figures tell, with 0, 1 failed"
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
         Path("out/pad/design.json").write_text(json.dumps(document | change))
         with pytest.raises(InputError, match="not as padforge writes it"):
             found_before(Path("out/pad"))
-
-
-def test_straight_fibres_that_a_short_search_hands_back_are_called_so(here):
-    told, document = designed(spec=QUICK.replace("grid = 1", "grid = 2").replace("steps = 3", "steps = 1"))
-    result = found_before(Path("out/pad"))
-    assert result is not None
-    assert document["found_by"] == result.found_by == "straight fibres"
-    assert search_lines(result, Path("out/pad"))[1:] == told[1:]
-    assert told[3:] == [
-        "  these are straight fibres: nothing better was found; more steps or time may find it",
-        "  all rules hold",
-    ]
-    searched = search_lines(replace(result, found_by="start 1"), Path("out/pad"))
-    assert searched[3] == "  no better than straight fibres, as far as such figures tell, with 0, 1 failed"
 
 
 @pytest.fixture(scope="module")

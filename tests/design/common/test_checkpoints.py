@@ -30,6 +30,7 @@ def work(folder: Path) -> None:
     kept.clear()
 
 
+@pytest.mark.slow
 def test_a_search_that_is_killed_at_any_moment_goes_on_and_leaves_no_litter(tmp_path: Path) -> None:
     left = set()
     for number in count():
@@ -91,7 +92,7 @@ def searched(method: str, run: SearchRun) -> SearchResult:
 
 
 @given(st.sampled_from(["descent", "genetic"]), st.integers(0, 3), damages)
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_damaged_states_are_gone_on_with_or_refused_in_one_line(
     begun, tmp_path_factory, method, number, damage
 ) -> None:

@@ -173,6 +173,7 @@ def test_torch_has_one_thread_until_the_last_one_leaves():
         torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 def test_an_end_from_outside_is_told_and_crashes_nothing() -> None:
     """Threads of torch that are at work when the interpreter ends do so."""

@@ -49,6 +49,7 @@ def renewed(folder: Path) -> None:
             (stage / name).write_bytes(b"new")
 
 
+@pytest.mark.slow
 def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> None:
     found = []
     for number in itertools.count():
@@ -95,15 +96,23 @@ def test_a_link_is_no_exchange(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "a").read_bytes() == b"another"
 
 
-@pytest.fixture
-def broken_off(tmp_path: Path) -> Path:
-    """A folder in which a run was killed as it was putting its files in place: one of them is, and some are gone."""
+@pytest.fixture(scope="module")
+def midway(tmp_path_factory: pytest.TempPathFactory) -> int:
+    """After how many changes a run is putting its files in place: one of them is, and some are gone."""
     for number in itertools.count(10):
-        folder = made(tmp_path / f"out {number}")
+        folder = made(tmp_path_factory.mktemp("midway") / "out")
         killed(lambda folder=folder: renewed(folder), number, folder)
         if (folder / "a").read_bytes() != (folder / "b").read_bytes():
-            return folder
+            return number
     raise AssertionError
+
+
+@pytest.fixture
+def broken_off(tmp_path: Path, midway: int) -> Path:
+    """A folder in which a run was killed then."""
+    folder = made(tmp_path / "out")
+    assert killed(lambda: renewed(folder), midway, folder)
+    return folder
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -142,7 +142,7 @@ def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monk
                     stranger.sendall(b"G")
                 except OSError:
                     strangers.remove(stranger)
-            time.sleep(0.02)
+            time.sleep(0.05)
         assert posted(page, b"1").status == 200
         page.show({"at": 1})
         told = (line for line in events if line.startswith(b"data: "))

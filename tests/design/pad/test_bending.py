@@ -144,15 +144,6 @@ def test_the_fold_gap_is_that_of_all_points_tried(seed, knots, gap):
     assert_nearest(fold_gap(line, gap), folds_tried(line, gap, gap / 20), gap, gap / 20)
 
 
-@given(st.lists(st.tuples(st.floats(0.01, 1), st.floats(-1.5, 1.5)), min_size=1, max_size=8), st.floats(0.1, 1))
-@settings(max_examples=25)
-def test_the_fold_gap_of_long_straight_branches(steps, gap):
-    length, heading = np.array(steps).T
-    way = np.column_stack([np.cos(heading), np.sin(heading)]) * length[:, None]
-    line = np.vstack([np.zeros(2), way.cumsum(axis=0)])
-    assert_nearest(fold_gap(line, gap), folds_tried(line, gap, gap / 50), gap, gap / 50)
-
-
 def test_a_narrow_u_turn_keeps_the_distance_of_its_legs():
     angle = np.linspace(np.pi, 0, 500)
     turn = 0.25 * np.column_stack([np.cos(angle), np.sin(angle)])

@@ -5,6 +5,7 @@ import pytest
 from design.pad import benchmark as contact
 
 
+@pytest.mark.slow
 def test_the_ways_compared_are_the_same_rule_and_the_exact_signals_have_no_error(taken, monkeypatch):
     for name, value in {"SAMPLES": (250, 2000), "KNOTS": (2,), "GRIDS": (4,)}.items():
         monkeypatch.setattr(contact, name, value)

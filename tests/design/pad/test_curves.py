@@ -41,7 +41,7 @@ def test_slopes_and_sampled_curves_are_scipys(pad):
 def test_torch_gradients_pass_the_finite_difference_test():
     t = torch.tensor([[0.0, 0.6, 1.1, 2.0, 3.0]], dtype=torch.float64, requires_grad=True)
     v = torch.tensor([[1.0, 1.7, 2.1, 1.2, 1.0]], dtype=torch.float64, requires_grad=True)
-    at = torch.linspace(0.05, 2.95, 23, dtype=torch.float64)
+    at = torch.linspace(0.05, 2.95, 9, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda t, v: pchip_sample(t, v, at), (t, v))
 
 

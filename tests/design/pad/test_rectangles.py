@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import PchipInterpolator
 
 from design import Contact, InputError, Morphology, signals, signals_quantized
 from design.criteria.rules import check_rules
@@ -89,27 +88,6 @@ def test_a_pad_that_is_turned_is_as_ambiguous():
         ambiguities(each, Contact(), 1, 0.05, PadSettings().of(each.layout)) for each in (pad, turned(pad))
     )
     assert swapped == pytest.approx(found, rel=2e-3)  # in single precision
-
-
-def plain_signal(pad, fibre, place, radius, count=5001):
-    """The length |dx| + |dy| of a fibre in a disc, from very many samples of it."""
-    axis = pad.layout.family(fibre)
-    travel = np.linspace(0, pad.layout.extent[axis], count)
-    cross = PchipInterpolator(pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis])(travel)
-    step = np.abs(np.diff(travel)) + np.abs(np.diff(cross))
-    middle = np.stack([travel[1:] + travel[:-1], cross[1:] + cross[:-1]]) / 2
-    centre = place if axis == 0 else place[::-1]
-    return step[np.hypot(middle[0] - centre[0], middle[1] - centre[1]) <= radius].sum()
-
-
-@given(pad=rectangles(knots=(0, 2)), seed=st.integers(0, 99))
-@settings(max_examples=15)
-def test_no_fibre_that_a_press_touches_is_left_out(pad, seed):
-    places = places_on(pad, seed, 3)
-    expected = [[plain_signal(pad, fibre, place, 0.6) for fibre in range(pad.layout.fibres)] for place in places]
-    found = signals(pad, places, ROUND)
-    np.testing.assert_allclose(found, expected, atol=0.03 * (1 + max(pad.layout.extent)))
-    assert ((found > 0.1) == (np.array(expected) > 0.1)).mean() > 0.9
 
 
 def test_a_fibre_of_a_coarse_family_is_felt_as_far_as_it_strays():
