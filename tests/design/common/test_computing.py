@@ -14,41 +14,14 @@ import torch
 from design.common.computing import cluster, forget_outdated, one_torch_thread, run_tasks
 from design.common.errors import Fault
 
-KERNELS = {
-    "__init__.py": "from pathlib import Path\nfrom design.common.computing import forget_outdated\n"
-    "forget_outdated(Path(__file__).parent)\n",
-    "inner.py": "from numba import njit\n@njit(cache=True)\ndef inner(x):\n    return x + 1\n",
-    "outer.py": "from numba import njit\nfrom .inner import inner\n@njit(cache=True)\ndef outer(x):\n"
-    "    return 10 * inner(x)\n",
-}
-KERNELS |= {"room/__init__.py": "", "room/outer.py": KERNELS["outer.py"].replace(".inner", "..inner")}
-
 
 @pytest.fixture
 def package(tmp_path):
     folder = tmp_path / "kernels"
     (folder / "room").mkdir(parents=True)
-    for name, text in KERNELS.items():
-        (folder / name).write_text(text)
+    for name in ("__init__.py", "inner.py", "outer.py", "room/__init__.py", "room/outer.py"):
+        (folder / name).write_text("x = 1")
     return folder
-
-
-def outer_of_one(package):
-    code = (
-        f"import sys; sys.path.insert(0, {str(package.parent)!r})\n"
-        "from kernels.outer import outer\nfrom kernels.room.outer import outer as in_room\n"
-        "print(*(y for x in (outer, in_room) for y in (x(1), sum(x.stats.cache_hits.values()))))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return tuple(map(int, done.stdout.split()))
-
-
-@pytest.mark.slow
-def test_a_change_in_what_a_kernel_calls_is_compiled_in(package):
-    assert outer_of_one(package) == (20, 0, 20, 0)
-    assert outer_of_one(package) == (20, 1, 20, 1)
-    (package / "inner.py").write_text(KERNELS["inner.py"].replace("x + 1", "x + 2"))
-    assert outer_of_one(package) == (30, 0, 30, 0)
 
 
 def test_kernels_are_kept_until_a_source_of_their_package_changes(package):
@@ -59,7 +32,7 @@ def test_kernels_are_kept_until_a_source_of_their_package_changes(package):
         path.touch()
     forget_outdated(package)
     assert all(path.exists() for path in kept)
-    (package / "inner.py").write_text(KERNELS["inner.py"].replace("x + 1", "x + 2"))
+    (package / "inner.py").write_text("x = 2")
     forget_outdated(package)
     assert not any(path.exists() for path in kept)
     kept[0].touch()

@@ -42,6 +42,10 @@ def test_bends_of_arcs_corners_and_lines_have_closed_forms():
     assert radius == pytest.approx(1 / (np.pi / 2))
     assert place == pytest.approx((5, 0))
     assert bend_radius(np.array([[0, 0], [1, 0], [2, 0.0]]), np.zeros(3), 1.0)[0] == np.inf
+    # half a unit that turns by 1, and half a unit of the side that turns more, whichever side that is
+    at, turned = np.array([0, 2, 2.5, 4.5]), np.array([0, 1, 2, 2.2])
+    for travel, headings in ((at, turned), (4.5 - at[::-1], 2.2 - turned[::-1])):
+        assert bend_radius(np.column_stack([travel, np.zeros(4)]), headings, 1.0)[0] == pytest.approx(1 / 1.25)
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 2)), min_size=1, max_size=20), st.integers(1, 12))

@@ -37,10 +37,8 @@ def contact_of(reach, length="euclidean"):
 
 def pads():
     yield Morphology.straight(3)
-    for knots in (1, 5, 21):
-        yield Morphology.random(3, knots, seed=knots)
-    yield Morphology.random(3, 5, seed=6, pitch_mm=(30.0, 5.0))
-    yield Morphology.random(3, 5, seed=7, pitch_mm=6.0)
+    for knots, pitch_mm in ((1, 11.25), (21, 6.0), (5, (30.0, 5.0))):
+        yield Morphology.random(3, knots, knots, pitch_mm)
 
 
 def knots_of(pad):
