@@ -16,7 +16,7 @@ from design.common.settings import commented_toml
 from design.criteria.score import AMBIGUITY_NOISE, ambiguities
 from design.evaluation.expected_error import error_terms, expected_errors, straight_full_scale
 from design.optimisers.twin_search import state_folders
-from design.pad.twin import Frame, TwinChannel
+from design.pad.twin import Frame, TwinChannel, TwinScatter
 from design.report.files import found_before, search_lines
 from design.report.twin_settings import settings_for_twin
 from design.settings import PadSettings, SearchSettings
@@ -75,11 +75,14 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
     """Of a pad of grid 2 and pitch 10 mm, pressed somewhat beyond its outer fibres."""
-    path, gain = tmp_path_factory.mktemp("twin") / "twin.json", (0.1, 0.02, 0.9)
-    channels = tuple(TwinChannel(channel, fibre, *gain) for channel, fibre in enumerate((2, 0, None)))
+    path = tmp_path_factory.mktemp("twin") / "twin.json"
+    gains = enumerate(((2, 0.1), (0, -0.1), (1, 0.4)))
+    channels = tuple(TwinChannel(channel, fibre, gain, abs(gain) / 5, 0.9) for channel, (fibre, gain) in gains)
     reach = np.array([0.0, 2, 5, 8, 11, 15]), np.array([1, 0.95, 0.6, 0.25, 0.05, 0])
-    laid = (np.array([[-15.0, -5], [15, -5]]), None, np.array([[-5.0, -15], [-5, 15]]), None)
-    Twin(Morphology.straight(2, 10.0), channels, Frame(), *reach, laid, 0.03, (18.0, 31.5), 500).save(path)
+    line = np.array([[-15.0, -5], [15, -5]])
+    laid = (line, line, line[:, ::-1], None)
+    known = Frame(), *reach, laid, 0.03, (18.0, 31.5), 500
+    Twin(Morphology.straight(2, 10.0), channels, *known, scatter=TwinScatter(0.05, 0.5, 0.8)).save(path)
     return path
 
 
@@ -90,7 +93,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
     assert spec.section(Contact) == contact
     used, pad = spec.section(SearchSettings), spec.section(PadSettings)
     scale = straight_full_scale(Morphology.straight(2, 10.0).layout, contact, "beyond")
-    assert (used.noise, used.scatter, used.scatter_common) == (pytest.approx(0.02 / (0.1 * scale)), 0.0, 0.0)
+    assert (used.noise, used.scatter, used.scatter_common) == (pytest.approx(0.8 * 0.02 / (0.1 * scale)), 0.05, 0.5)
     assert (used.knots, pad.grid, pad.pitch_mm, pad.sensed_mm) == (2, 2, 10, (18, 30))
     wider = settings_for_twin(Spec({"pad": {"pitch_mm": 20.0}}), twin)
     assert wider.section(Contact).reach[-1] == (15, 0)
@@ -104,7 +107,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
 def judged(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
     asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
-    settings = SearchSettings(lost=1, noise=noise, scatter=0.0, scatter_common=0.0)
+    settings = SearchSettings(lost=1, noise=noise, scatter=0.05, scatter_common=0.5)
     return score(pad, contact, **asked) | error_terms(expected_errors(pad, contact, settings, asked["size"]))
 
 
@@ -137,7 +140,7 @@ def test_settings_that_contradict_a_twin_and_files_that_are_none_are_refused(her
 
 @pytest.mark.slow
 def test_a_search_for_a_twin_is_resumed(here, twin):
-    long = QUICK_SEARCH.replace("steps = 3", "steps = 60")
+    long = QUICK_SEARCH.replace("steps = 3", "steps = 20")
     _, whole = designed("--twin", twin, spec=long)
 
     def stop(*step):

@@ -4,6 +4,7 @@ import os
 import zipfile
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,7 +118,8 @@ def test_states_of_other_arrays_are_refused_in_one_line(begun, tmp_path: Path, m
     state = dict(np.load(path))
     for key, array in state.items():
         for other in (None, array.reshape(-1)[:0], np.array("text"), np.zeros((2, 3, 4)), array[..., None]):
-            np.savez(path, **{name: value for name, value in (state | {key: other}).items() if value is not None})
+            arrays: Any = {name: value for name, value in (state | {key: other}).items() if value is not None}
+            np.savez(path, **arrays)
             with pytest.raises(InputError, match=r"start_0000\.npz") as refused:
                 searched(method, SearchRun(keep_in=tmp_path, resume=True))
             assert "\n" not in str(refused.value)

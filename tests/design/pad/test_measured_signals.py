@@ -19,7 +19,7 @@ from design.pad.kernels.measured_signals import PRECISION, fibre_elements, spaci
 from design.pad.kernels.press import MANHATTAN
 from design.pad.knots import kernel_ends
 from design.settings import DEFAULT_PITCH_MM, Layout
-from tests.design.pad.wild_pads import LENGTHS, SEEDS, longest_signals, wild_pads, wild_presses
+from tests.design.pad.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
 
 REACHES = {
     "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),
@@ -30,7 +30,7 @@ REACHES = {
 """In grid units."""
 
 
-def contact_of(reach, length="euclidean"):
+def contact_of(reach, length: Length = "euclidean"):
     """The contact on pads of the default pitch."""
     return Contact(reach=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
 

@@ -1,5 +1,7 @@
 """Pads as wild as a morphology may be, presses of every kind, and pads in the mirror."""
 
+from typing import Literal
+
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -9,7 +11,9 @@ from design.pad.knots import assemble
 
 Array = NDArray[np.float64]
 KINDS = ("random", "steps", "lattice", "border", "alike", "edge", "needles", "level")
-WEIGHTS, LENGTHS = ("uniform", "inverse_square", "inverse"), ("manhattan", "euclidean")
+Length = Literal["manhattan", "euclidean"]
+LENGTHS: tuple[Length, ...] = ("manhattan", "euclidean")
+WEIGHTS: tuple[Literal["uniform", "inverse_square", "inverse"], ...] = ("uniform", "inverse_square", "inverse")
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -83,7 +87,7 @@ def transposed(pad: Morphology) -> Morphology:
     return Morphology(np.concatenate([pad.knots[pad.grid :], pad.knots[: pad.grid]])[..., ::-1], pad.pitch_mm)
 
 
-def longest_signals(pad: Morphology, length: str) -> Array:
+def longest_signals(pad: Morphology, length: Length) -> Array:
     """(2M,) the longest a signal can be with weight 1."""
     if length == "manhattan":
         return np.abs(np.diff(pad.knots, axis=1)).sum(axis=(1, 2))
