@@ -6,10 +6,10 @@ import json
 import pytest
 
 from design.benchmarking import harness, suite, table
-from design.benchmarking.comparison import compared, comparison_lines, read_earlier, worsenings
+from design.benchmarking.comparison import read_earlier, worsenings
 from design.benchmarking.harness import Bench, BenchRounds, BenchTrial, measure_round
 from design.benchmarking.suite import run_benches
-from design.benchmarking.table import bench_lines, summary_rows, write_bench
+from design.benchmarking.table import bench_lines
 from design.common.errors import InputError
 
 
@@ -70,21 +70,6 @@ def test_files_hold_what_was_measured(tmp_path):
     ]
 
 
-def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
-    so_far = BenchRounds(pace_s=1e-3)
-    for number, (error, seconds) in enumerate(((0.1, 2.0), (0.3, 9.0), (0.2, 4.0))):
-        so_far.found["a", "slow", 1, number] = {"error": error}
-        so_far.times["a", "slow", 1, number] = so_far.paces["a", "slow", 1, number] = [seconds + 1, seconds]
-    so_far.found["a", "fast", 0, 0] = {"error": 0.4}
-    so_far.times["a", "fast", 0, 0] = so_far.paces["a", "fast", 0, 0] = [0.5]
-    made = write_bench(Bench("x", lambda: iter(()), "error", ("slow", 1), ("fast", 0), ()), so_far, tmp_path)
-    assert [row["speed"] for row in made["rows"]] == [2.0, pytest.approx(4 / 9), 1.0, 8.0]
-    row = f"{'a':<20} {'slow':<13} {1:>7} {'0.200':>9} {'4.00 s':>10} {'1.00x':>8} {'-':>8}"
-    assert bench_lines(made)[3] == row
-    (only,) = summary_rows([made])
-    assert (only["reference_seconds"], only["seconds"], only["speed"]) == (4.0, 0.5, 8.0)
-
-
 @pytest.mark.parametrize(
     ("before", "now", "what"),
     [
@@ -108,13 +93,6 @@ def test_tables_show_medians_of_repetitions_and_the_file_all(tmp_path):
 )
 def test_what_has_become_worse_is_found(before, now, what):
     assert [change.what for change in worsenings(document(**before), document(**now))] == what
-
-
-def test_changes_are_told_a_line_each():
-    (change,) = worsenings(document(), document(seconds=1.5))
-    assert str(change) == "x, a, ours: slower, 1.50x (1 before, 1.5 now)"
-    assert comparison_lines([change], 3) == ["3 trials compared; worse than before:", f"  {change}"]
-    assert compared({"x": document()}, {"x": document(), "y": document()}) == 1
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):

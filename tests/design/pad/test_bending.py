@@ -49,7 +49,7 @@ def test_bends_of_arcs_corners_and_lines_have_closed_forms():
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 2)), min_size=1, max_size=20), st.integers(1, 12))
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_windows_count_the_corners_at_both_their_ends(steps, quarters):
     """On quarter steps, whose lengths add without rounding, corners lie exactly a window apart again and again."""
     lengths, ways = np.array(steps).T
@@ -64,7 +64,7 @@ def test_windows_count_the_corners_at_both_their_ends(steps, quarters):
 
 
 @given(SEEDS, st.integers(1, 20), st.sampled_from([0.05, 0.3, 2.0]))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_the_bend_radius_is_that_of_every_window_tried(seed, knots, window):
     pad = Morphology.random(2, knots, seed)
     points, headings = dense(pad, fibre=1)

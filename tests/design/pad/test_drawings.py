@@ -203,7 +203,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @given(st.sampled_from(["damaged.svg", "damaged.dxf"]), damages)
-@settings(max_examples=30)
+@settings(max_examples=20)
 def test_a_damaged_drawing_is_read_or_refused_in_one_line(drawn, tmp_path_factory, name, damage) -> None:
     layout, path = Layout.of(1), tmp_path_factory.getbasetemp() / name
     found = read_damaged(path, drawn[name], damage, lambda path: import_plan(path, layout, 0.5))
