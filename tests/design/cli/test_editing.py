@@ -60,7 +60,6 @@ class Program:
 @pytest.fixture
 def pad(tmp_path: Path) -> Path:
     path = tmp_path / "pad.json"
-    Morphology.straight(2, 10.0).save(path)
     Morphology.random(2, 3, 7, 10.0).save(path)
     return path
 
@@ -82,8 +81,11 @@ def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
         yield program
 
 
-def test_what_is_hostile_is_refused_and_the_pad_is_as_it_was(program: Program, tmp_path: Path, pad: Path) -> None:
+def test_it_refuses_what_is_hostile_saves_beside_the_pad_and_tells_what_is_not_kept(
+    program: Program, tmp_path: Path, pad: Path
+) -> None:
     before = pad.read_bytes()
+    assert "saves to pad-edited.json" in program.said
     first = program.ask(do="undo")
     port = program.origin.rpartition(":")[2]
     move = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0}'
@@ -96,32 +98,23 @@ def test_what_is_hostile_is_refused_and_the_pad_is_as_it_was(program: Program, t
         program.post("/edit", b" " * 100_000 + move),
         program.post("/edit", b"[" * 4000),
         program.post("/edit", move.replace(b'"x_mm": 0', b'"x_mm": NaN')),
-        program.post("/edit", move.replace(b'"knot": 1', b'"knot": 99')),
-        program.post("/edit", move.replace(b'"fibre": 1', b'"fibre": 0')),
         program.post("/edit", b'{"do": "move", "a": ' + b'{"a": ' * 500 + b"1" + b"}" * 501),
-        program.post("/edit", b"\x00\xff"),
     ]
-    assert [status for status, _ in refused] == [403, 403, 403, 403, 404, 413, 400, 400, 400, 400, 400, 400]
+    assert [status for status, _ in refused] == [403, 403, 403, 403, 404, 413, 400, 400, 400]
     assert not any(b"Traceback" in answer for _, answer in refused)
-    after = program.ask(do="undo")
-    assert after["fibres"] == first["fibres"]
-    code, said = program.end()
-    assert (code, "Traceback" in said, "not kept" in said) == (130, False, False)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.json"]
-    assert pad.read_bytes() == before
-
-
-def test_it_saves_beside_the_pad_and_tells_what_is_not_kept(program: Program, tmp_path: Path, pad: Path) -> None:
-    assert "saves to pad-edited.json" in program.said
+    assert program.ask(do="undo")["fibres"] == first["fibres"]
     program.ask(do="add", fibre=1)
     assert program.post("/save", b"{}")[0] == 200
     program.ask(do="undo")
     code, said = program.end()
     assert (code, said.splitlines()[0]) == (130, "what was drawn since the last save is not kept")
+    assert "Traceback" not in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad-edited.json", "pad.json"]
     assert Morphology.load(tmp_path / "pad-edited.json").knots.shape == (4, 6, 2)
-    assert Morphology.load(pad).knots.shape == (4, 5, 2)
+    assert pad.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None:
     with at_work(tmp_path, "pad.json", "--out", "pad.json") as program:
         assert program.said.endswith("saves to pad.json in place of what it has\n")
@@ -148,6 +141,7 @@ def test_mistakes_are_told_before_a_page_is_there(
     assert re.search(told, str(ended.exception))
 
 
+@pytest.mark.slow
 def test_it_takes_no_torch() -> None:
     code = "import design.cli.editor.session, sys; sys.exit('torch' in sys.modules)"
     root = Path(__file__).resolve().parents[3]
@@ -184,6 +178,7 @@ def control_key(browser: Chromium, key: str, modifiers: int = 2) -> None:
         browser.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers)
 
 
+@pytest.mark.slow
 def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
     first = {name: browser.ask(TEXT.format(name)) for name in ("rules", "ambiguity")}
     colours = "[...document.querySelectorAll('#map rect')].map(each => each.getAttribute('fill-opacity')).join()"
@@ -213,6 +208,7 @@ def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, bro
     }
 
 
+@pytest.mark.slow
 def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: Chromium) -> None:
     browser.ask("document.getElementById('fibre').focus()")
     for _ in range(12):  # once round the page, to the first knot
@@ -249,6 +245,7 @@ def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: 
     assert lowered == pytest.approx(20, abs=6)  # the first bit may count as a tap
 
 
+@pytest.mark.slow
 def test_another_page_follows_and_one_that_was_away_comes_back(program: Program, browser: Chromium) -> None:
     moved = program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
     shown = "view.fibres[0].knots[1][1]"

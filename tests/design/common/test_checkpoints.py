@@ -4,12 +4,18 @@ import os
 import zipfile
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from design.common.checkpoints import Checkpoints
 from design.common.errors import InputError
+from design.optimisers.search import SearchResult, SearchRun, search
+from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
+from tests.design.pad.damage import damages, read_damaged
 from tools.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
@@ -25,6 +31,7 @@ def work(folder: Path) -> None:
     kept.clear()
 
 
+@pytest.mark.slow
 def test_a_search_that_is_killed_at_any_moment_goes_on_and_leaves_no_litter(tmp_path: Path) -> None:
     left = set()
     for number in count():
@@ -62,3 +69,57 @@ def test_a_state_that_unpacks_to_much_is_not_unpacked(tmp_path: Path, monkeypatc
     monkeypatch.setattr("design.common.checkpoints.MOST_BYTES", 50_000)
     with pytest.raises(InputError, match=r"start_0000\.npz: .*unpacks to more than 50000 bytes"):
         kept.begin(resume=True)
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
+    """Files of searches of both kinds that were broken off."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    found = {}
+    for method in ("descent", "genetic"):
+        folder = tmp_path_factory.mktemp(method)
+        with pytest.raises(KeyboardInterrupt):
+            searched(method, SearchRun(stop, folder))
+        found[method] = {path.name: path.read_bytes() for path in folder.iterdir()}
+    return found
+
+
+def searched(method: str, run: SearchRun) -> SearchResult:
+    settings = SearchSettings(method=method, knots=1, starts=1, steps=3, lost=0, population=4, generations=2)  # pyright: ignore
+    return search(PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False), run=run)
+
+
+@given(st.sampled_from(["descent", "genetic"]), st.integers(0, 3), damages)
+@settings(max_examples=6)
+def test_damaged_states_are_gone_on_with_or_refused_in_one_line(
+    begun, tmp_path_factory, method, number, damage
+) -> None:
+    folder = tmp_path_factory.mktemp("search")
+    for name, content in begun[method].items():
+        (folder / name).write_bytes(content)
+    name = sorted(begun[method])[number % len(begun[method])]
+    found = read_damaged(
+        folder / name,
+        begun[method][name],
+        damage,
+        lambda path: searched(method, SearchRun(keep_in=folder, resume=True)),
+    )
+    assert found is None or np.isfinite(list(found.terms.values())).all()
+
+
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_states_of_other_arrays_are_refused_in_one_line(begun, tmp_path: Path, method: str) -> None:
+    for name, content in begun[method].items():
+        (tmp_path / name).write_bytes(content)
+    path = tmp_path / "start_0000.npz"
+    state = dict(np.load(path))
+    for key, array in state.items():
+        for other in (None, array.reshape(-1)[:0], np.array("text"), np.zeros((2, 3, 4)), array[..., None]):
+            arrays: Any = {name: value for name, value in (state | {key: other}).items() if value is not None}
+            np.savez(path, **arrays)
+            with pytest.raises(InputError, match=r"start_0000\.npz") as refused:
+                searched(method, SearchRun(keep_in=tmp_path, resume=True))
+            assert "\n" not in str(refused.value)

@@ -1,10 +1,11 @@
-"""Tasks on any executor, torch on one thread, and kernels that are kept until a source of their package changes."""
+"""Tasks on any executor, torch on one thread, kernels that are kept, and how a program ends that is at work."""
 
+import os
 import subprocess
 import sys
 import threading
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import nullcontext
 from functools import partial
 
 import pytest
@@ -13,40 +14,31 @@ import torch
 from design.common.computing import cluster, forget_outdated, one_torch_thread, run_tasks
 from design.common.errors import Fault
 
-KERNELS = {
-    "__init__.py": "from pathlib import Path\nfrom design.common.computing import forget_outdated\n"
-    "forget_outdated(Path(__file__).parent)\n",
-    "inner.py": "from numba import njit\n@njit(cache=True)\ndef inner(x):\n    return x + 1\n",
-    "outer.py": "from numba import njit\nfrom .inner import inner\n@njit(cache=True)\ndef outer(x):\n"
-    "    return 10 * inner(x)\n",
-}
-KERNELS |= {"room/__init__.py": "", "room/outer.py": KERNELS["outer.py"].replace(".inner", "..inner")}
-
 
 @pytest.fixture
 def package(tmp_path):
     folder = tmp_path / "kernels"
     (folder / "room").mkdir(parents=True)
-    for name, text in KERNELS.items():
-        (folder / name).write_text(text)
+    for name in ("__init__.py", "inner.py", "outer.py", "room/__init__.py", "room/outer.py"):
+        (folder / name).write_text("x = 1")
     return folder
 
 
-def outer_of_one(package):
-    code = (
-        f"import sys; sys.path.insert(0, {str(package.parent)!r})\n"
-        "from kernels.outer import outer\nfrom kernels.room.outer import outer as in_room\n"
-        "print(*(y for x in (outer, in_room) for y in (x(1), sum(x.stats.cache_hits.values()))))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return tuple(map(int, done.stdout.split()))
-
-
-def test_a_change_in_what_a_kernel_calls_is_compiled_in(package):
-    assert outer_of_one(package) == (20, 0, 20, 0)
-    assert outer_of_one(package) == (20, 1, 20, 1)
-    (package / "inner.py").write_text(KERNELS["inner.py"].replace("x + 1", "x + 2"))
-    assert outer_of_one(package) == (30, 0, 30, 0)
+def test_kernels_are_kept_until_a_source_of_their_package_changes(package):
+    kept = [folder / "__pycache__" / "outer.py311.1.nbc" for folder in (package, package / "room")]
+    forget_outdated(package)
+    for path in kept:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    forget_outdated(package)
+    assert all(path.exists() for path in kept)
+    (package / "inner.py").write_text("x = 2")
+    forget_outdated(package)
+    assert not any(path.exists() for path in kept)
+    kept[0].touch()
+    (package / "__pycache__" / "kernels.sha256").write_bytes(b"\xff\xfe")  # a damaged stamp is none
+    forget_outdated(package)
+    assert not kept[0].exists()
 
 
 def test_a_folder_that_cannot_be_written_is_left_alone(package):
@@ -55,21 +47,14 @@ def test_a_folder_that_cannot_be_written_is_left_alone(package):
     assert (package / "__pycache__").is_file()
 
 
-def test_a_damaged_stamp_is_no_stamp(package):
-    kept = package / "__pycache__"
-    kept.mkdir()
-    (kept / "outer.py311.1.nbc").touch()
-    (kept / "kernels.sha256").write_bytes(b"\xff\xfe")
-    forget_outdated(package)
-    assert not list(kept.glob("*.nbc"))
-
-
 @pytest.mark.parametrize("threads", [None, 1, 3])
-def test_results_of_tasks_come_with_their_keys(threads):
+def test_results_and_errors_of_tasks_come_out_with_their_keys(threads):
     tasks = [(number, partial(pow, number, 2)) for number in range(20)]
     pool = ThreadPoolExecutor(threads) if threads else None
     assert dict(run_tasks(tasks, pool)) == {number: number**2 for number in range(20)}
     assert dict(run_tasks([], pool)) == {}
+    with pytest.raises(ZeroDivisionError):
+        list(run_tasks([("a", partial(pow, 0, -1)), ("b", partial(pow, 1, 2))], pool))
 
 
 def test_a_task_is_followed_by_the_next_of_its_key():
@@ -121,39 +106,20 @@ def test_nothing_begins_once_nobody_listens_and_a_task_at_work_is_not_waited_for
     never.set()
 
 
-def test_an_error_of_a_task_comes_out():
-    def fail():
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        list(run_tasks([("a", fail), ("b", lambda: 1)]))
-
-
 @pytest.mark.parametrize(("killed", "said"), [(False, "has lost its scheduler"), (True, "loses every worker")])
 def test_a_cluster_that_is_lost_is_one_line(monkeypatch, killed, said):
     distributed = pytest.importorskip("distributed")
 
-    class Client:
-        def __init__(self, address, timeout):
-            pass
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *error):
-            pass
-
-        @contextmanager
+    class Client(nullcontext):
         def get_executor(self, **how):
-            with ThreadPoolExecutor(1) as there:
-                yield there
+            return ThreadPoolExecutor(1)
 
     def lost():
         raise distributed.scheduler.KilledWorker("a task", None, 3) if killed else CancelledError
 
-    monkeypatch.setattr(distributed, "Client", Client)
-    with pytest.raises(Fault, match=f"the cluster at tcp://there {said}; .* --resume"), cluster("tcp://there") as there:
-        list(run_tasks([("a", lost)], there))
+    monkeypatch.setattr(distributed, "Client", lambda address, timeout: Client())
+    with pytest.raises(Fault, match=f"the cluster at tcp://there {said}; .* --resume"), cluster("tcp://there") as pool:
+        list(run_tasks([("a", lost)], pool))
 
 
 def test_torch_has_one_thread_until_the_last_one_leaves():
@@ -167,3 +133,32 @@ def test_torch_has_one_thread_until_the_last_one_leaves():
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_an_end_from_outside_is_told_and_crashes_nothing() -> None:
+    """Threads of torch that are at work when the interpreter ends do so."""
+    code = """
+import os, signal, sys, threading
+import click, torch
+from design.common.command_line import run_to_end
+from design.common.computing import run_tasks
+sys.argv = ["padforge"]
+at_work = threading.Barrier(5, lambda: threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start())
+def train():
+    x = torch.ones(20, 20, requires_grad=True)
+    at_work.wait()
+    while True:
+        (x @ x).sum().backward()
+@click.command()
+def work():
+    print("begun")
+    for _ in run_tasks([(number, train) for number in range(5)], at_once=5):
+        pass
+sys.exit(run_to_end(work, "padforge", {}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    said = done.stderr.strip()
+    assert (done.returncode, said) == (130, "padforge: interrupted; what was finished is kept")
+    assert done.stdout == "begun\n"

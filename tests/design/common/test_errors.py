@@ -9,44 +9,36 @@ import pytest
 from design.common import errors
 from design.common.errors import InputError, what_to_install
 
+LONGEST = "a" * errors.LONGEST_PATH
+
+
+def test_numbers_and_paths_within_their_bounds_are_taken():
+    assert [errors.whole("n", np.int8(n), 2, 5) for n in (2, 5)] == [2, 5]
+    for value in (0.0, 2.5, 1, np.float32(0.5)):
+        number = errors.real("x", value, 0.0, 2.5)
+        assert (type(number), number) == (float, value)
+    assert errors.reals("xs", [0, 3, -3], 3).tolist() == [0, 3, -3]
+    assert errors.path("file", LONGEST) == Path(LONGEST)
+
 
 @pytest.mark.parametrize(
-    ("value", "allowed"), [(2, True), (5, True), (1, False), (6, False), (True, False), (3.0, False)]
+    ("check", "values", "message"),
+    [
+        (lambda x: errors.whole("n", x, 2, 5), (1, 6, True, 3.0), "n is .*, allowed is a whole number from 2 to 5"),
+        (
+            lambda x: errors.real("x", x, 0.0, 2.5),
+            (-1e-9, 2.5 + 1e-9, math.nan, math.inf, True, "1", 10**400, None),
+            r"x is .*, allowed is 0 to 2\.5",
+        ),
+        (lambda x: errors.reals("xs", [0, x], 3), (3.5, -3.5), r"xs hold 3\.5, allowed is -3 to 3"),
+        (lambda x: errors.reals("xs", x), ([1, [2]], "a", [1j], [None], [math.nan]), "xs (are|hold) .*, expected"),
+        (lambda x: errors.path("file", x), ("", "a\0b", LONGEST + "a", 3, None), "file is .*, expected a path"),
+    ],
 )
-def test_a_whole_number_is_one_within_its_bounds(value, allowed):
-    if allowed:
-        assert errors.whole("n", np.int8(value), 2, 5) == value
-    else:
-        with pytest.raises(InputError, match=r"n is .*, allowed is a whole number from 2 to 5"):
-            errors.whole("n", value, 2, 5)
-
-
-@pytest.mark.parametrize("value", [0.0, 2.5, 1, np.float32(0.5)])
-def test_a_number_within_its_bounds_is_a_float(value):
-    number = errors.real("x", value, 0.0, 2.5)
-    assert type(number) is float
-    assert number == value
-
-
-@pytest.mark.parametrize("value", [-1e-9, 2.5 + 1e-9, math.nan, math.inf, True, "1", 10**400, None])
-def test_a_number_beyond_its_bounds_is_refused(value):
-    with pytest.raises(InputError, match=r"x is .*, allowed is 0 to 2\.5"):
-        errors.real("x", value, 0.0, 2.5)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_numbers_are_bounded_on_either_side(sign):
-    assert errors.reals("xs", [0, 3 * sign], 3).tolist() == [0, 3 * sign]
-    with pytest.raises(InputError, match=r"xs hold 3\.5, allowed is -3 to 3"):
-        errors.reals("xs", [0, 3.5 * sign], 3)
-
-
-def test_a_path_is_neither_empty_nor_longer_than_systems_take():
-    longest = "a" * errors.LONGEST_PATH
-    assert errors.path("file", longest) == Path(longest)
-    for value in ("", "a\0b", longest + "a", 3, None):
-        with pytest.raises(InputError, match=r"file is .*, expected a path"):
-            errors.path("file", value)
+def test_what_is_just_beyond_them_or_of_another_kind_is_refused(check, values, message):
+    for value in values:
+        with pytest.raises(InputError, match=message):
+            check(value)
 
 
 @pytest.mark.parametrize(

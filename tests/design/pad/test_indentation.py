@@ -4,15 +4,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from design import InputError, Morphology
+from design.pad.contact import fibre_axes
 from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
-from tests.helpers.effort import few
+from tests.design.pad.wild_pads import SEEDS, mirrored, transposed, wild_pads, wild_presses
 
 INDENTERS = [Indenter("sphere", 0.7), Indenter("cone", angle_deg=30), Indenter("flat", 0.45)]
 
@@ -74,20 +75,15 @@ def oracle(pad, press, depth, indenter, fibre):
 
 
 @given(indenters, st.floats(0.01, 0.19))
+@settings(max_examples=40)
 def test_stiffness_is_twice_modulus_times_contact_radius(indenter, depth):
     step = 1e-5 * depth
     stiffness = (indenter.force(depth + step) - indenter.force(depth - step)) / (2 * step)
     np.testing.assert_allclose(stiffness, 2 * indenter.contact_radius(depth), rtol=1e-6)
 
 
-@pytest.mark.parametrize(("indenter", "of_a", "of_force"), zip(INDENTERS, (0.5, 1, 0), (1.5, 2, 1), strict=True))
-def test_contact_radius_and_force_scale_with_a_power_of_depth(indenter, of_a, of_force):
-    assert indenter.contact_radius(0.4) / indenter.contact_radius(0.1) == pytest.approx(4**of_a)
-    assert indenter.force(0.4) / indenter.force(0.1) == pytest.approx(4**of_force)
-
-
-@few(50)
 @given(indenters, st.floats(0.01, 0.19), st.floats(0.02, 6))
+@settings(max_examples=30)
 def test_the_surface_is_that_of_flat_punches_pressed_one_after_another(indenter, depth, r):
     """Any contact grows as a flat punch of the present radius would be pressed on (Mossakovskii 1963)."""
     a, deflection = float(indenter.contact_radius(depth)), float(indenter.deflection(r, depth))
@@ -108,17 +104,6 @@ def test_the_surface_is_that_of_flat_punches_pressed_one_after_another(indenter,
     np.testing.assert_allclose(deflection, expected, rtol=1e-6, atol=1e-9)
 
 
-@given(indenters, st.floats(0.01, 0.19))
-def test_the_surface_has_no_step_and_is_deepest_at_the_axis(indenter, depth):
-    a = float(indenter.contact_radius(depth))
-    near, far = indenter.deflection([a * (1 - 1e-12), a * (1 + 1e-12)], depth)
-    assert near == pytest.approx(far, abs=1e-5 * depth)
-    w = indenter.deflection(np.linspace(0, 8, 500), depth)
-    assert w[0] == pytest.approx(depth)
-    assert (np.diff(w) <= 1e-12).all()
-    assert (w > 0).all()
-
-
 def test_forces_are_newtons():
     # a ball of 20 mm pressed 2 mm into a half-space of 100 kPa: 4/3 1e5 sqrt(0.01) 0.002^1.5
     ball = Indenter("sphere", radius=2.0)
@@ -126,24 +111,8 @@ def test_forces_are_newtons():
     assert pytest.approx(73.33, abs=0.01) == REDUCED_MODULUS_KPA
 
 
-def test_a_straight_fibre_through_the_axis_is_a_plain_integral_of_the_surface():
-    pad, depth = Morphology.straight(3), 0.3
-    for indenter in INDENTERS:
-        a = float(indenter.contact_radius(depth))
-
-        def lengthening(r, indenter=indenter):
-            return np.hypot(1, slope(indenter, r, depth)) - 1
-
-        under = quad(lengthening, 0, a)[0]
-        around = quad(lambda u, f=lengthening, a=a: f(a + u * u) * 2 * u, 0, np.sqrt(2 - a))[0]
-        found = indented_signals(pad, [[2, 2]], [depth], indenter)
-        np.testing.assert_allclose(found[0, [1, 4]], 2 * (under + around), rtol=1e-7)
-        if indenter.shape == "cone":
-            assert under == pytest.approx(a * (1 / np.cos(np.radians(indenter.angle_deg)) - 1))
-
-
-@few(20)
-@given(indenters, st.integers(0, 6), st.floats(0.01, 0.19), st.integers(0, 2**32 - 1))
+@given(indenters, st.integers(0, 6), st.floats(0.01, 0.19), SEEDS)
+@settings(max_examples=12)
 def test_signals_equal_adaptive_quadrature(indenter, knots, depth, seed):
     rng = np.random.default_rng(seed)
     pad = Morphology.random(2, knots, rng)
@@ -167,25 +136,34 @@ def test_a_fibre_that_grazes_the_contact_has_a_neighbours_signal(indenter, miss)
 @pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
 def test_deeper_presses_signal_more_and_no_depth_nothing(indenter):
     pad = Morphology.random(4, 5, 0)
-    presses = np.random.default_rng(0).uniform(1, 4, (20, 2))
+    presses = np.random.default_rng(0).uniform(1, 4, (6, 2))
     by_depth = [indented_signals(pad, presses, depth, indenter) for depth in (0, 1e-9, 0.1, 0.2, 0.4)]
     assert not by_depth[0].any()
     assert all((more > less).all() for less, more in pairwise(by_depth[1:]))
     assert np.isfinite(by_depth[1]).all()
 
 
-@pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
-def test_a_mirrored_pad_gives_mirrored_signals(indenter):
-    pad = Morphology.random(3, 4, 1)
-    presses = np.random.default_rng(2).uniform(0, 4, (10, 2))
-    found = indented_signals(pad, presses, 0.3, indenter)
-    swapped = Morphology(np.concatenate([pad.knots[3:, :, ::-1], pad.knots[:3, :, ::-1]]))
-    turned = indented_signals(swapped, presses[:, ::-1], 0.3, indenter)
-    np.testing.assert_allclose(turned, np.roll(found, 3, axis=1), rtol=1e-5)
-    upside_down = pad.knots * [1, -1] + [0, 4]
-    upside_down = Morphology(np.concatenate([upside_down[2::-1], upside_down[3:, ::-1]]))
-    mirrored = indented_signals(upside_down, presses * [1, -1] + [0, 4], 0.3, indenter)
-    np.testing.assert_allclose(mirrored, found[:, [2, 1, 0, 3, 4, 5]], rtol=1e-5)
+@given(
+    wild_pads((1, 2), (0, 5)),
+    st.sampled_from(["sphere", "cone", "flat"]),
+    st.sampled_from([(1e-6, 0.01), (0.7, 30.0), (1e4, 89.9)]),
+    st.sampled_from([0.0, 1e-300, 1e-9, 1e-6, 0.3]),
+    SEEDS,
+)
+@settings(max_examples=25)
+def test_a_mirrored_pad_has_mirrored_signals_and_they_stay_finite_on_wild_pads(pad, shape, size, depth, seed):
+    indenter, presses, grid = Indenter(shape, *size), wild_presses(pad, seed, 4), pad.grid
+    depth = depth * min(indenter.radius, 1) if shape == "sphere" else depth
+    found = indented_signals(pad, presses, depth, indenter)
+    assert np.isfinite(found).all()
+    assert (found >= 0).all()
+    assert depth > 0 or not found.any()
+    swapped = indented_signals(transposed(pad), presses[:, ::-1], depth, indenter)
+    np.testing.assert_allclose(np.roll(swapped, grid, axis=1), found, rtol=1e-3, atol=1e-6 * max(depth, 1e-9))
+    if pad.knots.shape[1] == 2 or np.diff(fibre_axes(pad)[0]).min() > 1e-5:  # steps move by rounding in a mirror
+        flipped = indented_signals(mirrored(pad), presses * [-1, 1] + [grid + 1, 0], depth, indenter)
+        order = np.r_[:grid, 2 * grid - 1 : grid - 1 : -1]
+        np.testing.assert_allclose(flipped[:, order], found, rtol=1e-3, atol=1e-6 * max(depth, 1e-9))
 
 
 @pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
@@ -199,42 +177,32 @@ def test_moving_the_press_along_the_pattern_moves_the_signals(indenter):
 
 def test_any_number_of_presses_gives_the_same_signals():
     pad, rng = Morphology.random(4, 5, 0), np.random.default_rng(3)
-    presses, depths = rng.uniform(0, 5, (300, 2)), rng.uniform(0.1, 0.45, 300)
+    presses, depths = rng.uniform(0, 5, (120, 2)), rng.uniform(0.1, 0.45, 120)
     many = indented_signals(pad, presses, depths, INDENTERS[0])
-    one = indented_signals(pad, presses[7:8], depths[7:8], INDENTERS[0])
-    np.testing.assert_array_equal(many[7:8], one)
+    one = indented_signals(pad, presses[107:108], depths[107:108], INDENTERS[0])
+    np.testing.assert_array_equal(many[107:108], one)
     assert indented_signals(pad, [], [], INDENTERS[0]).shape == (0, 8)
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"),
+    ("indenter", "depths", "message"),
     [
-        ({"shape": "cube"}, "shape is 'cube', allowed is sphere, cone, flat"),
-        ({"radius": 0.0}, "radius is 0.0, allowed"),
-        ({"radius": np.nan}, "radius is nan, allowed"),
-        ({"shape": "cone", "angle_deg": 90.0}, "angle_deg is 90.0, allowed"),
+        ({"shape": "cube"}, 0, "shape is 'cube', allowed is sphere, cone, flat"),
+        ({"radius": 0.0}, 0, "radius is 0.0, allowed"),
+        ({"radius": np.nan}, 0, "radius is nan, allowed"),
+        ({"shape": "cone", "angle_deg": 90.0}, 0, "angle_deg is 90.0, allowed"),
+        ({}, [0.1, -0.1], "depth is -0.1, allowed is 0 to the sphere's radius, 0.7"),
+        ({}, [0.1, 0.8], "depth is 0.8, allowed"),
+        ({}, [0.1, np.nan], "depths hold NaN"),
+        ({}, [0.1], r"depths have shape \(1,\), expected \(2,\)"),
     ],
 )
-def test_impossible_indenters_are_refused(settings, named):
-    with pytest.raises(InputError, match=named):
-        Indenter(**settings)
+def test_impossible_indenters_and_depths_are_refused(indenter, depths, message):
+    with pytest.raises(InputError, match=message):
+        indented_signals(Morphology.straight(2), [[1, 1], [2, 2]], depths, Indenter(**indenter))
 
 
-@pytest.mark.parametrize(
-    ("depths", "named"),
-    [
-        ([0.1, -0.1], "depth is -0.1, allowed is 0 to the sphere's radius, 0.7"),
-        ([0.1, 0.8], "depth is 0.8, allowed"),
-        ([0.1, np.nan], "depths hold NaN"),
-        ([0.1], r"depths have shape \(1,\), expected \(2,\)"),
-    ],
-)
-def test_impossible_depths_are_refused(depths, named):
-    with pytest.raises(InputError, match=named):
-        indented_signals(Morphology.straight(2), [[1, 1], [2, 2]], depths, Indenter())
-
-
-@pytest.mark.parametrize("share", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("share", [1e-1, 1e-3, 1e-5])
 @pytest.mark.parametrize("shape", ["cone", "flat"])
 def test_a_fibre_close_to_a_tip_or_beside_an_edge_misses_nothing(shape, share):
     """Its slope turns round within a length that quadrature could step over."""

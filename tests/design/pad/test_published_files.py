@@ -4,25 +4,26 @@ import re
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from design import Morphology
-from design.common.errors import InputError
+from design import InputError, Morphology
 from design.pad.published_files.matlab import load_mat
 from sense import import_mat
+from tests.design.pad.damage import damages, read_damaged
 
 
 def newer(path: Path, content: dict[str, Any]) -> Path:
     """A file as MATLAB writes it from version 7.3 on: HDF5 behind 512 bytes of text, all arrays transposed."""
-    import h5py
-
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in content.items():
             if isinstance(values, dict):
@@ -50,22 +51,99 @@ def test_numbers_and_structures_are_those_of_earlier_versions(tmp_path: Path) ->
     assert np.array_equal(pads[0].knots, pads[1].knots)
 
 
-@pytest.mark.parametrize("name", ["5para_dis", "square_grid_cir"])
-def test_published_pads_are_the_same_in_version_7_3(published: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(("name", "knots"), [("1para", 1), ("5para_dis", 5), ("20para", 20), ("square_grid_cir", 0)])
+def test_published_pads_load_and_are_the_same_in_version_7_3(published: Path, tmp_path: Path, name: str, knots: int):
     stored = scipy.io.loadmat(published / f"{name}.mat")
-    settings = {field: stored["K"][0, 0][field].item() for field in ("object_size", "str_shp", "fineness")}
-    content = {field: stored[field] for field in ("para", "loc_all", "sens_raw_all")} | {"K": settings}
-    pad = Morphology.load(newer(tmp_path / "new.mat", content))
-    assert np.array_equal(pad.knots, Morphology.load(published / f"{name}.mat").knots)
+    known = {field: stored["K"][0, 0][field].item() for field in ("object_size", "str_shp", "fineness")}
+    content = {field: stored[field] for field in ("para", "loc_all", "sens_raw_all")} | {"K": known}
+    pad = Morphology.load(published / f"{name}.mat")
+    assert pad.knots.shape == (8, knots + 2, 2)
+    assert pad.pitch_mm == 11.25
+    assert np.array_equal(pad.knots, Morphology.load(newer(tmp_path / "new.mat", content)).knots)
 
 
-def test_a_file_of_7_3_that_takes_values_from_another_is_refused(tmp_path: Path) -> None:
-    import h5py
+def test_a_torn_pad_and_a_recording_are_refused_in_one_line(published: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no variable para"):
+        Morphology.load(published / "para5_long_first4500.mat")
+    (tmp_path / "torn.mat").write_bytes((published / "5para_dis.mat").read_bytes()[:20_000])
+    with pytest.raises(InputError, match=r"torn\.mat") as refused:
+        Morphology.load(tmp_path / "torn.mat")
+    assert "\n" not in str(refused.value)
 
-    newer(tmp_path / "new.mat", {"K": {"object_size": 0.6}})
-    with h5py.File(tmp_path / "new.mat", "a") as file:
-        file.create_dataset("para", (3, 8), "f8", external=[("/etc/hostname", 0, 192)])
-    with pytest.raises(InputError, match=r"new\.mat: para has its values in other files"):
+
+SAMPLES = CONTENT | {
+    "K": {"object_size": 0.6, "str_shp": 30, "fineness": 100},
+    "loc_all": np.ones((5, 2)),
+    "sens_raw_all": np.ones((5, 4)),
+}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"K": {"str_shp": 30, "fineness": 100}},
+        {"K": {"object_size": -1, "str_shp": 30, "fineness": 100}},
+        {"K": {"object_size": 0.6, "str_shp": "text", "fineness": 100}},
+        {"sens_raw_all": np.ones((5, 7))},
+        {"loc_all": np.ones((2, 2, 8))},
+        {"loc_all": ""},
+        {"K": 3},
+    ],
+)
+def test_samples_that_are_not_as_published_are_refused_in_one_line(change: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "pad.mat"
+    scipy.io.savemat(path, SAMPLES)
+    assert Morphology.load(path).grid == 2
+    scipy.io.savemat(path, SAMPLES | change)
+    with pytest.raises(InputError, match="not as published") as refused:
+        Morphology.load(path)
+    assert "\n" not in str(refused.value)
+
+
+@given(st.sampled_from(["plain", "packed", "new"]), damages)
+@settings(max_examples=60)
+def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory: pytest.TempPathFactory, kind: str, damage):
+    path = tmp_path_factory.getbasetemp() / f"damaged_{kind}.mat"
+    if kind == "new":
+        newer(path, CONTENT)
+    else:
+        scipy.io.savemat(path, SAMPLES, do_compression=kind == "packed")
+    pad = read_damaged(path, path.read_bytes(), damage, Morphology.load)
+    assert pad is None or np.isfinite(pad.knots).all()
+
+
+def external(file: h5py.File) -> None:
+    file.create_dataset("para", (3, 8), "f8", external=[("/etc/hostname", 0, 192)])
+
+
+def virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout((3, 8), "f8")
+    layout[:] = h5py.VirtualSource("other.h5", "para", (3, 8))
+    file.create_virtual_dataset("para", layout)
+
+
+def linked(file: h5py.File) -> None:
+    file["para"] = h5py.ExternalLink("other.h5", "para")
+
+
+def boasting(file: h5py.File) -> None:
+    file.create_dataset("para", (2**13, 2**13), "f8", chunks=(2**10, 2**10))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (external, "para has its values in other files"),
+        (virtual, "para has its values in other files"),
+        (linked, "has no variable para"),
+        (boasting, "para claims 536870912 bytes of float64 in 0 of the file"),
+    ],
+)
+def test_a_file_of_7_3_is_read_only_where_its_values_lie_in_it(tmp_path: Path, spoil: Callable, message: str) -> None:
+    newer(tmp_path / "other.h5", {"para": CONTENT["para"]})
+    with h5py.File(newer(tmp_path / "new.mat", {"K": {"object_size": 0.6}}), "a") as file:
+        spoil(file)
+    with pytest.raises(InputError, match=rf"new\.mat: {message}"):
         Morphology.load(tmp_path / "new.mat")
 
 

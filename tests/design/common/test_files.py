@@ -1,17 +1,23 @@
-"""Atomic writing, self-describing JSON, and folders for results: one run at a time, nothing left of one that failed."""
+"""Atomic writing, self-describing JSON, folders for results, locks, and what was made from a file."""
 
 import errno
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from design.common.errors import InputError
 from design.common.files import (
     atomic,
+    check_replaceable,
     claimed,
+    find_dependents,
+    locks,
     read_bytes,
     read_json,
     refuse_unwritable,
@@ -37,16 +43,10 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
 
     with pytest.raises(RuntimeError, match="halfway"):
         fail_halfway()
-    assert read_json(path, "x/1") == {"format": "x/1"}
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_nan_is_refused_before_anything_is_replaced(tmp_path):
-    path = tmp_path / "result.json"
-    write_json(path, {"format": "x/1"})
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(path, {"value": float("nan")})
     assert read_json(path, "x/1") == {"format": "x/1"}
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_new_files_have_ordinary_permissions(tmp_path):
@@ -86,18 +86,17 @@ def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
     assert list(tmp_path.iterdir()) == [pipe]
 
 
-def test_a_file_that_is_too_large_is_not_read(tmp_path):
-    path = tmp_path / "large.json"
+def test_what_cannot_be_read_or_written_is_named(tmp_path):
+    path = tmp_path / "file"
     path.write_text("123456")
     assert read_bytes(path, 6) == b"123456"
     with pytest.raises(InputError, match=r"it has 6 bytes, allowed are 5"):
         read_bytes(path, 5)
-
-
-def test_what_the_system_has_against_writing_names_the_file(tmp_path):
-    (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"file/new\.json: cannot be written"):
-        write_json(tmp_path / "file" / "new.json", {})
+        write_json(path / "new.json", {})
+    for taken in (refuse_unwritable, lambda path: claimed(path).__enter__()):
+        with pytest.raises(InputError, match="is a file, expected a folder"):
+            taken(path / "deeper")
 
 
 def test_a_file_within_another_one_is_put_in_place_once(tmp_path):
@@ -111,20 +110,16 @@ def another(folder):
     return subprocess.run([sys.executable, "-c", ANOTHER, folder], capture_output=True, text=True, check=True).stdout
 
 
-def test_one_run_at_a_time_writes_to_a_folder(tmp_path):
+def test_one_run_at_a_time_writes_to_a_folder_and_a_claim_ends_with_its_process(tmp_path):
     folder = tmp_path / "out" / "pad"
     with claimed(folder):
         assert "another run is writing there" in another(folder)
         with pytest.raises(InputError, match="another run is writing there"), claimed(folder):
             pass
-        assert another(tmp_path / "out" / "other") == "in\n"
-    assert another(folder) == "in\n"
-
-
-def test_a_claim_ends_with_its_process(tmp_path):
     code = CLAIM + "import os\nwith claimed(Path(sys.argv[1])): os._exit(9)"
-    assert subprocess.run([sys.executable, "-c", code, tmp_path], check=False).returncode == 9
-    assert another(tmp_path) == "in\n"
+    assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
+    with claimed(folder), claimed(tmp_path / "out" / "other"):
+        pass
 
 
 def test_a_folder_made_for_nothing_goes_again(tmp_path):
@@ -140,56 +135,29 @@ def test_a_folder_made_for_nothing_goes_again(tmp_path):
     assert (tmp_path / "kept").exists()
 
 
-def test_what_is_in_the_way_is_named(tmp_path):
-    (tmp_path / "file").touch()
-    for taken in (refuse_unwritable, lambda path: claimed(path).__enter__()):
-        with pytest.raises(InputError, match="is a file, expected a folder"):
-            taken(tmp_path / "file" / "deeper")
-
-
-def test_staged_files_appear_together_or_not_at_all(tmp_path):
-    def work(fails):
-        with staged(tmp_path / "out") as folder:
-            (folder / "one").write_text("1")
-            if fails:
-                raise KeyError
-            (folder / "two").write_text("2")
-
-    with pytest.raises(KeyError):
-        work(fails=True)
-    assert list((tmp_path / "out").iterdir()) == []
-    work(fails=False)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["one", "two"]
-
-
-def test_a_folder_in_the_way_of_a_staged_file_moves_none(tmp_path):
-    (tmp_path / "two").mkdir()
-    (tmp_path / "one").write_text("old")
-
-    def work():
-        with staged(tmp_path) as folder:
-            for name in ("one", "two"):
-                (folder / name).write_text("new")
-
-    with pytest.raises(InputError, match="two: is a folder, expected a file or nothing"):
-        work()
-    assert (tmp_path / "one").read_text() == "old"
-    (tmp_path / "two").rmdir()
-    work()
-    assert [(tmp_path / name).read_text() for name in ("one", "two")] == ["new", "new"]
-
-
 def replaced(folder, *names, without=(), text="new"):
     with staged(folder, without) as stage:
         for name in names:
             (stage / name).write_text(text)
+            if name == "fails":
+                raise KeyError
 
 
-def test_files_go_as_others_come(tmp_path):
-    for name in ("one", "two", "mine"):
-        (tmp_path / name).write_text("old")
-    replaced(tmp_path, "one", without=["two", "three"])
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"one": "new", "mine": "old"}
+def contents(folder):
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_staged_files_come_together_or_not_at_all_and_others_go_with_them(tmp_path):
+    with pytest.raises(KeyError):
+        replaced(tmp_path / "out", "one", "fails")
+    assert contents(tmp_path / "out") == {}
+    replaced(tmp_path / "out", "one", "two", "mine", text="old")
+    replaced(tmp_path / "out", "one", without=["two", "three"])
+    assert contents(tmp_path / "out") == {"one": "new", "mine": "old"}
+    (tmp_path / "out" / "two").mkdir()
+    with pytest.raises(InputError, match="two: is a folder, expected a file or nothing"):
+        replaced(tmp_path / "out", "mine", "two")
+    assert (tmp_path / "out" / "mine").read_text() == "old"
 
 
 @pytest.mark.parametrize("linked", [True, False])
@@ -209,7 +177,7 @@ def test_what_was_there_is_put_back_where_not_all_can_be_moved(tmp_path, monkeyp
         monkeypatch.setattr(Path, "hardlink_to", lambda path, target: Path(target).rmdir())
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError):
         replaced(tmp_path, "a", "b", "c", "d", without=["mine"])
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(("b", "d", "mine"), "old")
+    assert contents(tmp_path) == dict.fromkeys(("b", "d", "mine"), "old")
 
 
 def test_what_another_run_does_meanwhile_is_no_fault_and_is_put_back(tmp_path, monkeypatch):
@@ -239,20 +207,7 @@ def test_what_another_run_does_meanwhile_is_no_fault_and_is_put_back(tmp_path, m
         monkeypatch.setattr(Path, name, stand_in)
     with pytest.raises(InputError, match="No space left"):
         replaced(tmp_path, "a", "b", without=["gone"])
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"b": "another's", "e": "another's"}
-
-
-@pytest.mark.skipif(os.name != "posix", reason="nobody else can tell that a run is no more")
-def test_what_a_killed_run_has_left_goes_with_the_next_and_nothing_else(tmp_path):
-    code = "import os, sys\nfrom pathlib import Path\nfrom design.common.files import staged\n"
-    code += "with staged(Path(sys.argv[1])) as stage: (stage / 'half').touch(); os._exit(9)"
-    assert subprocess.run([sys.executable, "-c", code, tmp_path], check=False).returncode == 9
-    (tmp_path / ".unfinished-mine").mkdir()
-    assert len(list(tmp_path.iterdir())) == 2
-    with staged(tmp_path) as stage:
-        (stage / "slow").touch()
-        replaced(tmp_path, "one")
-    assert {path.name for path in tmp_path.iterdir()} == {".unfinished-mine", "one", "slow"}
+    assert contents(tmp_path) == {"b": "another's", "e": "another's"}
 
 
 def test_files_are_known_by_their_digests_in_one_folder_only(tmp_path):
@@ -263,3 +218,104 @@ def test_files_are_known_by_their_digests_in_one_folder_only(tmp_path):
     names = ["a", "b", "c", "../a", "/", "", "..", "in", "in/c", str(tmp_path / "a"), "a\0", "a" * 1000, "\ud800"]
     assert unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
     assert unchanged(tmp_path, {"a": None, "c": [1]}) == set()
+
+
+@pytest.fixture
+def windows(monkeypatch):
+    """Bytes are locked by the file they are of, until that is closed; a file may go with its last descriptor."""
+    taken: dict[int, tuple[int, int]] = {}
+
+    def locking(handle, mode, count):
+        about = os.fstat(handle)
+        for other, inode in list(taken.items()):
+            try:
+                alive = (os.fstat(other).st_dev, os.fstat(other).st_ino) == inode
+            except OSError:
+                alive = False
+            if alive and other != handle and inode == (about.st_dev, about.st_ino):
+                raise PermissionError(13, "in use")
+        taken[handle] = (about.st_dev, about.st_ino)
+
+    monkeypatch.setattr(locks, "fcntl", None)
+    monkeypatch.setattr(locks, "LOCKS", False)
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))  # pyright: ignore
+    monkeypatch.setattr(os, "O_TEMPORARY", 0, raising=False)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="it is no stand-in there")
+def test_without_flock_two_runs_do_not_write_into_one_folder(windows, tmp_path):
+    with claimed(tmp_path), pytest.raises(InputError, match="another run is writing there"), claimed(tmp_path):
+        pass
+    with claimed(tmp_path):
+        pass
+
+
+def test_without_flock_a_locked_file_is_read_on_from_where_it_was(windows, tmp_path):
+    (tmp_path / "journal").write_bytes(b"line\n")
+    with (tmp_path / "journal").open("r+b", buffering=0) as first, (tmp_path / "journal").open("rb") as second:
+        first.seek(3)
+        locks.lock(first, "busy")
+        assert first.tell() == 3
+        with pytest.raises(InputError, match="busy"):
+            locks.lock(second, "busy")
+        assert second.read() == b"line\n"
+
+
+PAD = "morphology.json"
+
+
+def document(path: Path, inputs: object = None, **more: object) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    write_json(path, {"format": "padforge-some/1", "provenance": {"command": path.name, "inputs": inputs}, **more})
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A pad with its mould, its recording, and what was learnt from that."""
+    pad = document(tmp_path / PAD, format="padforge-morphology/1")
+    digest = {PAD: sha256(pad)}
+    document(tmp_path / "design.json", morphology_sha256=digest[PAD])
+    document(tmp_path / "fabrication.json", digest)
+    document(tmp_path / "recording" / "start.json", digest)
+    document(tmp_path / "localizer.json", {"recording": "of its readings"})
+    model: dict[str, Any] = json.loads((tmp_path / "localizer.json").read_text())["provenance"]
+    document(tmp_path / "fibre_loss.json", {"recording": "of its readings", "localizer": model})
+    document(tmp_path / "edited.json", digest, format="padforge-morphology/1")
+    document(tmp_path / "contacts.json", {PAD: "of another pad"})
+    return tmp_path
+
+
+def test_dependents_are_found_through_others(folder: Path) -> None:
+    made = ["design.json", "fabrication.json", "fibre_loss.json", "localizer.json", "recording"]
+    assert find_dependents(folder / PAD) == made
+    assert find_dependents(folder / PAD, remade=["design.json", "recording"]) == made[1:4]
+    assert find_dependents(folder / "localizer.json") == ["fibre_loss.json"]
+    assert find_dependents(folder / "edited.json") == find_dependents(folder / "contacts.json") == []
+
+
+@pytest.mark.parametrize(
+    "content", ["", "3", "[]", '{"provenance": 3}', '{"provenance": {"inputs": [1]}}', "[" * 10**5]
+)
+def test_what_else_lies_there_is_passed_over(folder: Path, content: str) -> None:
+    before = find_dependents(folder / PAD)
+    (folder / "other.json").write_text(content)
+    (folder / "folder.json").mkdir()
+    (folder / ".unfinished-set-0").mkdir()
+    document(folder / ".unfinished-set-0" / "start.json", {PAD: sha256(folder / PAD)})
+    assert find_dependents(folder / PAD) == before
+
+
+def test_a_file_that_others_were_made_from_is_replaced_by_force_alone(folder: Path) -> None:
+    other = document(folder / "new" / PAD, ["another"])
+    for by in (other, {"command": "another"}):
+        line = r"morphology.json: fabrication.json, .* and recording were made from it; .* another --out, .* --force$"
+        with pytest.raises(InputError, match=line):
+            check_replaceable(folder / PAD, by, remade=["design.json"])
+        check_replaceable(folder / PAD, by, force=True)
+        check_replaceable(folder / "contacts.json", by)
+        check_replaceable(folder / "none.json", by)
+    same = folder / "new" / PAD
+    same.write_bytes((folder / PAD).read_bytes())
+    check_replaceable(folder / PAD, same)
+    check_replaceable(folder / PAD, {"command": PAD})

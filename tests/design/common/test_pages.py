@@ -1,6 +1,7 @@
-"""Pages of this machine that post: who is heard, and what becomes of what cannot be used."""
+"""Pages of this machine that post: who is heard, and what becomes of the rest; elements of pages: text stays text."""
 
 import json
+import re
 import socket
 import time
 from collections.abc import Iterator, Mapping
@@ -11,6 +12,8 @@ from typing import Any
 import pytest
 
 from design.common.errors import InputError
+from design.common.page.elements import PageSection, html_pieces, table
+from design.common.page.elements import page as whole_page
 from design.common.page.local_page import listening
 from design.common.page.local_page.listening import HOST
 from design.common.page.local_page.local_page import LocalPage
@@ -33,9 +36,13 @@ def page() -> Iterator[LocalPage]:
         yield page
 
 
+def port_of(page: LocalPage) -> int:
+    return int(page.url.split("/")[2].rsplit(":", 1)[1])
+
+
 def posted(page: LocalPage, body: bytes | None, path: str = "/double", **headers: str) -> HTTPResponse:
     """What is answered; by default it is the page that was served that posts."""
-    connection = HTTPConnection(HOST, int(page.url.rstrip("/").rsplit(":", 1)[1]), timeout=10)
+    connection = HTTPConnection(HOST, port_of(page), timeout=10)
     connection.putrequest("POST", path, skip_host="Host" in headers)
     for name, value in ({"Origin": page.url.rstrip("/")} | headers).items():
         connection.putheader(name, value)
@@ -45,57 +52,56 @@ def posted(page: LocalPage, body: bytes | None, path: str = "/double", **headers
     return connection.getresponse()
 
 
-def test_what_is_posted_is_answered(page: LocalPage) -> None:
+def test_what_is_posted_is_answered_and_what_cannot_be_used_is_told_as_text(page: LocalPage) -> None:
     answer = posted(page, b"4")
-    assert (answer.status, answer.headers["Content-Type"], json.loads(answer.read())) == (
-        200,
-        "application/json",
-        {"twice": 8},
-    )
-    assert (posted(page, b"nothing").status, posted(page, b"nothing").read()) == (204, b"")
-
-
-def test_what_cannot_be_used_is_told_as_text(page: LocalPage) -> None:
+    assert (answer.status, answer.headers["Content-Type"]) == (200, "application/json")
+    assert json.loads(answer.read()) == {"twice": 8}
+    answer = posted(page, b"nothing")
+    assert (answer.status, answer.read()) == (204, b"")
     answer = posted(page, b"[")
     assert (answer.status, answer.read()) == (400, b"no <number>")
     assert answer.headers["Content-Type"].startswith("text/plain")
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-def test_only_the_page_itself_is_heard_and_only_where_it_was_agreed(page: LocalPage) -> None:
-    for origin in ("http://elsewhere.example", "null", ""):
-        assert posted(page, b"4", Origin=origin).status == 403
-    assert posted(page, b"4", Host="elsewhere.example", Origin="http://elsewhere.example").status == 403
-    assert posted(page, b"4", "/").status == 404
+ELSEWHERE = "http://elsewhere.example"
 
 
-def test_a_length_is_asked_for_and_kept(page: LocalPage) -> None:
-    assert posted(page, None).status == 411
-    for length in ("-1", "x", "1e3", "1" * 20):
-        assert posted(page, None, **{"Content-Length": length}).status == 411
-    assert posted(page, b"1" * 101).status == 413
-    assert posted(page, b"1" * 3_000_00).status == 413
-    assert posted(page, b"1").status == 200
+@pytest.mark.parametrize(
+    ("body", "path", "headers", "status"),
+    [
+        *((b"4", "/double", {"Origin": origin}, 403) for origin in (ELSEWHERE, "null", "")),
+        (b"4", "/double", {"Origin": ELSEWHERE, "Host": "elsewhere.example"}, 403),
+        (b"4", "/", {}, 404),
+        (None, "/double", {}, 411),
+        *((None, "/double", {"Content-Length": length}, 411) for length in ("-1", "x", "1e3", "1" * 20)),
+        (b"1" * 101, "/double", {}, 413),
+        (b"1" * 300_000, "/double", {}, 413),
+        (b"1" * 100, "/double", {}, 200),
+    ],
+)
+def test_only_the_page_itself_is_heard_where_it_was_agreed_and_no_more_than_that(
+    page: LocalPage, body: bytes | None, path: str, headers: dict[str, str], status: int
+) -> None:
+    assert posted(page, body, path, **headers).status == status
 
 
 def test_with_a_token_only_those_who_know_it_are_answered_by_whatever_name_they_ask() -> None:
     token = "known to few & all"
     with LocalPage(0, PAGE, {"/double": doubled}, 100, host="0.0.0.0", token=token) as page:
         assert page.url.endswith("/?token=known+to+few+%26+all")
-        port = int(page.url.split("/")[2].rsplit(":", 1)[1])
 
         def asked(path: str, **headers: str) -> int:
-            connection = HTTPConnection(HOST, port, timeout=10)
+            connection = HTTPConnection(HOST, port_of(page), timeout=10)
             connection.request("GET", path, headers={"Host": "pad.example"} | headers)
             return connection.getresponse().status
 
         assert asked("/") == asked("/events") == asked("/?token=") == asked("/?token=known+to+few") == 403
         assert asked("/?token=known+to+few+%26+all") == asked("/", Authorization=f"Bearer {token}") == 200
         assert asked("/", Authorization="Bearer another") == 403
-
-
-def port_of(page: LocalPage) -> int:
-    return int(page.url.split("/")[2].rsplit(":", 1)[1])
+    for host, token in (("0.0.0.0", ""), ("::", ""), ("", ""), ("0.0.0.0", "short")):
+        with pytest.raises(InputError, match="token"):
+            LocalPage(0, PAGE, host=host, token=token)
 
 
 def test_an_address_that_is_none_is_refused_in_silence(page: LocalPage, capfd: pytest.CaptureFixture[str]) -> None:
@@ -118,7 +124,7 @@ def test_half_of_what_was_posted_is_not_heard(page: LocalPage) -> None:
 
 def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are shown out however slowly they go on to ask; who was let in is not."""
-    monkeypatch.setattr(listening, "ADMIT_S", 1.0)
+    monkeypatch.setattr(listening, "ADMIT_S", 0.3)
     monkeypatch.setattr(listening, "MOST_CONNECTIONS", 8)
     page.show({"at": 0})
     with ExitStack() as stack:
@@ -136,14 +142,33 @@ def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monk
                     stranger.sendall(b"G")
                 except OSError:
                     strangers.remove(stranger)
-            time.sleep(0.1)
+            time.sleep(0.05)
         assert posted(page, b"1").status == 200
         page.show({"at": 1})
         told = (line for line in events if line.startswith(b"data: "))
         assert [json.loads(next(told)[6:])["at"] for _ in range(2)] == [0, 1]
 
 
-def test_other_machines_are_let_in_only_with_a_token() -> None:
-    for host, token in (("0.0.0.0", ""), ("::", ""), ("", ""), ("0.0.0.0", "short")):
-        with pytest.raises(InputError, match="token"):
-            LocalPage(0, PAGE, host=host, token=token)
+def test_markdown_becomes_headings_lists_tables_and_paragraphs():
+    rows = "| a | b |\n| --- | --- |\n| 1.5 mm | fail |"
+    steps = "1. Stir **well**.\n2. Read `x.json`."
+    head, rows, steps, end = html_pieces(f"# Title\n\n## Mix\n\n{rows}\n\n{steps}\n\nDone.")
+    assert head == "<h3>Mix</h3>"
+    assert rows == table(["a", "b"], [["1.5 mm", "fail"]])
+    assert '<td class="number">1.5 mm</td><td class="fail">fail</td>' in rows
+    assert re.sub(r"\s", "", steps) == ("<ol><li>Stir<strong>well</strong>.</li><li>Read<code>x.json</code>.</li></ol>")
+    assert end.strip() == "<p>Done.</p>"
+
+
+def test_html_and_links_in_markdown_are_text():
+    (piece,) = html_pieces('<img src="x"> [a](javascript:b) ![c](http://d) &lt;')
+    assert piece.strip() == "<p>&lt;img src=&quot;x&quot;&gt; [a](javascript:b) ![c](http://d) &amp;lt;</p>"
+
+
+def test_sections_are_linked_and_their_text_is_escaped():
+    text = whole_page("<b>", "&", [PageSection("A <i> b", [table(["<u>"], [["<s>"]])], [("<1>", "<2>")])])
+    assert not re.search("<[ius12]>", text)
+    assert "<title>&lt;b&gt;</title>" in text
+    assert '<a href="#a-i-b">A &lt;i&gt; b</a>' in text
+    assert '<h2 id="a-i-b">A &lt;i&gt; b</h2>' in text
+    assert '<div class="tile"><b>&lt;1&gt;</b> &lt;2&gt;</div>' in text

@@ -35,7 +35,7 @@ def move(begun, fibre, knot, x_mm, y_mm, gesture=""):
 
 
 def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
-    pad = Morphology.random((2, 3), 4, 1, (9.0, 12.0))
+    pad = Morphology.random((1, 2), 4, 1, (9.0, 12.0))
     _, shown = session(tmp_path, pad)
     assert [view["ready"] for view in shown] == [False, True]
     view = shown[-1]
@@ -43,7 +43,7 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
     assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size), abs=3e-4)
     assert np.mean(view["map"], axis=1) == pytest.approx(view["ambiguity"], abs=1e-4)
-    assert np.array(view["fibres"][4]["knots"]) == pytest.approx(pad.to_mm(pad.knots[4]), abs=1e-4)
+    assert np.array(view["fibres"][2]["knots"]) == pytest.approx(pad.to_mm(pad.knots[2]), abs=1e-4)
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
 
 
@@ -91,6 +91,8 @@ def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
 
 def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
     begun, _ = session(tmp_path, Morphology.random(2, 3, 3))
+    read = sha256(tmp_path / "pad.json")
+    Morphology.straight(2).save(tmp_path / "pad.json")  # what was read counts
     ask(begun, do="add", fibre=1)
     move(begun, 1, 1, -10.0, 2.0)
     saved = begun.save(b"{}")
@@ -99,7 +101,7 @@ def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
     assert pad.to_mm(pad.knots[0])[1] == pytest.approx(saved["fibres"][0]["knots"][1], abs=1e-4)
     assert saved["fibres"][0]["knots"][1][1] == 2.0
     assert pad.provenance["command"] == "padforge design edit"
-    assert list(pad.provenance["inputs"]) == ["pad.json"]
+    assert pad.provenance["inputs"] == {"pad.json": read}
     broken = [str(found) for found in check_rules(pad, RulesSettings())]
     assert [rule["text"] for rule in saved["rules"]] == broken
     checked = CliRunner().invoke(design, ["check", str(tmp_path / "out.json")], catch_exceptions=False)
@@ -107,42 +109,38 @@ def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
     assert (begun.unsaved, ask(begun, do="undo")["unsaved"]) == (False, True)
 
 
+MOVE = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0, "gesture": %s}'
 HOSTILE = (
     *(b"", b"nonsense", b"[]", b"null", b"4", b"[" * 4000, b'{"do":' * 600, b'"\\ud800"', b"\xff\xfe", b"9" * 4000),
     *(b"{}", b'{"do": "shell"}', b'{"do": ["move"]}', b'{"do": "move"}', b'{"do": "remove", "fibre": 1}'),
     *(b'{"do": "remove", "fibre": 1, "knot": %d}' % knot for knot in (-1, 0, 6, 10**30)),
     *(b'{"do": "add", "fibre": %s}' % fibre for fibre in (b"0", b"5", b"1.5", b"true", b"NaN", b'"1"', b"[1]")),
-    *(
-        b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0}' % x_mm
-        for x_mm in (b"NaN", b"Infinity", b"1e999", b"1e7", b'"0"', b"[]", b"true", b"9" * 400)
-    ),
-    b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0, "gesture": "%s"}' % (b"x" * 50),
-    b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0, "gesture": {}}',
+    *(MOVE % (x, b'""') for x in (b"NaN", b"Infinity", b"1e999", b"1e7", b'"0"', b"[]", b"true", b"9" * 400)),
+    *(MOVE % (b"0", gesture) for gesture in (b'"%s"' % (b"x" * 50), b"{}")),
 )
 
 
-@pytest.mark.parametrize("body", HOSTILE, ids=lambda body: repr(body[:40]))
-def test_what_cannot_be_done_changes_nothing(tmp_path, body):
+def test_what_cannot_be_done_changes_nothing(tmp_path):
     begun, shown = session(tmp_path, grid=2)
-    with pytest.raises(InputError) as refused:
-        begun.edit(body)
-    assert len(str(refused.value).splitlines()) == 1
-    assert len(str(refused.value)) < 300
+    for body in HOSTILE:
+        with pytest.raises(InputError) as refused:
+            begun.edit(body)
+        assert len(str(refused.value).splitlines()) == 1, body
+        assert len(str(refused.value)) < 300
     assert len(shown) == 2
     assert ask(begun, do="undo")["fibres"] == shown[1]["fibres"]
 
 
 def test_a_fibre_has_no_more_knots_than_it_may_and_none_where_there_is_no_room(tmp_path):
-    begun, _ = session(tmp_path, grid=1)
-    for _ in range(59):
-        ask(begun, do="add", fibre=1)
-    with pytest.raises(InputError, match="64 knots"):
-        ask(begun, do="add", fibre=1)
-    for _ in range(64):
-        ask(begun, do="remove", fibre=1, knot=1)
+    begun, _ = session(tmp_path, Morphology.straight(1))
+    assert ask(begun, do="add", fibre=1)["at"] == (0, 1)
+    ask(begun, do="remove", fibre=1, knot=1)
     with pytest.raises(InputError, match="no knot"):
         ask(begun, do="remove", fibre=1, knot=1)
-    assert ask(begun, do="add", fibre=1)["at"] == (0, 1)
+    most = Morphology.random(1, 64, 0)
+    full, _ = session(tmp_path, most)
+    with pytest.raises(InputError, match="64 knots"):
+        ask(full, do="add", fibre=1)
 
 
 def test_a_disk_that_refuses_is_told_and_nothing_is_lost(tmp_path):
@@ -165,32 +163,16 @@ def test_what_another_has_saved_meanwhile_stays(tmp_path):
     assert [pad.to_mm(pad.knots[0])[1, 1] for pad in found] == pytest.approx([3.0, 2.0])
 
 
-def test_where_a_pad_came_from_is_the_file_that_was_read(tmp_path):
-    pad = Morphology.random(2, 3, 3)
-    begun, _ = session(tmp_path, pad)
-    read = sha256(tmp_path / "pad.json")
-    Morphology.straight(2).save(tmp_path / "pad.json")
-    begun.save(b"{}")
-    assert Morphology.load(begun.out).provenance["inputs"] == {"pad.json": read}
-
-
-def made_from(path, name="fabrication.json"):
-    write_json(path.parent / name, {"provenance": {"inputs": {path.name: sha256(path)}}})
-
-
-def test_a_pad_that_a_mould_was_made_from_since_stays(tmp_path):
+def test_a_pad_that_a_mould_was_made_from_stays(tmp_path):
+    """One that was saved before, and one that lies there from the beginning."""
     begun, _ = session(tmp_path, Morphology.straight(2))
     begun.save(b"{}")
-    made_from(tmp_path / "out.json")
+    made = {"provenance": {"inputs": {"out.json": sha256(tmp_path / "out.json")}}}
+    write_json(tmp_path / "fabrication.json", made)
     begun.save(b"{}")  # as it is
     before = (tmp_path / "out.json").read_bytes()
     ask(begun, do="add", fibre=1)
     assert begun.save(b"{}")["told"] == f"saved to {tmp_path / 'out-2.json'}"
     assert (tmp_path / "out.json").read_bytes() == before
-
-
-def test_a_pad_that_a_mould_was_made_from_is_not_begun_to_be_replaced(tmp_path):
-    Morphology.straight(2).save(tmp_path / "out.json")
-    made_from(tmp_path / "out.json")
     with pytest.raises(InputError, match=r"out.json: fabrication.json was made from it"):
         session(tmp_path)

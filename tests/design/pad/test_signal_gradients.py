@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import assume, given, settings
 
 from design import Contact, Morphology, signals
 from design.criteria.differentiable import pchip_slopes, press_signals
 from design.pad.contact import fibre_axes
 from design.pad.knots import kernel_ends
 from design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
+from tests.design.pad.wild_pads import SEEDS, wild_contacts, wild_pads
 
 REACH = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))
 CONTACTS = [
@@ -64,12 +66,39 @@ def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(conta
     assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
 
 
-def test_the_torch_function_gives_the_exact_signals():
-    pad = Morphology.random(4, 5, seed=1)
-    presses = np.random.default_rng(1).uniform(1, 4, (20, 2))
-    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
-    found = torch_signals(travel, cross, presses, PUBLISHED_CONTACT).T.numpy()
-    np.testing.assert_allclose(found, signals(pad, presses, PUBLISHED_CONTACT), rtol=1e-12, atol=1e-14)
+@pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[5], CONTACTS[9]], ids=["polygon", "inverse square", "reach"])
+@pytest.mark.parametrize("counts", [(2, 3), (3, 1), (0, 2)])
+def test_the_torch_function_gives_the_exact_signals_and_their_gradient_on_rectangles(contact, counts):
+    pad, rng = Morphology.random(Layout.of(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
+    presses = rng.uniform(0, pad.layout.extent, (20, 2))
+    travel, cross, ends, _ = fibre_axes(pad)
+
+    def found(across):
+        along = torch.tensor(travel[0])
+        return press_signals(along, across, pchip_slopes(along, across), presses, contact, ends, pad.unit_mm)
+
+    across = torch.tensor(cross[0], requires_grad=True)
+    exact = signals(pad, presses, contact)
+    np.testing.assert_allclose(found(across).detach().T, exact, rtol=1e-3, atol=2e-3 * abs(exact).max())
+    upstream, move = torch.tensor(rng.normal(size=exact.T.shape)), torch.tensor(rng.normal(size=across.shape))
+    move[:, [0, -1]] = 0
+    (upstream * found(across)).sum().backward()
+    assert across.grad is not None
+    with torch.no_grad():
+        ahead, behind = ((upstream * found(across + step * move)).sum().item() for step in (1e-6, -1e-6))
+    assert (across.grad * move).sum().item() == pytest.approx((ahead - behind) / 2e-6, rel=2e-3, abs=2e-3)
+
+
+@given(wild_pads((1, 2), (1, 5)), wild_contacts, SEEDS)
+@settings(max_examples=20)
+def test_gradients_on_wild_pads_are_finite(pad, contact, seed):
+    travel, cross, ends, _ = fibre_axes(pad)
+    assume(np.diff(travel).min() > 1e-6)
+    along, across = torch.tensor(travel[0]), torch.tensor(cross[0], requires_grad=True)
+    presses = np.random.default_rng(seed).uniform(0, pad.grid + 1, (3, 2))
+    press_signals(along, across, pchip_slopes(along, across), presses, contact, ends, pad.unit_mm).sum().backward()
+    assert across.grad is not None
+    assert torch.isfinite(across.grad).all()
 
 
 def test_an_untouched_fibre_has_no_gradient_and_grazing_stays_finite():

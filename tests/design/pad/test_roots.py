@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from design.pad.kernels.roots import SCRATCH, roots_in_unit, sort
+from design.pad.kernels.roots import SCRATCH, roots_in_unit
 
 
 def found(coefficients: list[float], tolerance: float = 1e-14) -> list[float]:
@@ -38,8 +38,9 @@ def test_polynomials_of_known_roots(coefficients, roots):
 @given(
     st.sets(st.integers(-20, 40).filter(lambda k: k not in (0, 16)), min_size=1, max_size=6),
     st.booleans(),
-    st.sampled_from([-3.0, 0.5, 1.0]),
+    st.sampled_from([-3.0, 1.0, 1e-12, 1e150]),
 )
+@settings(max_examples=60)
 def test_simple_roots_are_all_found(places, with_pair, factor):
     """Roots at sixteenths, some outside, and a pair that is not real where there is room for it."""
     p = np.poly1d(factor)
@@ -48,18 +49,10 @@ def test_simple_roots_are_all_found(places, with_pair, factor):
     if with_pair and len(places) <= 4:
         p *= np.poly1d([1, -1, 0.3])
     expected = sorted(k / 16 for k in places if 0 < k < 16)
-    assert found(p.coeffs[::-1].tolist()) == pytest.approx(expected, abs=1e-9)
+    assert found(p.coeffs[::-1].tolist(), 1e-14 * abs(factor)) == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_touch_within_the_tolerance_is_no_root():
     touch = [1 / 9 - 1e-13, -2 / 3, 1.0]
     assert len(found(touch, tolerance=0.0)) == 2
     assert found(touch, tolerance=1e-11) == []
-
-
-@given(st.lists(st.floats(-1e9, 1e9), max_size=40), st.integers(0, 40))
-def test_as_many_as_told_are_sorted_and_the_others_stay(values, count):
-    count = min(count, len(values))
-    found = np.array(values, dtype=float)
-    sort(found, count)
-    assert found.tolist() == sorted(values[:count]) + values[count:]

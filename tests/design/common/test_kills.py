@@ -1,8 +1,11 @@
-"""A kill between any two file operations leaves what was there, or what was to come, and nothing that stays."""
+"""A kill between any two file operations leaves what was there, or what was to come, and litter that goes."""
 
+import errno
 import itertools
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +15,16 @@ from design.common.errors import InputError
 from design.common.files import (
     atomic,
     claimed,
+    clear_litter,
     read_bytes,
     resolve_exchange,
+    scratch,
     settle,
     sha256,
     staged,
     unchanged,
+    unfinished_file,
+    write_json,
     write_text,
 )
 from design.common.files.folders import EXCHANGE
@@ -42,6 +49,7 @@ def renewed(folder: Path) -> None:
             (stage / name).write_bytes(b"new")
 
 
+@pytest.mark.slow
 def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> None:
     found = []
     for number in itertools.count():
@@ -59,9 +67,7 @@ def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> N
             break
     assert len(found) > 15
     assert found[0] == OLD
-    assert (
-        sum(found[i] != found[i + 1] for i in range(len(found) - 1)) == 1
-    )  # there is one moment in which they are renewed
+    assert sum(one != other for one, other in itertools.pairwise(found)) == 1  # the moment in which they are renewed
 
 
 def test_the_next_run_clears_up_a_file_that_was_being_written(tmp_path: Path) -> None:
@@ -90,15 +96,23 @@ def test_a_link_is_no_exchange(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "a").read_bytes() == b"another"
 
 
-@pytest.fixture
-def broken_off(tmp_path: Path) -> Path:
-    """A folder in which a run was killed as it was putting its files in place: one of them is, and some are gone."""
-    for number in itertools.count():
-        folder = made(tmp_path / f"out {number}")
+@pytest.fixture(scope="module")
+def midway(tmp_path_factory: pytest.TempPathFactory) -> int:
+    """After how many changes a run is putting its files in place: one of them is, and some are gone."""
+    for number in itertools.count(10):
+        folder = made(tmp_path_factory.mktemp("midway") / "out")
         killed(lambda folder=folder: renewed(folder), number, folder)
         if (folder / "a").read_bytes() != (folder / "b").read_bytes():
-            return folder
+            return number
     raise AssertionError
+
+
+@pytest.fixture
+def broken_off(tmp_path: Path, midway: int) -> Path:
+    """A folder in which a run was killed then."""
+    folder = made(tmp_path / "out")
+    assert killed(lambda: renewed(folder), midway, folder)
+    return folder
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -157,17 +171,17 @@ PLANTED: list[Callable[[Path], object]] = [
 ]
 
 
-@pytest.mark.parametrize("plant", PLANTED)
-def test_what_only_has_the_name_of_an_exchange_is_left_alone(tmp_path: Path, plant: Callable) -> None:
-    folder = made(tmp_path / "out")
-    (folder / EXCHANGE).mkdir()
-    (folder / EXCHANGE / "a").write_bytes(b"planted")
-    plant(folder / EXCHANGE)
-    before = content(folder)
-    for use in (lambda: read_bytes(folder / "a"), lambda: renewed(folder)):
-        with pytest.raises(InputError, match="begun in another folder"):
-            use()
-    assert content(folder) == before
+def test_what_only_has_the_name_of_an_exchange_is_left_alone(tmp_path: Path) -> None:
+    for number, plant in enumerate(PLANTED):
+        folder = made(tmp_path / str(number))
+        (folder / EXCHANGE).mkdir()
+        (folder / EXCHANGE / "a").write_bytes(b"planted")
+        plant(folder / EXCHANGE)
+        before = content(folder)
+        for use in (lambda: read_bytes(folder / "a"), lambda: renewed(folder)):  # noqa: B023
+            with pytest.raises(InputError, match="begun in another folder"):
+                use()
+        assert content(folder) == before
 
 
 def test_the_next_run_puts_in_place_what_it_reads(broken_off: Path) -> None:
@@ -201,3 +215,93 @@ def test_nobody_puts_files_of_another_user_in_place(broken_off: Path, given: str
         with pytest.raises(InputError, match="cannot be written"):
             renewed(broken_off)
     assert content(broken_off) == before
+
+
+NUMBER = "0123456789abcdef"
+FILES = (f".unfinished-{NUMBER}", f".unfinished-{NUMBER}.json", f".unfinished-{NUMBER}.with space")
+FOLDERS = (f".unfinished-set-{NUMBER}",)
+NEAR = (
+    *(".unfinished-", ".unfinished-set-", ".unfinished-notes.txt", f"x.unfinished-{NUMBER}", f"unfinished-{NUMBER}"),
+    *(f".unfinished-{NUMBER[:-1]}.json", f".unfinished-{NUMBER}0.json", f".unfinished-{NUMBER.upper()}.json"),
+    *(f".unfinished-{NUMBER}.tar.gz", f".unfinished-{NUMBER}\n", f".unfinished-set-{NUMBER}.json"),
+    *(f".unfinished-Set-{NUMBER}", f".rec-{NUMBER}", f".recording-{NUMBER}"),
+)
+"""Names like those of litter that are none."""
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def write_one(folder: Path) -> None:
+    write_json(folder / "new.json", {})
+
+
+def write_some(folder: Path) -> None:
+    with staged(folder) as stage:
+        (stage / "new.json").touch()
+
+
+def claim(folder: Path) -> None:
+    with claimed(folder):
+        (folder / "new.json").touch()
+
+
+@pytest.mark.parametrize("work", [write_one, write_some, claim])
+def test_litter_goes_and_what_is_named_nearly_so_stays(tmp_path: Path, work: Callable) -> None:
+    for name in FILES:
+        (tmp_path / name).write_text("half")
+    for name in FOLDERS:
+        (tmp_path / name / "deeper").mkdir(parents=True)
+        (tmp_path / name / "deeper" / "half").touch()
+    for name in NEAR:
+        (tmp_path / name).touch()
+        (tmp_path / f"{name} ").mkdir()
+    near = names(tmp_path) - {*FILES, *FOLDERS}
+    work(tmp_path)
+    assert names(tmp_path) == near | {"new.json"}
+
+
+def test_files_and_folders_are_not_taken_for_each_other_and_links_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "work").touch()
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / FILES[0]).mkdir()
+    (folder / FOLDERS[0]).touch()
+    (folder / f".unfinished-{NUMBER[::-1]}").symlink_to(tmp_path / "mine" / "work")
+    (folder / f".unfinished-set-{NUMBER[::-1]}").symlink_to(tmp_path / "mine")
+    os.mkfifo(folder / f".unfinished-{NUMBER[::-1]}.pipe")
+    before = names(folder)
+    clear_litter(folder)
+    assert names(folder) == before
+    (folder / f".unfinished-set-{NUMBER[1:]}0").mkdir()
+    (folder / f".unfinished-set-{NUMBER[1:]}0" / "link").symlink_to(tmp_path / "mine")
+    clear_litter(folder)
+    assert names(folder) == before
+    assert names(tmp_path / "mine") == {"work"}
+
+
+def test_what_somebody_is_at_work_with_stays(tmp_path: Path) -> None:
+    with scratch(tmp_path), unfinished_file(tmp_path, ".json"), atomic(tmp_path / "a.txt"):
+        at_work = names(tmp_path)
+        assert len(at_work) == 3
+        clear_litter(tmp_path)
+        another = "import sys, pathlib, design.common.files as f; f.clear_litter(pathlib.Path(sys.argv[1]))"
+        subprocess.run([sys.executable, "-c", another, tmp_path], check=True)
+        assert names(tmp_path) == at_work
+    assert names(tmp_path) == {"a.txt"}
+
+
+def test_what_is_another_ones_stays_and_all_where_there_are_no_locks(tmp_path: Path, monkeypatch) -> None:
+    def none_here(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    (tmp_path / FILES[0]).touch()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+        clear_litter(tmp_path)
+    assert names(tmp_path) == {FILES[0]}
+    monkeypatch.setattr("fcntl.flock", none_here)
+    claim(tmp_path)
+    assert names(tmp_path) == {FILES[0], "new.json"}

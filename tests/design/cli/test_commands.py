@@ -1,0 +1,192 @@
+"""Commands of design: where their results go, pads designed for a twin, and plans as pictures."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.patches import Circle, Polygon
+
+from design import Contact, InputError, Morphology, SearchRun, Spec, Twin, draw_plan, score, search
+from design.cli.main import design
+from design.common.files import sha256
+from design.common.settings import commented_toml
+from design.criteria.score import AMBIGUITY_NOISE, ambiguities
+from design.evaluation.expected_error import error_terms, expected_errors, straight_full_scale
+from design.optimisers.twin_search import state_folders
+from design.pad.twin import Frame, TwinChannel, TwinScatter
+from design.report.files import found_before, search_lines
+from design.report.twin_settings import settings_for_twin
+from design.settings import PadSettings, SearchSettings
+
+QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
+QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def designed(*arguments, spec):
+    """What `padforge design` says in this folder, and its design.json."""
+    Path("pad.toml").write_text(spec)
+    ended = CliRunner().invoke(design, [str(each) for each in arguments], catch_exceptions=False)
+    assert ended.exit_code in (0, 1)
+    return ended.output.splitlines(), json.loads(Path("out/pad/design.json").read_text())
+
+
+def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_read_again(here):
+    told, document = designed(spec=QUICK)
+    pad, asked = Morphology.straight(2), {"lost": 1, "size": PadSettings(grid=2)}
+    straight = [
+        *expected_errors(pad, Contact(), SearchSettings(lost=1), asked["size"]),
+        *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
+    ]
+    assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
+    assert set(document["straight"]) == {name for name in document["terms"] if "_lost_" in name}
+    result = found_before(Path("out/pad"))
+    assert result is not None
+    assert (result.terms, result.straight) == (document["terms"], document["straight"])
+    assert document["found_by"] == result.found_by == "straight fibres"
+    assert search_lines(result, Path("out/pad"))[1:] == told[1:]
+    first, second = (11.25 * value for value in straight[:2])
+    assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 fibres failed")
+    assert told[3:] == [
+        "  these are straight fibres: nothing better was found; more steps or time may find it",
+        "  all rules hold",
+    ]
+    terms = {name: value / 2 if name.startswith("expected_error") else value for name, value in result.terms.items()}
+    better = search_lines(replace(result, terms=terms, found_by="start 1"), Path("out/pad"))
+    assert better[1].startswith(f"  expected error {first / 2:.2f} / {second / 2:.2f} mm with 0 / 1 fibres failed")
+    assert better[2].split() == f"{first:.2f} / {second:.2f} mm with straight fibres".split()
+    alike = search_lines(replace(result, found_by="start 1"), Path("out/pad"))
+    assert alike[3] == "  no better than straight fibres, as far as such figures tell, with 0, 1 failed"
+    wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
+    for change in wrong:
+        Path("out/pad/design.json").write_text(json.dumps(document | change))
+        with pytest.raises(InputError, match="not as padforge writes it"):
+            found_before(Path("out/pad"))
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    """Of a pad of grid 2 and pitch 10 mm, pressed somewhat beyond its outer fibres."""
+    path = tmp_path_factory.mktemp("twin") / "twin.json"
+    gains = enumerate(((2, 0.1), (0, -0.1), (1, 0.4)))
+    channels = tuple(TwinChannel(channel, fibre, gain, abs(gain) / 5, 0.9) for channel, (fibre, gain) in gains)
+    reach = np.array([0.0, 2, 5, 8, 11, 15]), np.array([1, 0.95, 0.6, 0.25, 0.05, 0])
+    line = np.array([[-15.0, -5], [15, -5]])
+    laid = (line, line, line[:, ::-1], None)
+    known = Frame(), *reach, laid, 0.03, (18.0, 31.5), 500
+    Twin(Morphology.straight(2, 10.0), channels, *known, scatter=TwinScatter(0.05, 0.5, 0.8)).save(path)
+    return path
+
+
+def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_stated(here, twin):
+    """Of the rectangle what lies on the pad; the defaults of a contact that are written out contradict none."""
+    Path("pad.toml").write_text(QUICK_SEARCH + commented_toml({"contact": Contact}))
+    spec, contact = settings_for_twin(Spec.load(Path("pad.toml")), twin), Twin.load(twin).contact()
+    assert spec.section(Contact) == contact
+    used, pad = spec.section(SearchSettings), spec.section(PadSettings)
+    scale = straight_full_scale(Morphology.straight(2, 10.0).layout, contact, "beyond")
+    assert (used.noise, used.scatter, used.scatter_common) == (pytest.approx(0.8 * 0.02 / (0.1 * scale)), 0.05, 0.5)
+    assert (used.knots, pad.grid, pad.pitch_mm, pad.sensed_mm) == (2, 2, 10, (18, 30))
+    wider = settings_for_twin(Spec({"pad": {"pitch_mm": 20.0}}), twin)
+    assert wider.section(Contact).reach[-1] == (15, 0)
+    assert (wider.section(PadSettings).pitch_mm, wider.section(PadSettings).sensed_mm) == (20, (18, 31.5))
+    Morphology.straight(2, 10.0).save(here / "pad.json")
+    scored = CliRunner().invoke(design, ["score", "pad.json", "--twin", str(twin)], catch_exceptions=False)
+    terms = judged(Morphology.straight(2, 10.0), contact, used.noise)
+    assert json.loads(scored.output)["terms"] == pytest.approx(terms, rel=1e-9)
+
+
+def judged(pad, contact, noise):
+    """What a pad scores and errs for the contact and noise of the twin."""
+    asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
+    settings = SearchSettings(lost=1, noise=noise, scatter=0.05, scatter_common=0.5)
+    return score(pad, contact, **asked) | error_terms(expected_errors(pad, contact, settings, asked["size"]))
+
+
+@pytest.mark.slow
+def test_a_pad_is_designed_for_the_twin_of_a_printed_one(here, twin):
+    _, document = designed("--twin", twin, spec=QUICK_SEARCH)
+    used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
+    assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
+    assert document["found_by"] in ("twin", "from usual", "usual", "straight fibres")
+    assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
+    pad = Morphology.load("out/pad/morphology.json")
+    assert document["terms"] == pytest.approx(judged(pad, contact, used["search"]["noise"]), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ("[contact]\nradius = 0.9\n", r"pad\.toml: \[contact\] is given beside .*twin\.json.*; leave one out"),
+        ("[pad]\ngrid = 4\n", r"pad\.toml: \[pad\] asks for 4 \+ 4 fibres, .*, but .*twin\.json is of a pad of 2 \+ 2"),
+        ("[pad]\ngrid = 0\n", r"grid"),
+        ("", "none.json"),
+        ("", "other.json"),
+    ],
+)
+def test_settings_that_contradict_a_twin_and_files_that_are_none_are_refused(here, twin, stated, message):
+    Morphology.straight(2).save(here / "other.json")
+    with pytest.raises(InputError, match=message):
+        designed("--twin", twin if stated else message, spec=QUICK_SEARCH + stated)
+
+
+@pytest.mark.slow
+def test_a_search_for_a_twin_is_resumed(here, twin):
+    long = QUICK_SEARCH.replace("steps = 3", "steps = 20")
+    _, whole = designed("--twin", twin, spec=long)
+
+    def stop(*step):
+        raise SystemError
+
+    spec = settings_for_twin(Spec.load(Path("pad.toml")), twin)
+    pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
+    begun = state_folders(Path("out/pad/search"))["twin"]
+    with pytest.raises(SystemError):
+        search(pad, contact, settings, run=SearchRun(stop, begun))
+    assert list(begun.glob("start_*.npz"))
+    _, resumed = designed("--twin", twin, "--resume", spec=long)
+    assert resumed["terms"] == whole["terms"]
+    assert not list(Path("out/pad").glob("search*"))
+
+
+def test_the_plan_goes_to_the_folder_of_the_pad_unless_told_otherwise(here):
+    Morphology.straight(2).save(here / "pad" / "morphology.json")
+    shown = CliRunner().invoke(design, ["show", "pad/morphology.json"], catch_exceptions=False)
+    assert shown.output == "plan -> pad/plan.svg\n"
+    assert Path("pad/plan.svg").exists()
+    CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.png"], catch_exceptions=False)
+    assert Path("a.png").exists()
+    with pytest.raises(InputError, match=r"--out is a\.pdf, allowed are \.svg and \.png"):
+        CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.pdf"], catch_exceptions=False)
+
+
+def test_rules_that_cannot_be_are_told_before_an_import_writes_anything(here):
+    Path("plan.svg").touch()
+    Path("pad.toml").write_text("[pad]\ngrid = 2\n[rules]\nlost = 1\n")
+    with pytest.raises(InputError, match=r"\[rules\] lost: no such key"):
+        CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
+    assert sorted(path.name for path in here.iterdir()) == ["pad.toml", "plan.svg"]
+
+
+@pytest.mark.parametrize("pitch_mm", [5.0, (20.0, 8.0)])
+def test_a_plan_shows_keep_outs_as_stated_and_to_where_half_of_the_contact_is_felt_in_mm(pitch_mm):
+    holes = [((-3.0, 1.0), (2.0, 1.0), (0.0, 4.0)), [[5, 5], [6, 5], [6, 6], [5, 6]]]
+    patches = draw_plan(Morphology.straight(2, pitch_mm), Contact(), (), holes).axes[0].patches
+    drawn = [patch.get_xy()[:-1].tolist() for patch in patches if isinstance(patch, Polygon)]
+    assert drawn == [np.array(hole).tolist() for hole in holes]
+    (press,) = (patch for patch in patches if isinstance(patch, Circle))
+    assert press.radius == pytest.approx(np.sqrt(2 * np.log(2)) * 6.2, rel=0.01)
+
+
+@pytest.mark.parametrize("holes", [4, None, "ab", [3], [[1.0, 2.0]], [[]], [[(0, 0), (1, np.nan)]], np.ones((1, 3, 2))])
+def test_a_plan_of_keep_outs_that_are_no_polygons_is_refused_in_one_line(holes):
+    with pytest.raises(InputError, match="keep_out_mm"):
+        draw_plan(Morphology.straight(2), Contact(), (), holes)

@@ -1,0 +1,301 @@
+"""Drawings as pads: our own come back, others are placed and read, and what is none is told in one line."""
+
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from click.testing import CliRunner
+from ezdxf import new, units  # pyright: ignore[reportPrivateImportUsage]
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from design import Contact, InputError, Morphology, PadSettings, draw_plan, flatten
+from design.cli.main import design
+from design.common.figures import save_figure
+from design.pad.courses.drawings.plan import import_plan
+from design.settings import Layout
+from fabricate import Plan
+from fabricate.report.track_drawings import tracks_dxf
+from tests.design.pad.damage import damages, read_damaged
+
+LAYOUT = Layout.of((2, 3), (10.0, 12.0))
+"""40 by 36 mm: ends of horizontals at y = -6 and 6, of verticals at x = -10, 0 and 10."""
+WAYS = (
+    *(f"M -20 {y} C -10 {y - 9} 10 {y + 9} 20 {y}" for y in (-6, 6)),
+    *(f"M {x} -18 C {x - 6} -6 {x + 6} 6 {x} 18" for x in (-10, 0, 10)),
+)
+
+
+HEAD = 'viewBox="-20 -18 40 36" width="40mm" height="36mm"'
+FIRST = 'viewBox="0 0 40 36" width="40mm" height="36mm"'
+
+
+def svg(tmp_path: Path, *parts: str, head: str = HEAD) -> Path:
+    path = tmp_path / "plan.svg"
+    link = 'xmlns:xlink="http://www.w3.org/1999/xlink"'
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {link} {head}>{"".join(parts)}</svg>')
+    return path
+
+
+def paths(*ways: str) -> str:
+    return "".join(f'<path id="w{number}" d="{way}"/>' for number, way in enumerate(ways))
+
+
+PATHS = paths(*WAYS)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Morphology:
+    """What the paths are."""
+    return import_plan(svg(tmp_path_factory.mktemp("plain"), PATHS), LAYOUT, 0.4).pad
+
+
+def apart(one: Morphology, other: Morphology) -> float:
+    """Greatest distance of fibres, mm."""
+    lines = ([shapely.LineString(pad.to_mm(line)) for line in flatten(pad, 1e-5)] for pad in (one, other))
+    return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
+
+
+def test_curves_become_fibres(tmp_path: Path) -> None:
+    plain = import_plan(svg(tmp_path, PATHS), LAYOUT, 0.05).pad
+    assert plain.to_mm(flatten(plain, 1e-4)[1])[0] == pytest.approx([-20, 6])  # y of an SVG goes down
+    t = np.linspace(0, 1, 200)[:, None]
+    a, b, c, d = np.array([[-20, -6], [-10, -15], [10, 3], [20, -6]]) * [1, -1]
+    drawn = (1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d
+    upper = shapely.LineString(plain.to_mm(flatten(plain, 1e-4)[1]))
+    assert shapely.distance(shapely.points(drawn), upper).max() < 0.06
+
+
+@pytest.mark.parametrize(
+    ("drawn", "head"),
+    [
+        (PATHS, 'viewBox="-20 -18 40 36" width="4cm" height="3.6cm"'),
+        (PATHS, 'viewBox="-20 -18 40 36" width="1.5748031in" height="1.4173228in"'),
+        (f'<g transform="translate(7 3) rotate(90) rotate(-90) matrix(1 0 0 1 -7 -3)">{PATHS}</g>', HEAD),
+        (f'<g transform="scale(2 .5)"><g transform="scale(.5,2)">{PATHS}</g></g>', HEAD),
+        (f'<defs><g id="all">{PATHS}</g></defs><use href="#all"/>', HEAD),
+        (f'<symbol id="all">{PATHS}</symbol><use xlink:href="#all" x="0" y="0"/>', HEAD),
+        (f'<g transform="translate(20 18)">{PATHS}</g>', FIRST),
+        (f'<g transform="translate(500 80)">{PATHS}</g>', FIRST),
+        (f'<rect id="pad" x="-20" y="-18" width="40" height="36"/>{PATHS}', 'viewBox="0 0 9 9"'),
+        (f'<path d="M -20 0 H 20"/><g id="fibres">{PATHS}</g>', HEAD),
+        (f'<svg x="-20" y="-18" width="40" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (f'{PATHS}<circle r="3"/><text>no fibre</text><path d="M0 0L1 0L1 1Z"/>', HEAD),
+        (paths(*(re.sub("M -20 (-?6)", r"M -25 \1 L -20 \1", way) for way in WAYS)), HEAD),  # they begin outside
+        (f'{PATHS}<path style="display: none" d="M0 0L1 1"/>', HEAD),
+    ],
+)
+def test_it_is_read_as_it_is_drawn(tmp_path: Path, plain: Morphology, drawn: str, head: str) -> None:
+    assert apart(import_plan(svg(tmp_path, drawn, head=head), LAYOUT, 0.4).pad, plain) < 0.02
+
+
+def test_pieces_are_put_together(tmp_path: Path) -> None:
+    parts = [
+        '<polyline points="-20,-6 -5,-8"/><line x1="5" y1="-4" x2="-5" y2="-8"/><path d="M5-4 20-6"/>',
+        '<line x1="-20" y1="6" x2="20" y2="6"/>',
+        *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
+    ]
+    found = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
+    assert found.fibres[1].off_mm < 0.05
+    assert "to" in found.fibres[1].name
+
+
+def test_ends_are_put_right_within_the_tolerance_and_said(tmp_path: Path) -> None:
+    ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
+    found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
+    assert found.fibres[1].moved_mm == pytest.approx(0.03)
+    with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
+        import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
+    assert "--tolerance-mm" in str(told.value)
+
+
+def instead(way: str) -> str:
+    """Paths of which the upper horizontal is another."""
+    return paths(way, *WAYS[1:])
+
+
+REFUSED = [
+    ("", "no open curve"),
+    (paths(*WAYS[1:]).replace("w0", "w4"), "no curve is horizontal 2"),
+    (f'{PATHS}<path id="again" d="M-20-6.01 20-6.01"/>', "w0 and again: both are horizontal 2"),
+    (instead(WAYS[0].replace("-10 -15", "60 -15")), r"w0: (turns back|goes beyond)"),
+    (instead("M -20 -6 C 30 0 -30 0 20 -6"), r"w0: turns back at \(.*\) mm, expected .* along x"),
+    (instead("M -20 -6 L 0 -40 L 20 -6"), r"w0: leaves the pad at"),
+    (instead("M -20 -6 L 0 -6 L 0 -9 L 20 -9"), r"w0: runs from"),
+    (instead("M -20 -3 L 20 -3"), r"w0: runs from \(-20.0, 3.0\) mm to \(20.0, 3.0\) mm, 3 mm from"),
+    (f'<g id="fibres"><path id="x" d="M0 0L1 0L1 1Z"/></g>{PATHS}', "x: closed"),
+    ('<rect id="pad" width="1" height="7"/>' + PATHS, "pad is drawn 1 by 7, expected the shape of 40 by 36"),
+    (PATHS + "".join(f'<line x1="-20" y1="-6" x2="{x}" y2="0"/>' for x in (-18, -17)), "more than two"),
+    ('<path id="x" d="M 0 0 L 1"/>', "x: no path that can be read"),
+    *(
+        (f'<path id="x" transform="{wrong}" d="M 0 0 L 1 1"/>', "x: transform")
+        for wrong in ("turn(3)", "scale(", "rotate(1e999)")
+    ),
+    ('<g transform="scale(1e200)"><path id="x" transform="scale(1e200)" d="M 0 0C1 1 2 2 3 3"/></g>', "x: coord"),
+    (f'<path id="x" d="M 0 0 C {"9" * 300} 1 2 2 1e300 3 A 1e200 1 9 0 1 1e9 2"/>', "x: (coord|no path)"),
+    ('<line id="x" x1="5%" x2="1" y2="2"/>', "x: x1 is '5%', expected a length"),
+    ('<line id="x" x1="1e308" x2="1" y2="2" transform="scale(1e308)"/>', "x: coordinates"),
+    ('<path id="x" d="M 0 0 L 1e999 1"/>', "x: coordinates"),
+    ('<path id="x" d="M 0 0 L 9e9 1"/>', "x: coordinates"),
+    ('<use id="x" href="#x"/>', "x: <use> of <use>"),
+    ('<g id="a"><use href="#b"/></g><g id="b"><use href="#a"/><use href="#a"/></g>', "<use>|elements"),
+    ('<path d="M0 0' + "L1 1L2 1" * 101_000 + '"/>', "points"),
+    ("<g>" * 5000 + "</g>" * 5000, "not an SVG file that can be read"),
+    ("<g/>" * 21_000, "elements"),
+    (f'<rect x="1{" " * 200_000}!"/>', "x is .* expected a length"),
+    (f'<g transform="{" " * 200_000}!"/>', "transform is .* expected such as"),
+    (f'<g transform="{"scale(1)" * 20_000} "/>', "no open curve"),
+    ('<path d="M0 0L1 1"/>' * 5100, "5100 open curves"),
+    (PATHS + "".join(f'<path d="M{k} 0L{k + 0.5} 1"/>' for k in range(50)), "55 open curves, expected 5, one a fibre"),
+]
+
+
+@pytest.mark.parametrize(("drawn", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_what_is_no_plan_is_refused_in_one_line_and_soon(tmp_path: Path, drawn: str, message: str) -> None:
+    begin = time.process_time()
+    with pytest.raises(InputError, match=message) as refused:
+        import_plan(svg(tmp_path, drawn), LAYOUT, 0.05)
+    assert str(refused.value).startswith(str(tmp_path / "plan.svg"))
+    assert len(str(refused.value)) < 500
+    assert time.process_time() - begin < 8
+
+
+BOMB = """<?xml version="1.0"?><!DOCTYPE svg [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>
+<svg xmlns="http://www.w3.org/2000/svg"><text>&b;</text></svg>"""
+FETCH = """<?xml version="1.0"?><!DOCTYPE svg SYSTEM "http://127.0.0.1:1/x.dtd" [<!ENTITY a SYSTEM "file:///etc/passwd">]>
+<svg xmlns="http://www.w3.org/2000/svg"><path id="&a;" d="M0 0L1 1"/></svg>"""
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"nonsense", b"<svg", b"<html/>", b"\x00" * 99, b"  0\nSECTION\n", b"  0\nSECTION\n  2\nHEADER\n"),
+        *(BOMB.encode(), FETCH.encode(), BOMB.encode("utf-16")),
+    ],
+    ids=lambda content: repr(content[:20]),
+)
+def test_hostile_files_are_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    for name in ("plan.svg", "plan.dxf"):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=re.escape(str(path))) as refused:
+            import_plan(path, LAYOUT, 0.05)
+        assert "root:" not in str(refused.value)
+    with pytest.raises(InputError, match=r"allowed are \.svg and \.dxf"):
+        import_plan(tmp_path / "plan.pdf", LAYOUT, 0.05)
+
+
+def test_what_another_file_would_have_to_declare_draws_nothing(tmp_path: Path) -> None:
+    path = svg(tmp_path, f"&a;{PATHS[:-2]}/>&b;")
+    path.write_text('<!DOCTYPE svg SYSTEM "svg11.dtd">' + path.read_text())
+    assert len(import_plan(path, LAYOUT, 0.05).fibres) == 5
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder, pad = tmp_path_factory.mktemp("drawn"), Morphology.random(1, 2, seed=0)
+    save_figure(draw_plan(pad, Contact()), folder / "damaged.svg")
+    (folder / "damaged.dxf").write_text(tracks_dxf(Plan(pad)), encoding="utf-8")
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@given(st.sampled_from(["damaged.svg", "damaged.dxf"]), damages)
+@settings(max_examples=20)
+def test_a_damaged_drawing_is_read_or_refused_in_one_line(drawn, tmp_path_factory, name, damage) -> None:
+    layout, path = Layout.of(1), tmp_path_factory.getbasetemp() / name
+    found = read_damaged(path, drawn[name], damage, lambda path: import_plan(path, layout, 0.5))
+    assert found is None or np.isfinite(found.pad.knots).all()
+
+
+def dxf(tmp_path: Path, draw) -> Path:
+    document = new(units=units.MM)  # pyright: ignore[reportPrivateImportUsage]
+    space = document.modelspace()
+    draw(space)
+    document.saveas(tmp_path / "plan.dxf")
+    return tmp_path / "plan.dxf"
+
+
+def straight_ones(space) -> None:
+    space.add_lwpolyline([(-20, 6), (20, 6)])
+    for x in (-10, 0, 10):
+        space.add_line((x, -18), (x, 18))
+
+
+def several(space) -> None:
+    space.add_line((-20, -6), (-5, -6))
+    space.add_arc((0, -6), 5, 0, 180)
+    space.add_polyline2d([(5, -6), (20, -6)])
+    space.add_circle((0, 0), 3)
+    space.add_text("no fibre")
+
+
+@pytest.mark.parametrize(
+    ("draw", "middle_mm"),
+    [
+        (several, -1.0),  # over the top of the arc
+        (lambda space: space.add_lwpolyline([(-20, -6, 0.1), (20, -6, 0)], format="xyb"), -8.0),  # a bulge
+        (lambda space: space.add_spline([(-20, -6), (0, -9), (20, -6)]), -9.0),
+    ],
+)
+def test_a_dxf_of_all_kinds_is_read(tmp_path: Path, draw, middle_mm: float) -> None:
+    found = import_plan(dxf(tmp_path, lambda space: (straight_ones(space), draw(space))), LAYOUT, 0.05)
+    assert all(fibre.off_mm < 0.06 for fibre in found.fibres)
+    line = found.pad.to_mm(flatten(found.pad, 1e-4)[0])
+    assert np.interp(0, *line.T) == pytest.approx(middle_mm, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda space: space.add_line((float("nan"), 0), (1, 1)),
+        lambda space: space.add_line((1e300, 0), (1, 1)),
+        lambda space: space.add_arc((0, 0), 1e200, 0, 90),
+        lambda space: space.add_spline([(0, 0), (1e18, 1), (3, 3)]),
+        pytest.param(lambda space: space.add_lwpolyline([(k, k % 7) for k in range(50_000)]), marks=pytest.mark.slow),
+        lambda space: space.add_lwpolyline([(0, 0, 1e300), (1, 1, 0)], format="xyb"),
+        pytest.param(lambda space: [space.add_line((k, 0), (k, 1)) for k in range(21_000)], marks=pytest.mark.slow),
+        lambda space: space.doc.header.__setitem__("$INSUNITS", 99),
+    ],
+)
+def test_hostile_dxf_is_told_in_one_line(tmp_path: Path, draw) -> None:
+    begin = time.process_time()
+    with pytest.raises(InputError) as refused:
+        import_plan(dxf(tmp_path, draw), LAYOUT, 0.05)
+    assert len(str(refused.value)) < 500
+    assert time.process_time() - begin < 10
+
+
+def test_our_own_plan_comes_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    courses = Morphology.random(LAYOUT, 4, rng).knots.copy()
+    for fibre, line in enumerate(courses):  # not as steep as random ones are
+        axis = LAYOUT.family(fibre)
+        line[:, axis] = np.linspace(0, LAYOUT.extent[axis], 6)
+        line[1:-1, 1 - axis] = LAYOUT.levels[fibre] + rng.uniform(-0.4, 0.4, 4)
+    pad = Morphology.of_layout(courses, LAYOUT)
+    save_figure(draw_plan(pad, Contact(), (), PadSettings().of(LAYOUT).keep_out_mm), tmp_path / "plan.svg")
+    found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
+    assert apart(found.pad, pad) < 0.08
+    assert found.pad.knots.shape[1] <= 6 + 3
+    assert found.placed == "the border is that named pad"
+
+
+def test_the_command_writes_a_morphology_and_tells_of_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    stated = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_bend_radius_mm = 0\n"
+    Path("pad.toml").write_text(stated)
+    svg(tmp_path, PATHS)
+    ended = CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
+    assert ended.exit_code == 0, ended.output
+    lines = ended.output.splitlines()
+    assert lines[0].startswith("import: 5 fibres of ")
+    assert lines[-1] == "  all rules hold"
+    assert re.fullmatch(r"  fibre 1: w1, within 0\.0\d+ mm", lines[2])
+    pad = Morphology.load(tmp_path / "out/plan/morphology.json")
+    assert pad.provenance["command"] == "padforge design import"
+    assert list(pad.provenance["inputs"]) == ["plan.svg"]
+    Path("pad.toml").write_text(stated + "max_length_mm = 38\n")
+    assert CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False).exit_code == 1

@@ -1,0 +1,311 @@
+"""Exact signals against adaptive quadrature between independently found crossings, closed forms and hard geometry."""
+
+import warnings
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
+
+from design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
+from design.pad.contact import fibre_axes, signals_and_spans
+from design.pad.knots import assemble
+from design.settings import PUBLISHED_CONTACT, Layout
+from tests.design.pad.wild_pads import (
+    KINDS,
+    LENGTHS,
+    SEEDS,
+    WEIGHTS,
+    longest_signals,
+    mirrored,
+    transposed,
+    wild_contacts,
+    wild_knots,
+    wild_pads,
+    wild_presses,
+)
+
+
+def root(function, low, high):
+    found = brentq(function, low, high, xtol=1e-15)
+    assert isinstance(found, float)
+    return found
+
+
+def oracle(pad, press, contact, fibre):
+    """One signal: crossings by sign changes on a dense sample and bisection, then SciPy's adaptive quadrature."""
+    axis = pad.layout.family(fibre)
+    knots, radius = pad.knots[fibre], contact.radius
+    curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
+    slope = curve.derivative()
+    sides = contact.sides or 3
+    normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
+    directions, apothem = np.column_stack([np.cos(normal), np.sin(normal)]), radius * np.cos(np.pi / sides)
+
+    def away(t):
+        v = curve(t)
+        x, y = (t, v) if axis == 0 else (v, t)
+        return np.stack([x - press[0], y - press[1]], axis=-1)
+
+    def outside(t):
+        if contact.sides:
+            return (away(t) @ directions.T).max(axis=-1) - apothem
+        return np.linalg.norm(away(t), axis=-1) - radius
+
+    def density(t):
+        d = np.linalg.norm(away(t))
+        weight = {"uniform": 1, "inverse_square": 1 / (radius + d**2), "inverse": 1 / max(d, radius / 100)}
+        run = 1 + abs(slope(t)) if contact.length == "manhattan" else np.hypot(1, slope(t))
+        return weight[contact.weight] * run
+
+    total = 0.0
+    for begin, end in pairwise(knots[:, axis]):
+        low, high = max(begin, press[axis] - radius), min(end, press[axis] + radius)
+        if high <= low:
+            continue
+        at = np.linspace(low, high, 1500)
+        sign = np.sign(outside(at))
+        turns = np.flatnonzero(sign[:-1] * sign[1:] < 0)
+        for a, b in pairwise([low, *(root(outside, at[i], at[i + 1]) for i in turns), high]):
+            if outside((a + b) / 2) > 0:
+                continue
+            if contact.weight == "uniform" and contact.length == "manhattan":
+                total += b - a + abs(curve(b) - curve(a))
+            else:
+                pieces = pairwise(np.linspace(a, b, 9))
+                total += sum(quad(density, *piece, epsabs=1e-13, epsrel=1e-12, limit=200)[0] for piece in pieces)
+    return total
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+@pytest.mark.parametrize("length", LENGTHS)
+@pytest.mark.parametrize("sides", [None, 3, 30, *(pytest.param(sides, marks=pytest.mark.slow) for sides in (4, 7, 64))])
+def test_exact_signals_equal_the_oracle(weight, length, sides):
+    contact = Contact(radius=0.7, sides=sides, weight=weight, length=length)
+    plain = weight == "uniform" and length == "manhattan"
+    for knots, layout in (
+        (0, Layout.of(1)),
+        (5, Layout.of((2, 1), (5.0, 30.0))),
+        (20, Layout.of((1, 2), (10.0, 10.0))),
+    ):
+        rng = np.random.default_rng([knots, sides or 0])
+        pad = Morphology.random(layout, knots, rng)
+        presses = rng.uniform(0.2, np.array(layout.extent) - 0.2, (1, 2))
+        found = signals(pad, presses, contact)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            expected = [[oracle(pad, press, contact, fibre) for fibre in range(layout.fibres)] for press in presses]
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=4e-12 if plain else 1e-10)
+
+
+def test_exact_signals_of_published_pads_are_the_limit_of_the_sampled_ones(published):
+    presses = np.random.default_rng(0).uniform(0.5, 4.5, (4, 2))
+    for name in ("1para", "20para"):
+        pad = Morphology.load(published / f"{name}.mat")
+        true = signals(pad, presses, PUBLISHED_CONTACT)
+        errors = [np.abs(signals_quantized(pad, presses, samples=n) - true).max() for n in (2_000, 200_000)]
+        assert errors[1] < errors[0] / 20
+
+
+@given(wild_pads((1, 4), (0, 10)), wild_contacts, SEEDS)
+@settings(max_examples=30)
+def test_signals_on_wild_pads_lie_between_nothing_and_the_whole_fibre(pad, contact, seed):
+    found = signals(pad, wild_presses(pad, seed), contact)
+    weights = {"uniform": 1.0, "inverse_square": 1 / contact.radius, "inverse": 100 / contact.radius}
+    assert (found >= 0).all()
+    most = longest_signals(pad, contact.length)
+    assert (found <= most * weights[contact.weight] * (1 + 1e-9)).all()
+    whole = signals(pad, [[1, 1]], contact.model_copy(update={"radius": 1e3}))[0]
+    assert (whole > 0).all()
+    if (contact.weight, contact.length) == ("uniform", "manhattan"):
+        np.testing.assert_allclose(whole, most, rtol=1e-7)
+
+
+@given(wild_pads(), wild_contacts.filter(lambda contact: contact.sides is None or contact.sides % 4 == 0), SEEDS)
+@settings(max_examples=25)
+def test_signals_follow_the_pad_and_the_press_into_the_mirror(pad, contact, seed):
+    assume(pad.knots.shape[1] == 2 or np.diff(fibre_axes(pad)[0]).min() > 1e-5)  # steps move by rounding in a mirror
+    grid, presses = pad.grid, np.random.default_rng(seed).uniform(-0.5, pad.grid + 1.5, (6, 2))
+    found = signals(pad, presses, contact)
+    scale = 1e-6 * max(1.0, found.max())
+    swapped = signals(transposed(pad), presses[:, ::-1], contact)
+    np.testing.assert_allclose(np.roll(swapped, grid, axis=1), found, atol=scale)
+    flipped = signals(mirrored(pad), presses * [-1, 1] + [grid + 1, 0], contact)
+    order = np.r_[:grid, 2 * grid - 1 : grid - 1 : -1]
+    np.testing.assert_allclose(flipped[:, order], found, atol=scale)
+
+
+@given(st.sampled_from(KINDS), st.integers(1, 3), st.integers(0, 6), st.integers(0, 2), wild_contacts, SEEDS)
+@settings(max_examples=25)
+def test_presses_pads_and_forms_are_each_as_they_are_alone(kind, grid, count, population, contact, seed):
+    """Presses at once add up; order, other pads beside it, the layout in memory and sparseness change no bit."""
+    rng = np.random.default_rng(seed)
+    pads = [Morphology(wild_knots(kind, grid, count, rng)) for _ in range(population)]
+    knots = np.array([pad.knots for pad in pads]).reshape(-1, 2 * grid, count + 2, 2)
+    presses = rng.uniform(0, grid + 1, (6, 2))
+    found = signals(knots, presses, contact)
+    assert found.shape == (population, 6, 2 * grid)
+    np.testing.assert_array_equal(signals(np.asfortranarray(knots), presses, contact), found)
+    np.testing.assert_array_equal(signals(knots[:, ::-1][:, ::-1], presses[::-1], contact), found[:, ::-1])
+    together = signals(knots, presses.reshape(3, 2, 2), contact)
+    np.testing.assert_allclose(together, found[:, ::2] + found[:, 1::2], rtol=1e-12)
+    for pad, alone in zip(pads, found, strict=True):
+        np.testing.assert_array_equal(signals(pad, presses, contact), alone)
+        np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), alone)
+
+
+@pytest.mark.parametrize("radius", [1e-9, 1e-6, 1e-3, 0.4])
+@pytest.mark.parametrize("sides", [None, 4, 30])
+def test_a_press_centred_on_a_straight_fibre_signals_its_diameter_at_every_size(radius, sides):
+    """A 30-gon has vertices left and right, but edges at top and bottom."""
+    found = signals(Morphology.straight(3), [[2, 2]], Contact(radius=radius, sides=sides))
+    upright = np.cos(np.pi / 30) if sides == 30 else 1
+    np.testing.assert_allclose(found[0, [1, 4]], [2 * radius, 2 * radius * upright], rtol=1e-12)
+    assert not found[0, [0, 2, 3, 5]].any()
+
+
+def test_inverse_weights_on_a_straight_fibre_have_closed_forms():
+    """Centre on the fibre, circle of radius K: 2 + 2 ln 100 for 1/d cut off at K/100, arctan for 1/(K + d^2)."""
+    pad, radius = Morphology.straight(1), 0.5
+    near = signals(pad, [[1, 1]], Contact(radius=radius, sides=None, weight="inverse"))
+    np.testing.assert_allclose(near, 2 + 2 * np.log(100), rtol=1e-12)
+    square = signals(pad, [[1, 1]], Contact(radius=radius, sides=None, weight="inverse_square"))
+    np.testing.assert_allclose(square, 2 / np.sqrt(radius) * np.arctan(radius / np.sqrt(radius)), rtol=1e-12)
+
+
+HIGH = 0.6 * np.sqrt(0.75)
+"""Of a hexagon's edge over its centre."""
+
+
+@pytest.mark.parametrize(
+    ("sides", "press", "fibre", "expected"),
+    [
+        (4, (1.6, 1.0), 0, 1.2),  # along a diagonal
+        (4, (1.0, 1.6), 0, 0.0),  # a corner touches
+        (4, (1.0, 1.6 + 1e-9), 0, 0.0),
+        (None, (1.0, 1.6 + 1e-9), 0, 0.0),
+        (6, (1.0, 1 - HIGH), 0, 0.6),  # along an edge, which belongs to the press
+        (6, (1.0, 1 + HIGH), 0, 0.6),
+        (3, (1.3, 1.0), 2, 0.6 * np.sqrt(3)),  # the upright edge of a triangle
+        (3, (1.3 - 1e-9, 1.0), 2, 0.6 * np.sqrt(3)),
+        (3, (1.3 + 1e-9, 1.0), 2, 0.0),
+    ],
+)
+def test_a_straight_fibre_at_a_corner_or_along_an_edge(sides, press, fibre, expected):
+    found = signals(Morphology.straight(2), [press], Contact(radius=0.6, sides=sides))[0, fibre]
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("sides", [3, 4, 5, 6, 8, 12, 30])
+def test_a_fibre_on_an_edge_counts_whole_whichever_way_rounding_goes(sides):
+    normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
+    for radius in np.random.default_rng(sides).uniform(0.1, 1, 50):
+        apothem, edge = radius * np.cos(np.pi / sides), 2 * radius * np.sin(np.pi / sides)
+        for nx, ny in zip(np.cos(normal), np.sin(normal), strict=True):
+            if min(abs(nx), abs(ny)) < 1e-9:
+                press, fibre = ([2.5, 2 - apothem * ny], 1) if abs(nx) < 1e-9 else ([2 - apothem * nx, 2.5], 4)
+                found = signals(Morphology.straight(3), [press], Contact(radius=radius, sides=sides))
+                assert found[0, fibre] == pytest.approx(edge, rel=1e-6)
+
+
+@pytest.mark.parametrize("radius", [1e-9, 0.25, 0.4, 1.0])
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_a_circle_that_only_touches_a_fibre_adds_nothing(radius, weight):
+    """From both sides, and exactly at the radius, where the crossing is a double root."""
+    contact = Contact(radius=radius, sides=None, weight=weight)
+    presses = [[1.5, 1 + radius + nudge] for nudge in (0.0, 1e-15, -1e-15)]
+    assert (signals(Morphology.straight(2), presses, contact)[:, 0] <= 1e-6 / radius).all()
+
+
+@pytest.mark.parametrize("gap", [1e-12, 1e-9, 1e-6])
+def test_knots_that_nearly_coincide_make_a_step_and_nothing_else(gap):
+    """A rise of 1 within `gap`, slope up to 1e12: the Manhattan signal is run plus rise."""
+    inner = np.array([[[1.0, 0.5], [1.0 + gap, 1.5]], [[1.0, 0.5], [1.0, 1.5]]])
+    pad = Morphology(assemble(inner))
+    presses = [[1.0, 1.0], [1.0 + gap, 1.5], [1.0, 0.5]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for length in LENGTHS:
+            found = signals(pad, presses, Contact(radius=5, sides=None, length=length))
+            assert np.isfinite(found).all()
+            if length == "manhattan":
+                assert found[:, 0] == pytest.approx(2 + 0.5 + 1 + 0.5, rel=1e-9)
+
+
+def test_a_weight_that_rounding_blurs_is_summed_in_time():
+    """On a span all but vertical a small press is known to some digits only; halving it would go on for ever."""
+    steep = np.empty((6, 7, 2))
+    steep[:] = Morphology.straight(3).knots[:, :1]
+    for fibre, axis in enumerate((0, 0, 0, 1, 1, 1)):
+        steep[fibre, :, axis] = np.linspace(0, 4, 7)
+    steep[3, 1:6, 1] = 1.0791468550554812 + 1e-9 * np.arange(5)
+    steep[3, 1:6, 0] = 2.75378692228376, 0.5403860200896449, 2.1014172899029036, 1.9433414353271563, 3.7361740638249987
+    press = [3.5059369232428153, 1.0791468560554813]
+    contact = Contact(radius=1e-6, sides=5, weight="inverse", length="euclidean")
+    found = signals(Morphology(steep), [press, [1.801357466597148, 1.0791468580554815]], contact)
+    assert ((found[:, 3] > 1) & (found[:, 3] < 100)).all()
+
+
+def test_fibres_that_leave_the_pad_are_followed():
+    out = np.insert(Morphology.straight(2).knots, 1, [[1.5, 50], [1.5, -50], [50, 1.5], [-50, 1.5]], axis=1)
+    found = signals(out, [[1.0, 40], [1, 1], [-30, 0.6]], Contact(sides=None))
+    assert found[0, 0] > 1
+    assert found[2, 3] > 1
+
+
+def test_many_presses_give_the_same_on_many_threads():
+    pad, presses = Morphology.random(4, 5, seed=2), np.random.default_rng(2).uniform(0.5, 4.5, (10_000, 2))
+    whole = signals(pad, presses, PUBLISHED_CONTACT)
+    for part in (slice(10), slice(1995, 2005), slice(5000, 5010)):
+        np.testing.assert_array_equal(whole[part], signals(pad, presses[part], PUBLISHED_CONTACT))
+
+
+def test_work_follows_what_is_touched():
+    """Counters, not clocks: spans looked at per press do not grow with the pad, and shrink with the press."""
+    rng = np.random.default_rng(0)
+    counts = {}
+    for grid in (4, 128):
+        presses = rng.uniform(1, grid, (400, 2))
+        counts[grid] = signals_and_spans(Morphology.straight(grid), presses, PUBLISHED_CONTACT)[1]
+    assert counts[128] <= 1.2 * counts[4]
+    pad, presses = Morphology.random(4, 20, seed=0), rng.uniform(1, 4, (100, 2))
+    small, large = (signals_and_spans(pad, presses, Contact(radius=radius))[1] for radius in (0.1, 1.0))
+    assert small < large < 100 * 8 * 21
+    pad, presses = Morphology.random(4, 3, seed=0).tiled(32), rng.uniform(1, 128, (200, 2))
+    found = signals_sparse(pad, presses)
+    assert found.nnz < 40 * len(presses)
+    np.testing.assert_array_equal(found.toarray(), signals(pad, presses))
+
+
+def test_odd_but_fair_input_is_taken_as_it_is():
+    pad = Morphology.random(2, 3, seed=0)
+    presses = np.array([[1, 2], [2, 1]])
+    expected = signals(pad, presses.astype(float))
+    for same in (presses, presses.astype(np.float32), presses.tolist(), np.repeat(presses, 2, axis=0)[::2]):
+        np.testing.assert_array_equal(signals(pad, same), expected)
+    for function in (signals, signals_quantized, signals_sparse):
+        assert function(pad, []).shape == (0, 4)
+        assert not function(pad, [[50, 50], [-9, 1]], PUBLISHED_CONTACT).sum()
+    for function in (signals, signals_quantized):
+        none = function(pad, np.empty((5, 0, 2)))
+        assert (none.shape, none.any()) == ((5, 4), False)
+
+
+@pytest.mark.parametrize("presses", [[[np.nan, 1]], [[np.inf, 1]], [1, 2, 3], [[1, 2, 3]]])
+def test_presses_that_are_no_positions_are_refused(presses):
+    for function in (signals, signals_quantized, signals_sparse):
+        with pytest.raises(InputError, match="presses"):
+            function(Morphology.straight(2), presses)
+
+
+def test_knots_that_are_no_pad_are_refused():
+    unsorted = np.array([[[0, 1.0], [1, 0.2], [1 + 2.0**-52, 1.8], [2, 1.0]]] * 2)
+    unsorted[1] = unsorted[1, :, ::-1]
+    wrong_shapes = np.zeros((3, 2, 2)), np.zeros((2, 2)), np.zeros((4, 3, 2))
+    for knots in (*wrong_shapes, np.full((4, 2, 2), np.nan), "x", unsorted):
+        with pytest.raises(InputError, match="knots"):
+            signals(knots, [[1, 1]])  # pyright: ignore[reportArgumentType]

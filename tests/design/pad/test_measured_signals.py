@@ -1,0 +1,178 @@
+"""Signals of a measured reach: exact ones against adaptive quadrature, and those that a search takes beside them."""
+
+import warnings
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.optimize import brentq
+
+from design import Contact, Morphology, signals, signals_quantized, signals_sparse
+from design.criteria.differentiable import pchip_slopes, press_signals
+from design.pad.contact import fibre_axes, signals_and_spans
+from design.pad.kernels.measured_signals import PRECISION, fibre_elements, spacing_of
+from design.pad.kernels.press import MANHATTAN
+from design.pad.knots import kernel_ends
+from design.settings import DEFAULT_PITCH_MM, Layout
+from tests.design.pad.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
+
+REACHES = {
+    "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),
+    "nearly a disc": ((0.0, 1.0), (0.3, 1.0), (0.55, 1.0), (0.6, 0.85), (0.65, 0.15), (0.7, 0.0), (0.9, 0.0)),
+    "below 0": ((0.0, -0.3), (0.2, -0.5), (0.35, -0.35), (0.5, 0.1), (0.6, 0.2), (0.9, 0.0)),
+    "beyond the pad": ((0.0, 1.0), (2.0, 0.8), (4.0, 0.3), (6.0, 0.0)),
+}
+"""In grid units."""
+
+
+def contact_of(reach, length: Length = "euclidean"):
+    """The contact on pads of the default pitch."""
+    return Contact(reach=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
+
+
+def pads():
+    yield Morphology.straight(3)
+    for knots, pitch_mm in ((1, 11.25), (21, 6.0), (5, (30.0, 5.0))):
+        yield Morphology.random(3, knots, knots, pitch_mm)
+
+
+def knots_of(pad):
+    return [torch.tensor(axis[0], requires_grad=True) for axis in fibre_axes(pad)[:2]]
+
+
+def searched(pad, presses, contact):
+    """(Q, 2M) signals of the kind that a search takes."""
+    travel, cross = knots_of(pad)
+    return (
+        press_signals(
+            travel, cross, pchip_slopes(travel, cross), presses, contact, kernel_ends(pad.layout), pad.unit_mm
+        )
+        .detach()
+        .numpy()
+        .T
+    )
+
+
+def measured_oracle(pad, press, length, fibre):
+    """One signal under the broad reach: adaptive quadrature between the circles on which the spline's pieces meet."""
+    axis = 0 if fibre < pad.grid else 1
+    knots = pad.knots[fibre]
+    curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
+    slope = curve.derivative()
+    distance, weight = np.array(REACHES["broad"]).T
+    spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
+
+    def square(t):
+        return (t - press[axis]) ** 2 + (curve(t) - press[1 - axis]) ** 2
+
+    def density(t):
+        run = 1 + abs(slope(t)) if length == "manhattan" else np.hypot(1, slope(t))
+        return spline(square(t)) * run if square(t) < distance[-1] ** 2 else 0.0
+
+    total = 0.0
+    for begin, end in pairwise(knots[:, axis]):
+        at = np.linspace(begin, end, 1500)
+        ends = {begin, end}
+        for d in distance[1:]:
+            sign = np.sign(square(at) - d**2)
+            ends |= {
+                brentq(lambda t, d=d: square(t) - d**2, at[i], at[i + 1], xtol=1e-15)
+                for i in np.flatnonzero(np.diff(sign))
+            }
+        total += sum(quad(density, *piece, epsabs=1e-13, epsrel=1e-12)[0] for piece in pairwise(sorted(ends)))
+    return total
+
+
+@pytest.mark.parametrize("length", ["manhattan", "euclidean"])
+def test_signals_of_a_measured_reach_equal_the_oracle(length):
+    for knots in (0, 5):
+        rng = np.random.default_rng(knots)
+        pad, contact = Morphology.random(2, knots, rng), contact_of(REACHES["broad"], length)
+        presses = rng.uniform(0, 3, (2, 2))
+        found = signals(pad, presses, contact)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            expected = [[measured_oracle(pad, press, length, fibre) for fibre in range(4)] for press in presses]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), found)
+        sampled = signals_quantized(pad, presses, contact, samples=200_001)
+        np.testing.assert_allclose(sampled, found, atol=1e-3)
+
+
+def test_a_measured_reach_is_not_felt_beyond_its_end():
+    contact = contact_of(REACHES["broad"])
+    found, looked_at = signals_and_spans(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
+    assert looked_at == 4  # fibres 1 and 2 of both families
+    assert not found[1].any()
+    assert found[0, 0] == found[0, 4] > 0 > found[0, 1] == found[0, 5]
+    assert not found[0, [2, 3, 6, 7]].any()
+
+
+@given(wild_pads((1, 2), (0, 6)), st.sampled_from([1e-2, 1.0, 5.0, 20.0, 200.0]), st.integers(8, 20), SEEDS)
+@settings(max_examples=20)
+def test_signals_of_any_reach_on_wild_pads_lie_within_the_whole_fibre_at_its_heaviest(pad, end_mm, points, seed):
+    rng, distance = np.random.default_rng(seed), np.linspace(0, end_mm, points)
+    waves = np.cos(np.pi * rng.uniform(0, 2) * distance / end_mm) * (1 - distance / end_mm) ** 2
+    weight = rng.choice([-1e3, -1.0, 1e-3, 1.0]) * waves
+    for length in LENGTHS:
+        contact = Contact(reach=np.column_stack([distance, weight]).tolist(), length=length)
+        found = signals(pad, wild_presses(pad, seed), contact)
+        spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
+        heaviest = np.abs(spline(np.linspace(0, end_mm, 2000) ** 2)).max()
+        assert (np.abs(found) <= longest_signals(pad, length) * heaviest * 1.01 + 1e-9).all()
+
+
+@pytest.mark.parametrize("length", ["manhattan", "euclidean"])
+@pytest.mark.parametrize("reach", REACHES.values(), ids=REACHES)
+def test_a_search_sees_the_signals_to_its_precision(reach, length):
+    contact = contact_of(reach, length)
+    for pad in pads():
+        presses = np.random.default_rng(0).uniform(0, 4, (60, 2))
+        exact = signals(pad, presses, contact)
+        assert abs(searched(pad, presses, contact) - exact).max() < PRECISION * abs(exact).max()
+
+
+@pytest.mark.parametrize("reach", REACHES.values(), ids=REACHES)
+def test_the_gradient_is_that_of_the_exact_signals(reach):
+    """Along a random change of all knots, within what a difference of exact signals can tell."""
+    rng = np.random.default_rng(1)
+    contact, presses = contact_of(reach), rng.uniform(0, 4, (40, 2))
+    upstream = rng.normal(size=6)
+    pad = Morphology.random(3, 5, seed=2)
+    travel, cross = knots_of(pad)
+    slope = pchip_slopes(travel, cross)
+    found = press_signals(travel, cross, slope, presses, contact, kernel_ends(pad.layout), pad.unit_mm)
+    (torch.tensor(upstream)[:, None] * found).sum().backward()
+    assert cross.grad is not None
+    move = rng.normal(size=cross.shape)
+    move[:, [0, -1]] = 0
+    along = np.stack([np.zeros_like(move), move], axis=-1)
+    along[3:] = along[3:, :, ::-1]
+    ahead, behind = (signals(pad.knots + step * along, presses, contact) @ upstream for step in (1e-5, -1e-5))
+    expected = ((ahead - behind) / 2e-5).sum()
+    assert (cross.grad.numpy() * move).sum() == pytest.approx(expected, rel=2e-3)
+
+
+def test_elements_lie_only_where_a_press_may_feel_them():
+    """Of a large pad pressed near one corner: on the spans about there, whose knots alone have a gradient."""
+    grid, reach, corner = 40, REACHES["broad"], np.array([[1.0, 1.0], [2.0, 1.5]])
+    travel = torch.linspace(0, grid + 1, 42, dtype=torch.float64).repeat(2 * grid, 1)
+    cross = torch.arange(1.0, grid + 1, dtype=torch.float64).repeat(2)[:, None].repeat(1, 42).requires_grad_()
+    slope = torch.zeros_like(cross)
+    t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
+    starts = fibre_elements(t, v, d, grid, corner, 1.6, spacing_of(reach), MANHATTAN).starts
+    felt = np.diff(starts) > 0
+    assert felt.any(axis=1).nonzero()[0].tolist() == [0, 1, 2, 40, 41, 42]
+    assert felt.any(axis=0).nonzero()[0].tolist() == [0, 1, 2, 3]
+    layout = Layout.of(grid)
+    press_signals(travel, cross, slope, corner, contact_of(reach), kernel_ends(layout), layout.unit_mm).sum().backward()
+    assert cross.grad is not None
+    moved = cross.grad.numpy().astype(bool)
+    assert moved[0, :4].all()
+    assert not moved[:, 5:].any()
+    assert not moved[3:40].any()
