@@ -31,6 +31,7 @@ if coverage is not None and coverage.Coverage.current() is not None:
     fresh = tempfile.TemporaryDirectory(prefix="padforge-coverage-")
     config.JIT_COVERAGE, config.CACHE_DIR = 1, fresh.name  # pyright: ignore[reportAttributeAccessIssue]
 
+from tests.helpers import kernels  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
@@ -44,8 +45,11 @@ def pytest_xdist_auto_num_workers() -> int:
 
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Workers get whole groups of tests; kernels are compiled by one process, not by each worker again."""
-    if config.getoption("numprocesses", None) and config.option.dist == "load":
-        config.option.dist = "loadgroup"
+    if config.getoption("numprocesses", None) and not config.option.collectonly:
+        if config.option.dist == "load":
+            config.option.dist = "loadgroup"
+        if kernels.missing():
+            kernels.compile_all()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -51,6 +51,8 @@ def design_kernels() -> None:
         signals_quantized,
         signals_sparse,
     )
+    from design.criteria.information import disorder, disorder_area
+    from design.evaluation.ambiguity_map import ambiguity_map
     from design.settings import PUBLISHED_CONTACT
     from fabricate import build, check_mesh
 
@@ -64,7 +66,10 @@ def design_kernels() -> None:
         signals_sparse(pad, presses, contact)
     signals_quantized(pad, presses)
     published_objective(pad)
-    indented_signals(pad, presses, [0.1], Indenter())
+    disorder(pad.knots)
+    disorder_area(pad)
+    ambiguity_map(pad, presses, Contact(), 1, 0.1)
+    indented_signals(pad, presses, 0.1, Indenter())
     check_rules(pad, RulesSettings())
     for contact in (Contact(), PUBLISHED_CONTACT):
         score(pad, contact, lost=1)
@@ -87,6 +92,8 @@ def sense_kernels() -> None:
         simulate,
         total_variation,
     )
+    from sense.live.deployment.streaming import Detector
+    from sense.twin.identification import identify
 
     recording = simulate(Morphology.straight(2), RigSettings(presses=60))
     total_variation(recording.readings, 2.0)
@@ -95,6 +102,8 @@ def sense_kernels() -> None:
     find_presses(recording.readings, recording.times_s)
     localizer, _ = calibrate(recording, LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, lost=1))
     locate(localizer, recording)
+    Detector.fit(recording, np.arange(20))
+    identify(recording, Morphology.straight(2))
 
 
 HALVES = {"design": design_kernels, "sense": sense_kernels}
