@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
@@ -58,3 +59,13 @@ def mild_pad(grid: int, knots: int, seed: int) -> Morphology:
     straight = Morphology.straight(grid)
     ends = [straight.knots[:, :1], places, straight.knots[:, -1:]]
     return Morphology(np.concatenate(ends, axis=1), straight.pitch_mm)
+
+
+def exact_fibre(pad: Morphology, fibre: int, step_mm: float = 5e-3) -> np.ndarray:
+    """(n, 2) mm: places of a fibre by scipy's own PCHIP, a step apart along it, and its knots."""
+    family, knots = pad.layout.family(fibre), pad.to_mm(pad.knots[fibre])
+    curve = PchipInterpolator(knots[:, family], knots[:, 1 - family])
+    t = np.unique(np.linspace(knots[:-1, family], knots[1:, family], 3000))
+    along = np.concatenate([[0], np.cumsum(np.hypot(np.diff(t), np.diff(curve(t))))])
+    t = np.union1d(np.interp(np.arange(0, along[-1], step_mm), along, t), knots[:, family])
+    return np.stack([t, curve(t)], axis=1)[:, :: -1 if family else 1]

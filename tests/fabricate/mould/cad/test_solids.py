@@ -1,4 +1,4 @@
-"""Solids put together face by face, against volumes and surfaces that arithmetic gives."""
+"""Solids put together face by face or by the kernel, against volumes and surfaces that arithmetic gives."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 import shapely
 from build123d import Solid
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ellipe
 from shapely.geometry.base import BaseGeometry
 
+from design.pad.morphology import Morphology
 from fabricate.mould.cad.layout import Span, Surface
 from fabricate.mould.cad.outlines.drawing import Drawing
 from fabricate.mould.cad.outlines.pieces import ring_pieces, straight_pieces
 from fabricate.mould.cad.shells import solids
-from fabricate.mould.cad.walls import FLOOR, RIM, Walls
-from fabricate.mould.plan import polygon_rings
-from tests.helpers.effort import few
+from fabricate.mould.cad.walls import FLOOR, RIM, Walls, walls_of
+from fabricate.mould.plan import Plan, polygon_rings
+from tests.fabricate.planted import with_settings
 
 
 def disc(x: float, y: float, radius: float) -> BaseGeometry:
@@ -48,14 +50,10 @@ def kinds(solid: Solid) -> dict[str, int]:
     return {name: names.count(name) for name in sorted(set(names))}
 
 
-def sizes(solid: Solid) -> tuple[int, int, int]:
-    return len(solid.faces()), len(solid.edges()), len(solid.vertices())
-
-
 def test_a_box():
     (solid,) = built([shapely.box(0, 0, 1, 2)], lambda within: 3.0 if within else None)
     assert solid.is_valid
-    assert sizes(solid) == (6, 12, 8)
+    assert (len(solid.faces()), len(solid.edges()), len(solid.vertices())) == (6, 12, 8)
     assert (solid.volume, solid.area) == pytest.approx((6, 22))
 
 
@@ -65,6 +63,23 @@ def test_a_washer():
     assert solid.volume == pytest.approx(2 * math.pi * 8, rel=1e-9)
     assert solid.area == pytest.approx(2 * math.pi * 8 + 2 * 2 * math.pi * 4, rel=1e-9)
     assert kinds(solid) == {"CYLINDER": 4, "PLANE": 2}
+
+
+@pytest.mark.parametrize("upper", [False, True])
+def test_what_is_drawn_as_an_ellipse_has_walls_of_splines(upper):
+    """Alone, or over half of its outline, where the walls of a block that it overlaps rise higher."""
+    t = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
+    ellipse = shapely.Polygon(np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1))
+    block = [shapely.box(0, -5, 20, 5)] if upper else []
+    (solid,) = built([ellipse, *block], lambda within: {(): None, (0,): 1.0}.get(tuple(within), 2.0))
+    assert solid.is_valid
+    half = 24 * math.pi / 2
+    assert solid.volume == pytest.approx(half + 200 * 2 if upper else 2 * half, rel=1e-3)
+    length = 32 * float(ellipe(1 - 9 / 64))
+    assert solid.area == pytest.approx(
+        2 * (half + 200) + length / 2 + 2 * 60 - 6 if upper else 4 * half + length, rel=1e-3
+    )
+    assert kinds(solid)["BSPLINE"] >= 2
 
 
 def test_steps_share_their_edges():
@@ -102,6 +117,49 @@ def test_circles_that_cross():
 
 
 BOWL = Walls(np.array([[-3.0, -2.0, 3.0, 2.0]]), floor_mm=1.0, depth_mm=4.0, flare_mm=0.8)
+
+
+CROSS = Walls(np.array([[-10.0, -10.0, 10.0, 10.0], [9.0, -1.0, 12.0, 1.0]]), 2.0, 6.0, 0.5)
+
+
+@given(st.floats(-13, 13), st.floats(-13, 13), st.sampled_from([BOWL, CROSS]))
+@settings(max_examples=60)
+def test_planes_are_the_heights_over_their_places(x, y, walls):
+    place = np.array([[x, y]])
+    (sheet,) = walls.sheets(place).tolist()
+    expected = walls.floor_mm if sheet == FLOOR else walls.floor_mm + walls.depth_mm
+    plane = expected if sheet < 0 else walls.plane(sheet, place)[0]
+    assert walls.heights(place)[0] == pytest.approx(plane, abs=1e-9)
+    if sheet >= 0:
+        beside = walls.plane(sheet, place + np.eye(2)) - plane
+        assert walls.normal(sheet) == pytest.approx((-beside[0], -beside[1], 1))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.07, 0.5, 1.0])
+@pytest.mark.parametrize("walls", [BOWL, CROSS, replace(BOWL, flare_mm=0.0)])
+def test_outlines_are_what_is_open_at_a_height(walls, share):
+    grown, z = share * walls.flare_mm, walls.floor_mm + share * walls.depth_mm
+    boxes = [shapely.box(*low - grown, *high + grown) for low, high in walls.hollows.reshape(-1, 2, 2)]
+    outline = walls.outline(z)
+    assert outline.symmetric_difference(shapely.union_all(boxes)).area == pytest.approx(0, abs=1e-9)
+    on = np.array([point.coords[0] for point in outline.exterior.interpolate(np.linspace(0, 1, 41), normalized=True)])
+    if walls.flare_mm:
+        assert walls.heights(on) == pytest.approx(np.full(41, z))
+        assert len(walls.creases()) == 1 + len(outline.exterior.coords) - 1  # one from every corner of the floor
+    else:
+        assert walls.heights(0.999 * on) == pytest.approx(np.full(41, walls.floor_mm))
+        assert walls.heights(1.001 * on) == pytest.approx(np.full(41, walls.floor_mm + walls.depth_mm))
+        assert len(walls.creases()) == 1
+
+
+@pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0}, {"wall_draft_deg": 0.0, "border_mm": 1.5}])
+def test_walls_of_a_plan(mould):
+    plan = Plan(Morphology.random(2, 2, seed=1), with_settings(mould))
+    walls = walls_of(plan)
+    assert walls.outline(walls.floor_mm).symmetric_difference(plan.silicone).area == pytest.approx(0, abs=1e-9)
+    assert (walls.floor_mm, walls.depth_mm) == (2.0, plan.silicone_mm)
+    assert walls.flare_mm == pytest.approx(6 * math.tan(math.radians(plan.settings.mould.wall_draft_deg)))
+    assert walls.outline(8.0).bounds[0] == pytest.approx(plan.silicone.bounds[0] - plan.flare_mm)
 
 
 def surfaces(drawing: Drawing) -> list[Surface]:
@@ -176,7 +234,7 @@ def test_a_curve_that_strays_past_its_top_on_a_wall_ends_at_it():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))
-@few(4)
+@settings(max_examples=3)
 def test_any_drums_and_blocks(seed, count):
     rng = np.random.default_rng(seed)
     areas = [disc(*row) for row in rng.uniform([0, 0, 0.3], [4, 4, 1.5], (count, 3))]
