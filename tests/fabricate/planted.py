@@ -9,7 +9,7 @@ from design.pad.knots import assemble
 from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings
 from fabricate.materials import FibreSettings, SiliconeSettings
-from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
+from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 
 
 def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:
@@ -36,6 +36,7 @@ def with_settings(
     rules: dict[str, object] | None = None,
     silicone: dict[str, object] | None = None,
     fibre: dict[str, object] | None = None,
+    dispenser: dict[str, object] | None = None,
 ) -> FabricationSettings:
     """The defaults with some keys changed."""
     return replace(
@@ -46,6 +47,7 @@ def with_settings(
         rules=RulesSettings.model_validate(rules or {}),
         silicone=SiliconeSettings.model_validate(silicone or {}),
         fibre=FibreSettings.model_validate(fibre or {}),
+        dispenser=DispenserSettings.model_validate(dispenser or {}),
     )
 
 

@@ -74,27 +74,37 @@ def test_straight_pad_has_the_volume_that_arithmetic_gives():
     assert sizes(plan)["tray_mm"] == pytest.approx(rim + 4)
 
 
-@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
-def test_published_moulds_are_closed(published, name):
-    plan = Plan(Morphology.load(published / f"{name}.mat"))
-    assert_one_closed_body(as_read(mould_body(plan)))
+@pytest.mark.parametrize(
+    "pad",
+    [
+        *((1, 1, 0), (2, 10, 2), (2, 30, 1032), "5para_dis"),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "1para", "20para")),
+    ],
+)
+def test_random_and_published_moulds_are_closed(request, pad):
+    if isinstance(pad, str):
+        pad = Morphology.load(request.getfixturevalue("published") / f"{pad}.mat")
+    else:
+        pad = Morphology.random(*pad)
+    assert_one_closed_body(as_read(mould_body(Plan(pad))))
+
+
+@pytest.mark.parametrize(
+    ("make", "pad", "mould", "line"),
+    [
+        (lid_body, (1, 3.5), {"lid": True, "spout": True}, "spout: got true for a pad 7 mm wide, allowed from 19"),
+        (mould_body, (2,), {"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}, r"pins.*1 mm wide"),
+        (conductive_plan, (2, 5.0), {}, "exit_width_mm"),
+    ],
+)
+def test_what_has_no_room_is_refused(make, pad, mould, line):
+    with pytest.raises(InputError, match=line):
+        make(Plan(Morphology.straight(*pad), with_settings(mould)))
 
 
 @pytest.mark.slow
 def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
     assert_both_ways_agree(mould_body(Plan(Morphology.load(published / "1para.mat"))))
-
-
-@pytest.mark.parametrize(
-    ("grid", "knots", "seed"),
-    [
-        *((1, 1, 0), (2, 3, 1), (2, 10, 2), (2, 30, 1032), (5, 2, 4)),
-        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((4, 10, 2), (4, 30, 1032), (9, 4, 4))),
-    ],
-)
-def test_random_moulds_are_closed(grid, knots, seed):
-    plan = Plan(Morphology.random(grid, knots, seed))
-    assert_one_closed_body(as_read(mould_body(plan)))
 
 
 @pytest.mark.parametrize(
@@ -218,6 +228,7 @@ def test_lid_has_the_holes_that_fit_the_pins():
     assert_one_closed_body(read)
     spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
     assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
+    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))  # just room enough
 
 
 @pytest.mark.parametrize(
@@ -231,18 +242,6 @@ def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
         assert_one_closed_body(as_read(body))
 
 
-def test_a_spout_needs_room_between_the_vents():
-    with pytest.raises(InputError, match=r"spout: got true for a pad 7 mm wide, allowed from 19"):
-        lid_body(Plan(Morphology.straight(1, 3.5), with_settings({"lid": True, "spout": True})))
-    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))
-
-
-def test_pins_need_room():
-    plan = Plan(Morphology.straight(2), with_settings({"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}))
-    with pytest.raises(InputError, match=r"pins.*1 mm wide"):
-        mould_body(plan)
-
-
 def test_the_second_mould_has_a_well_at_every_ridge_end():
     plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
     read = as_read(conductive_body(plan))
@@ -252,8 +251,6 @@ def test_the_second_mould_has_a_well_at_every_ridge_end():
         for offset in (0.0, 0.9 * WELL_MM / 2):
             assert height_at(read, x, -7.5 + offset + 0.01) == pytest.approx(2 + 1.2, abs=1e-4)
         assert height_at(read, x, -7.5 + 1.1 * WELL_MM / 2) == pytest.approx(2.0, abs=1e-4)
-    with pytest.raises(InputError, match="exit_width_mm"):
-        conductive_plan(Plan(Morphology.straight(2, pitch_mm=5.0)))
 
 
 def test_corners_that_meet_by_chance_are_drawn_apart():
@@ -265,14 +262,14 @@ def test_corners_that_meet_by_chance_are_drawn_apart():
     assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(2, abs=2e-3)
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(1, 3), (5, 4), (20, 5)])
+@pytest.mark.parametrize(("knots", "seed"), [(5, 4), (20, 5)])
 def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
     plan = Plan(Morphology.random(2, knots, seed))
     read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm
     floors = []
     for line in plan.lines:
-        places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 60))
+        places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 40))
         # Deeper tracks that cross are seen too: the least is the fibre's own.
         floors.append(min(height_at(read, *place) for place in shapely.get_coordinates(places)))
     (stated,) = [f.measured for f in check_plan(plan) if f.name == "crossing_gap"]

