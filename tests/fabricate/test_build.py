@@ -1,9 +1,12 @@
+"""Moulds made and written: all files or none, whole, read back by others, the same bytes again."""
+
 import errno
 import json
 import math
 import os
 import zipfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,6 +14,7 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
+from build123d import Mesher, Solid, import_step
 
 from design.common.errors import InputError
 from design.common.files import sha256
@@ -18,6 +22,7 @@ from design.pad.morphology import Morphology
 from fabricate import export
 from fabricate.export import FORMATS, build
 from fabricate.mesh_files import COLOURS, write_3mf
+from fabricate.mould.cad import model
 from fabricate.mould.prisms import Body, Prism
 from fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -31,6 +36,8 @@ FILES = {
     *("tracks.svg", "tracks.dxf", "mould.png", "tracks.png", "laying.md", "orientation.svg", "fabrication.json"),
     *("laying.gcode", "laying.script", "dispensing.svg"),
 }
+
+
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
 
@@ -40,15 +47,11 @@ def built(tmp_path_factory) -> tuple[Path, dict]:
     return out, build(PAD, out, FORMATS, SETTINGS)
 
 
-def test_all_files_are_there_and_nothing_else(built):
+def test_all_files_are_there_with_their_digests_and_nothing_else(built):
     out, document = built
     assert {path.name for path in out.iterdir()} == FILES
     assert {*document["files"]} == FILES - {"fabrication.json", "laying.md", "orientation.svg"}
     assert json.loads((out / "fabrication.json").read_text()) == document
-
-
-def test_the_document_has_the_digest_of_every_other_file(built):
-    out, document = built
     assert document["sha256"] == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
 
 
@@ -83,15 +86,7 @@ def test_stl_normals_point_out(built):
     assert ((area * records["normal"]).sum(axis=1) > 0)[large].all()
 
 
-def test_3mf_is_in_millimetres(built):
-    out, _ = built
-    with zipfile.ZipFile(out / "mould.3mf") as archive:
-        assert archive.testzip() is None
-        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
-    assert model.get("unit") == "millimeter"
-
-
-@pytest.mark.parametrize("body", ["mould", "lid", "conductive", "holder"])
+@pytest.mark.parametrize("body", ["mould", "lid", "holder"])
 def test_3mf_is_strictly_one_named_object_of_one_material(built, body):
     lib3mf = pytest.importorskip("lib3mf")
     out, document = built
@@ -130,8 +125,6 @@ def listed(iterator, current: str) -> list:
 
 
 def test_3mf_opens_in_cad_by_its_name_and_colour(built):
-    from build123d import Mesher
-
     out, _ = built
     (solid,) = Mesher().read(out / "lid.3mf")
     assert solid.label == "lid"
@@ -153,7 +146,45 @@ def test_words_of_a_3mf_are_text(tmp_path):
     assert [base.get("name") for base in model.iter(f"{core}base")] == [hostile]
 
 
-def test_the_document_has_what_a_lab_needs(built):
+def test_step_reads_back_as_the_same_solid(built):
+    out, document = built
+    whole = import_step(out / "mould.step")
+    assert whole.is_valid
+    assert {part.label: [each.label for each in part.children] for part in whole.children} == {
+        "mould": ["tray", "horizontal_tracks", "vertical_tracks", "numbers", "pins"],
+        "lid": [],
+        "conductive": ["tray", "horizontal_tracks", "vertical_tracks", "numbers", "pins"],
+        "holder": [],
+    }
+    volume = {part.label: part.volume for part in whole.children}
+    assert volume["mould"] / 1000 == pytest.approx(document["mould_volume_ml"], rel=1e-4)
+    for name in ("lid", "conductive", "holder"):  # the mesh has polygons for circles
+        assert volume[name] == pytest.approx(trimesh.load_mesh(out / f"{name}.stl").volume, rel=1e-4)
+
+
+def test_the_step_file_is_judged_by_the_meshes(built):
+    _, document = built
+    (found,) = (finding for finding in document["findings"] if finding["name"] == "cad_solid")
+    assert found["status"] == "pass"
+    (volume, surface), (most_volume, most_surface) = found["measured"], found["limit"]
+    assert 0 < volume < 2e-4 < most_volume
+    assert 0 < surface < 2e-4 < most_surface
+    assert found["message"].endswith("curves within 2 µm")
+
+
+def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path):
+    """What chords take away of the volume grows with the tolerance."""
+    settings = with_settings({"tolerance_mm": 0.099, "ridge_width_mm": 1.2})
+    (found,) = (
+        finding
+        for finding in build(Morphology.random(2, 12, seed=0), tmp_path, ["step"], settings)["findings"]
+        if finding["name"] == "cad_solid"
+    )
+    assert found["limit"] == pytest.approx([9.9 * 5e-4, 9.9 * 5e-3])
+    assert 5e-4 < found["measured"][0] < found["limit"][0]
+
+
+def test_the_document_has_what_a_lab_needs(built, tmp_path):
     _, document = built
     assert document["format"] == "padforge-fabrication/1"
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
@@ -167,28 +198,35 @@ def test_the_document_has_what_a_lab_needs(built):
     first, second, x, y, *_ = document["crossings"]["table"][0]
     assert {first.split()[0], second.split()[0]} <= {"horizontal", "vertical"}
     assert max(abs(x), abs(y)) < 22.5 / 2
+    other = build(level_pad(1.8, 1.2), tmp_path, [])
+    assert other["crossings"]["same_family"] == 2
+    assert "frame" not in other  # without a holder nobody knows where the pad lies
 
 
-def test_same_family_crossings_are_counted(tmp_path):
-    assert build(level_pad(1.8, 1.2), tmp_path, [])["crossings"]["same_family"] == 2
-
-
-def test_without_a_holder_nobody_knows_where_the_pad_lies(tmp_path):
-    assert "frame" not in build(PAD, tmp_path, [])
-
-
-def test_nothing_is_written_from_a_mould_in_two_pieces(tmp_path, monkeypatch):
-    pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
-    monkeypatch.setattr(export, "mould_body", lambda plan: pieces)
-    with pytest.raises(InputError, match=r"the mesh has 2 bodies.*nothing was written"):
-        build(PAD, tmp_path / "out", ["stl"])
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_pad_the_settings_refuse_writes_nothing(tmp_path):
-    with pytest.raises(InputError, match="2 crossings"):
-        build(level_pad(1.8, 1.2), tmp_path / "out", ["svg"], with_settings({"levels": "two"}))
-    assert not (tmp_path / "out").exists()
+def test_a_shrinking_silicone_gets_a_larger_mould_and_the_same_pad(tmp_path):
+    pad, mould = Morphology.straight(2, 12.0), {"holder": True, "number_mm": 0.0, "exit_mm": 0.0}
+    kept = build(pad, tmp_path / "kept", ["stl"], with_settings(mould))
+    grown = build(pad, tmp_path / "grown", ["stl"], with_settings(mould, silicone={"shrinkage": 0.04}))
+    floors = []
+    for folder in ("kept", "grown"):
+        mesh = trimesh.load_mesh(tmp_path / folder / "mould.stl")
+        assert isinstance(mesh, trimesh.Trimesh)
+        floors.append(mesh.vertices[np.isclose(mesh.vertices[:, 2], 2.0)][:, :2].max())
+    assert floors == pytest.approx([18.0, 18.0 / 0.96], abs=1e-5)
+    sizes = grown["sizes"]
+    assert sizes["cavity_mm"] * 0.96 == pytest.approx(sizes["pad_mm"]) == pytest.approx(kept["sizes"]["pad_mm"])
+    assert sizes["cavity_depth_mm"] == 6.2  # 6.25 mm in whole layers
+    assert sizes["pad_thickness_mm"] == pytest.approx(6.2 * 0.96)
+    assert grown["frame"]["surface_mm"] == pytest.approx(2 + 6.2 * 0.96)
+    assert grown["frame"]["pad_mm"] == kept["frame"]["pad_mm"]
+    assert (tmp_path / "kept" / "holder.stl").read_bytes() == (tmp_path / "grown" / "holder.stl").read_bytes()
+    for key in ("in_pad_mm", "cut_mm"):
+        assert [fibre[key] for fibre in grown["fibres"]] == [fibre[key] for fibre in kept["fibres"]]
+    assert [row[2:4] for row in grown["crossings"]["table"]] == [row[2:4] for row in kept["crossings"]["table"]]
+    assert [fibre["ridge_mm"] * 0.96 for fibre in grown["fibres"]] == pytest.approx(
+        [fibre["depth_mm"] for fibre in grown["fibres"]]
+    )
+    assert {finding["status"] for finding in grown["findings"]} == {"pass"}
 
 
 def test_what_stops_the_needle_is_told(tmp_path):
@@ -202,10 +240,56 @@ def test_what_stops_the_needle_is_told(tmp_path):
     assert by_machine["files"] == ["laying.script", "dispensing.svg"]
 
 
-def test_an_unknown_format_is_refused(tmp_path):
-    with pytest.raises(InputError, match="'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode, urscript"):
-        build(PAD, tmp_path / "out", ["obj"])
-    assert not (tmp_path / "out").exists()
+def other_solid(monkeypatch, body: str) -> None:
+    """Plant a box in place of a body's CAD model."""
+    for makes in ("mould_model", "body_model"):
+
+        def other(of, name, *rest, right=getattr(model, makes)):
+            made = right(of, name, *rest)
+            return replace(made, shape=Solid.make_box(1, 1, 1)) if name == body else made
+
+        monkeypatch.setattr(model, makes, other)
+
+
+def in_pieces(monkeypatch) -> None:
+    pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
+    monkeypatch.setattr(export, "mould_body", lambda plan: pieces)
+
+
+def full_step(*_, **__):
+    raise RuntimeError("Failed to write STEP file")  # what build123d makes of a full disk
+
+
+@pytest.mark.parametrize(
+    ("planted", "formats", "line"),
+    [
+        (None, ["obj"], "'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode, urscript"),
+        (None, ["svg"], "2 crossings"),
+        (in_pieces, ["stl"], r"the mesh has 2 bodies.*nothing was written"),
+        (
+            partial(other_solid, body="mould"),
+            ["step"],
+            r"^mould: the CAD solid is not of its mesh \(.*nothing was written",
+        ),
+        (partial(other_solid, body="conductive"), ["step"], r"^conductive: the CAD solid is not of its mesh"),
+        (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
+        (lambda m: m.setattr(Solid, "is_valid", False), ["step"], "mould: the CAD kernel finds a solid invalid"),
+        (
+            lambda m: m.setattr("build123d.export_step", full_step),
+            ["stl", "step"],
+            r"mould\.step: cannot be written \(the CAD kernel could not write it",
+        ),
+    ],
+)
+def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, planted, formats, line):
+    pad, settings = PAD, SETTINGS
+    if planted:
+        planted(monkeypatch)
+    else:
+        pad, settings = level_pad(1.8, 1.2), with_settings({"levels": "two"})
+    with pytest.raises(InputError, match=line):
+        build(pad, tmp_path / "out", formats, settings)
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -220,7 +304,7 @@ def full_disk(*_, **__):
     ("last", "stop"), [("draw_tracks", full_disk), ("draw_tracks", KeyboardInterrupt), ("write_json", full_disk)]
 )
 def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last, stop):
-    build(PAD, tmp_path, ["stl", "svg", "png"])
+    build(PAD, tmp_path, ["stl", "svg"])
     before = contents(tmp_path)
 
     def stopped(*arguments):
@@ -241,16 +325,6 @@ def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
     with pytest.raises(InputError, match=r"tracks\.svg: is a folder, expected a file or nothing"):
         build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert (tmp_path / "mould.stl").read_bytes() == before
-
-
-def test_a_step_file_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise RuntimeError("Failed to write STEP file")  # what build123d makes of a full disk
-
-    monkeypatch.setattr("build123d.export_step", full)
-    with pytest.raises(InputError, match=r"mould\.step: cannot be written \(the CAD kernel could not write it"):
-        build(PAD, tmp_path, ["stl", "step"])
-    assert contents(tmp_path) == {}
 
 
 def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):

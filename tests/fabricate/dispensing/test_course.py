@@ -9,7 +9,6 @@ from scipy.interpolate import PchipInterpolator
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
-from fabricate.checks.findings import Finding
 from fabricate.dispensing.clearance import check_course
 from fabricate.dispensing.course import Stroke, laying_steps
 from fabricate.mould.plan import Plan
@@ -114,7 +113,7 @@ PAD = Morphology.straight(2)  # 33.75 mm, with leads 97.75 mm
 EDGE = 33.75 / 2 + 2 + 30
 
 
-def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object) -> dict[str, Finding]:
+def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object):
     plan = Plan(pad, with_settings(mould, dispenser=dispenser))
     return {finding.name: finding for finding in check_course(plan, laying_steps(plan, 0.3))}
 

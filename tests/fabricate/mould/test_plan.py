@@ -76,27 +76,6 @@ def test_a_pad_that_does_not_shrink_is_its_own_mould():
     assert Plan(Morphology.straight(2)).enlarged.pad.pitch_mm == 11.25
 
 
-@pytest.mark.parametrize(
-    ("mould", "line"),
-    [
-        ({"ridge_width_mm": 12.0}, "[mould] ridge_width_mm: got 12, allowed is less than the pitch, 11.25 mm"),
-        (
-            {"shallow_ridge_height_mm": 1.2},
-            "[mould] shallow_ridge_height_mm: got 1.2, allowed is less than deep_ridge_height_mm, 1.2 mm",
-        ),
-        ({"silicone_mm": 1.0}, "[mould] deep_ridge_height_mm: got 1.2, allowed is less than silicone_mm, 1 mm"),
-        (
-            {"tolerance_mm": 0.1, "ridge_width_mm": 0.4},
-            "[mould] tolerance_mm: got 0.1, allowed is less than a quarter of ridge_width_mm, 0.1 mm",
-        ),
-    ],
-)
-def test_contradictory_settings_are_one_clear_line(mould, line):
-    with pytest.raises(InputError) as error:
-        Plan(Morphology.straight(4), with_settings(mould))
-    assert str(error.value) == line
-
-
 @settings(max_examples=50)
 @given(st.integers(1, 6), st.data())
 def test_fibres_that_cross_never_share_a_level(grid, data):

@@ -170,6 +170,7 @@ def test_any_mesh_is_drawn_with_its_findings(tmp_path):
     assert not where(pixels(path), ALARM).any()
 
 
+@pytest.mark.slow
 def test_pictures_are_small(tmp_path, published):
     plan = Plan(Morphology.load(published / "20para.mat"))
     findings = [finding("fail", *as_places(plan.pad.to_mm([c.place for c in plan.clashes])))]

@@ -1,18 +1,21 @@
+"""The page for the bench: what to mix, cut, lay and wire, by integration and by the curves, and what it says of it."""
+
 import math
+import re
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import shapely
 from scipy.integrate import quad
-from scipy.interpolate import PchipInterpolator
 
 from design.pad.morphology import Morphology
-from fabricate.mould.assembly import mould_body, plan_mesh
-from fabricate.mould.mesh import mesh
+from fabricate.export import build
+from fabricate.mould.assembly import plan_mesh
 from fabricate.mould.plan import Plan
-from fabricate.report.laying import guide, orientation
-from fabricate.settings import DEFAULTS, FabricationSettings
-from tests.fabricate.planted import level_pad, with_settings
+from fabricate.report.laying import guide, orientation, print_settings
+from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
+from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 
 def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
@@ -56,26 +59,16 @@ def test_silicone_of_a_straight_pad(draft_deg):
     assert silicone["part_a_g"] == silicone["part_b_g"] == pytest.approx(silicone["mass_g"] / 2)
 
 
-def test_a_thicker_pad_takes_more_silicone(published):
-    plan = Plan(Morphology.load(published / "20para.mat"))
+def test_pins_take_no_silicone_and_a_thicker_pad_takes_more(tmp_path):
+    pad = Morphology.straight(2)
+    volumes = [build(pad, tmp_path, [], with_settings({"pins": pins}))["silicone_volume_ml"] for pins in (True, False)]
+    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
+    plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
     silicone = guide.document(plan, plan_mesh(plan).volume())["silicone"]
-    assert silicone["thickness_mm"] == plan.silicone_mm == 7.0
-    empty = plan.silicone.area * 7
+    assert silicone["thickness_mm"] == plan.silicone_mm == 3.0
+    empty = plan.silicone.area * 3
     tracks = sum(area.area * height for area, height in zip(plan.ridges, plan.heights_mm, strict=True))
     assert empty - tracks < 1000 * silicone["volume_ml"] < empty * 1.02
-
-
-def test_pins_take_no_silicone():
-    pad = Morphology.straight(3)
-    with_pins = Plan(pad, with_settings({"pins": True}))
-    height = DEFAULTS.mould.floor_mm + with_pins.silicone_mm
-    inner = mesh(mould_body(with_pins)).trim_by_plane((0, 0, -1), -height)
-    plain = Plan(pad)
-    volumes = [
-        guide.document(p, v)["silicone"]["volume_ml"]
-        for p, v in ((with_pins, inner.volume()), (plain, plan_mesh(plain).volume()))
-    ]
-    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
 
 
 @pytest.mark.parametrize("mould", [{}, {"border_mm": 1.5, "exit_mm": 0.0, "lead_mm": 12.5}])
@@ -83,15 +76,12 @@ def test_lengths_are_those_of_the_curves(mould):
     plan = Plan(Morphology.random(3, 4, seed=3), with_settings(mould))
     tongue = plan.settings.mould.border_mm + plan.settings.mould.exit_mm
     for fibre, entry in enumerate(guide.document(plan, 1.0)["fibres"]):
-        axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
-        slope = PchipInterpolator(knots[:, axis], knots[:, 1 - axis]).derivative()
-        stretches = zip(knots[:-1, axis], knots[1:, axis], strict=True)
-        course = sum(quad(lambda t, slope=slope: np.hypot(1, slope(t)), *ends, limit=200)[0] for ends in stretches)
+        course = shapely.LineString(exact_fibre(plan.pad, fibre)).length
         assert entry["in_pad_mm"] == pytest.approx(course + 2 * tongue, abs=0.006)
         assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
 
 
-def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
+def test_a_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
     document = guide.document(plan, 1.0)
     assert [fibre["number"] for fibre in document["fibres"]] == list(range(1, 9))
@@ -100,17 +90,15 @@ def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
     assert depths == [{2.8}, {2.0}, {1.2}, {0.4}]
     assert sorted(n for step in document["laying_order"] for n in step) == list(range(1, 9))
     assert [fibre["level"] for fibre in document["fibres"]] == list(plan.levels)
-
-
-def test_silicone_between_fibres_at_every_crossing(published):
-    plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    crossings = guide.document(plan, 1.0)["crossings"]
+    crossings = document["crossings"]
     assert crossings["total"] == len(crossings["table"]) == 30
-    assert crossings["same_family"] == 6
+    assert (crossings["same_family"], crossings["gap_mm"]) == (6, 0.5)
     assert all(len(row) == len(crossings["columns"]) for row in crossings["table"])
     for *_, first_mm, second_mm, gap in crossings["table"]:
         assert gap == pytest.approx(abs(first_mm - second_mm) - 0.3)
-    assert crossings["gap_mm"] == 0.5
+    table = rows(guide.laying_page(whole(plan)), "depths")  # so many crossings are counted by depth
+    assert sum(int(count) for *_, count in table) == 30
+    assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
 
 
 @pytest.mark.parametrize(
@@ -233,41 +221,22 @@ def test_parts_are_weighed_by_their_ratio():
     assert silicone["mass_g"] == pytest.approx(silicone["volume_ml"] * 1.3 * 1.1, abs=0.011)
 
 
-def test_the_page_tells_how_the_pad_lies_in_its_holder():
-    page = guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
-    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
-    assert "holder" not in guide.laying_page(whole(Plan(Morphology.straight(4))))
-
-
-def test_the_page_has_the_places_of_the_plan():
-    plan = Plan(Morphology.straight(2))
-    page = guide.laying_page(whole(plan))
-    assert "x runs to the left" in page
+def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
+    plain = whole(Plan(Morphology.straight(2)))
+    page = guide.laying_page(plain)
+    for absent in ("holder", "machine", "the lid", "of resin", "pour through its spout"):
+        assert absent not in page
+    section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
+    assert orientation.sentence((2, 2), "edges") in section
+    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 4." in section
+    assert f"]({orientation.FILE})" in section
     table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-
-
-def test_the_page_names_the_ways_of_a_machine_where_there_are_some():
-    document = whole(Plan(Morphology.straight(2)))
-    assert "machine" not in guide.laying_page(document)
-    page = guide.laying_page(document | {"files": ["mould.stl", "laying.gcode", "laying.script", "dispensing.svg"]})
+    page = guide.laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "dispensing.svg"]})
     assert "in `laying.gcode` and `laying.script` and drawn in `dispensing.svg`" in page.partition("## Lay\n")[2]
-
-
-def test_the_page_says_and_shows_which_way_round():
-    page = guide.laying_page(whole(Plan(Morphology.straight(4))))
-    section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
-    assert orientation.sentence((4, 4), "edges") in section
-    assert "Horizontal fibres are 1 to 4, vertical ones 5 to 8." in section
-    assert f"]({orientation.FILE})" in section
-
-
-def test_many_crossings_are_counted_by_depth(published):
-    page = guide.laying_page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
-    table = rows(page, "depths")
-    assert sum(int(count) for *_, count in table) == 30
-    assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
+    page = guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
+    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
 
 
 def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
@@ -285,7 +254,6 @@ def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
     assert "read the right way" not in page
     plain = guide.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
-    assert "the lid" not in plain
 
 
 def test_the_page_says_what_to_set_for_the_printer_at_hand():
@@ -294,3 +262,61 @@ def test_the_page_says_what_to_set_for_the_printer_at_hand():
     resin = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"resin": True}))))
     assert "PrusaSlicer" not in resin
     assert resin.index("- Slice it") < resin.index("- Turn anti-aliasing") < resin.index("- Wash and cure")
+
+
+def found(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:
+    """The value of a setting as PrusaSlicer has it, and why."""
+    row = next(row for row in print_settings.rows(mould, printer) if row[0].startswith(f"{name}: "))
+    return row[0].removeprefix(f"{name}: "), row[-1]
+
+
+def test_every_slicer_is_told_every_setting_and_why():
+    told = list(print_settings.rows(MouldSettings(), PrinterSettings()))
+    assert {len(row) for row in told} == {len(print_settings.HEAD)}
+    assert all(cell for row in told for cell in row)
+    for columns in zip(*told, strict=True):
+        assert len(set(columns)) == len(told)
+    for prusa, orca, cura, _ in told:  # where all give a size, it is the same one, but for its sign
+        sizes = [re.findall(r"([\d.]+) mm", cell) for cell in (prusa, orca, cura)]
+        assert sizes[0] == sizes[1]
+        assert sizes[2] in (sizes[0], [])
+
+
+@pytest.mark.parametrize(
+    ("floor", "layer", "nozzle", "first"),
+    [(2, 0.1, 0.4, 0.2), (2, 0.2, 0.4, 0.2), (2, 0.3, 0.4, 0.2), (2.05, 0.1, 0.4, 0.15), (0.4, 0.2, 1, 0.4)],
+)
+def test_whole_layers_are_left_of_the_floor(floor, layer, nozzle, first):
+    printer = PrinterSettings(layer_mm=layer, nozzle_mm=nozzle)
+    assert found("First layer height", MouldSettings(floor_mm=floor), printer)[0] == f"{first:g} mm"
+    assert (floor - first) / layer == pytest.approx(round((floor - first) / layer), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("ridge", "nozzle", "width", "why"),
+    [
+        (0.4, 0.4, "0.4 mm", "0.4 mm wide is one line"),
+        (0.5, 0.4, "0.5 mm", "0.5 mm wide is one line"),
+        (0.8, 0.4, "0.4 mm", "0.8 mm wide is 2 lines"),
+        (0.4, 0.6, "0.51 mm", "0.4 mm wide is narrower than the nozzle: see the checks"),
+    ],
+)
+def test_a_ridge_is_whole_lines(ridge, nozzle, width, why):
+    mould, printer = MouldSettings(ridge_width_mm=ridge), PrinterSettings(nozzle_mm=nozzle)
+    assert found("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
+
+
+@pytest.mark.parametrize(("wall", "lines"), [(0.8, "2"), (2.0, "3"), (20.0, "4")])
+def test_walls_of_the_tray_are_solid_where_they_are_thin(wall, lines):
+    assert found("Perimeters", MouldSettings(wall_mm=wall), PrinterSettings())[0] == lines
+
+
+def test_resin_is_told_in_pixels_and_layers():
+    text = "\n".join(
+        print_settings.for_resin(MouldSettings(), PrinterSettings(resin=True, nozzle_mm=0.05, layer_mm=0.05))
+    )
+    assert "in layers of 0.05 mm" in text
+    assert "A ridge is 8 pixels wide" in text
+    assert "the floor is 2 mm, 40 layers" in text
+    one = print_settings.for_resin(MouldSettings(), PrinterSettings(resin=True, nozzle_mm=0.4))
+    assert any("A ridge is 1 pixel wide" in line for line in one)
