@@ -38,7 +38,6 @@ FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
         ("mould", {"ridge_draft_deg": -1.0}, ("[mould] ridge_draft_deg", "-1.0")),
         ("mould", {"ridge_draft_deg": math.nan}, ("[mould] ridge_draft_deg", "nan")),
         ("mould", {"levels": "three"}, ("[mould] levels", "'three'")),
-        ("mould", {"spout": True}, ("[mould] spout", "lid")),
         ("printer", {"bed_mm": [100.0, 100.0]}, ("[printer] bed_mm", "at least 3")),
         ("printer", {"layer_mm": 0.0}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
         ("dispenser", BOX, ("[dispenser] box_mm", "5.0", "from low to high")),
@@ -71,6 +70,7 @@ def test_a_bad_key_is_one_clear_line(section, keys, parts):
     ("mould", "pitch_mm", "line"),
     [
         ({"ridge_width_mm": 12.0}, 11.25, "[mould] ridge_width_mm: got 12, allowed is less than the pitch, 11.25 mm"),
+        ({"spout": True}, 11.25, "[mould] spout: "),
         ({"exit_width_mm": 11.0}, 11.25, "[mould] exit_width_mm: "),
         ({"exit_width_mm": 0.3}, 11.25, "[mould] exit_width_mm: "),
         ({}, 0.1, "[mould] ridge_width_mm: got 0.4, allowed is less than the pitch, 0.1 mm"),
@@ -158,12 +158,6 @@ def test_the_defaults_are_those_the_pads_were_made_with():
         "bed_mm": [220.0, 220.0, 250.0],
         "resin": False,
     }
-
-
-@pytest.mark.parametrize("other", [None, {"mould": {}}])
-def test_settings_are_read_from_a_spec_and_nothing_else(other):
-    with pytest.raises(InputError, match=r"spec is .*, expected a Spec"):
-        FabricationSettings.from_spec(other)
 
 
 def test_numbers_of_numpy_are_numbers():

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-import trimesh.exchange.stl
 from manifold3d import Manifold, OpType
 
 from fabricate.checks import slices
-from fabricate.checks.findings import graded
-from fabricate.checks.mesh_checks import SOUND, check_mesh, inspect_mesh, sound
+from fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
 from fabricate.checks.surface import Surface
 from fabricate.settings import PrinterSettings
 from tests.fabricate.checks.trays import CROSS, FLOOR, block, faults, inspected, line, near, prism, tray
@@ -130,28 +128,6 @@ def _together(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
-class TestFiles:
-    @pytest.mark.parametrize("suffix", ["stl", "3mf"])
-    def test_a_box(self, tmp_path, suffix):
-        path = tmp_path / f"box.{suffix}"
-        TestSound.box.export(path)
-        assert {finding.status for finding in check_mesh(path)} == {"pass"}
-
-    def test_two_solids_in_an_ascii_stl(self, tmp_path):
-        far = block(10, 20, 5, at=(30, 0, 0))
-        text = "\n".join(trimesh.exchange.stl.export_stl_ascii(mesh) for mesh in (TestSound.box, far))
-        (tmp_path / "two.stl").write_text(text)
-        found = {finding.name: finding for finding in check_mesh(tmp_path / "two.stl")}
-        assert faults(found) == {"bodies": "fail"}
-        assert found["bodies"].measured == 2
-
-    def test_two_objects_in_a_3mf(self, tmp_path):
-        near_by = block(10, 20, 5, at=(5, 4, 0))
-        trimesh.Scene([TestSound.box, near_by]).export(tmp_path / "two.3mf")
-        found = {finding.name: finding for finding in check_mesh(tmp_path / "two.3mf")}
-        assert {"bodies", "self_intersection"} <= set(faults(found))
-
-
 class TestTight:
     @pytest.mark.parametrize("width", [1.0, 3.0, 8.0])
     def test_a_wall_cut_open(self, width):
@@ -207,33 +183,6 @@ class TestTight:
         assert inspected(tray(*CROSS) - slot - recess)["tight"].status == "pass"
 
 
-def surface(*meshes) -> Surface:
-    corners = np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)
-    return Surface.joined(corners, np.arange(len(corners)).reshape(-1, 3))
-
-
-def test_equal_corners_are_one_and_triangles_without_three_are_none():
-    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.0, -0.0, 0], [1, 0, 0], [5, 5, 5]]
-    found = Surface.joined(vertices, [[0, 1, 2], [3, 4, 2], [0, 3, 2], [1, 4, 2]])
-    assert found.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5]]
-    assert len(found.triangles) == 2
-    assert (found.triangles[0] == found.triangles[1]).all()
-    assert found.bottom_top.tolist() == [[0, 0, 0], [1, 1, 0]]
-
-
-def test_a_box_has_its_measures():
-    box = surface(block(2, 3, 4, at=(10, -5, 2)))
-    assert len(box.vertices) == 8
-    assert box.areas.sum() == pytest.approx(2 * (6 + 8 + 12))
-    assert box.volumes.sum() == pytest.approx(24)
-    assert sorted(box.rise) == pytest.approx([-1] * 2 + [0] * 8 + [1] * 2)
-    assert box.areas[box.rise == 1].sum() == pytest.approx(6)
-    np.testing.assert_allclose(box.bottom_top, [[9, -6.5, 0], [11, -3.5, 4]])
-    assert len(box.edges[0]) == 18
-    assert np.bincount(box.edges[1]).tolist() == [2] * 18
-    np.testing.assert_allclose(box.middles, box.corners.mean(axis=1))
-
-
 @pytest.mark.parametrize(("height", "rise"), [(1.9e-3, 1.0), (0.9e-3, 0.0)])
 def test_needles_have_no_slope(height, rise):
     found = Surface.joined([[0, 0, 0], [2, 0, 0], [1, height, 0]], [[0, 1, 2]])
@@ -243,34 +192,9 @@ def test_needles_have_no_slope(height, rise):
     assert slanted.areas == pytest.approx([5])
 
 
-def test_shells_and_patches_are_told_apart_at_edges():
-    both = surface(block(2, 2, 2), block(2, 2, 2, at=(9, 0, 0)))
-    count, label = both.shells
-    assert count == 2
-    assert len(set(label[:12])) == len(set(label[12:])) == 1
-    upright = np.abs(both.rise) > 0.5
-    assert both.patches(upright)[0] == 4
-    places = both.patch_places(both.rise > 0.5)
-    assert sorted(x > 5 for x, _ in places) == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("measured", "status"),
-    [(0.4, "pass"), (0.4 - 1e-10, "pass"), (0.399, "warn"), (1e-6, "warn"), (0, "fail"), (-1, "fail")],
-)
-def test_what_is_less_than_the_limit_is_a_warning_and_nothing_a_failure(measured, status):
-    assert graded(measured, 0.4) == status
-
-
 class TestAreas:
     bar = shapely.box(0, 0, 10, 0.3)
     block = shapely.box(0, 0, 10, 5)
-
-    @pytest.mark.parametrize(
-        ("limit", "tested"), [(2.0, 1.9), (1.0, 0.95), (0.4, 0.38), (0.3, 0.28), (0.08, 0.06), (0.04, 0.03)]
-    )
-    def test_what_is_rough_is_allowed_for(self, limit, tested):
-        assert slices.tested_width(limit) == pytest.approx(tested)
 
     def test_a_bar_is_as_wide_as_it_is(self):
         (patch,) = slices.too_narrow(self.bar, 0.4)
@@ -279,13 +203,6 @@ class TestAreas:
         assert len(slices.too_narrow(self.bar, 0.31)) == 0
         assert len(slices.too_narrow(self.block, 4.9)) == 0
         assert slices.spare_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
-
-    def test_only_what_lies_within_counts(self):
-        both = shapely.union(self.bar, shapely.box(0, 5, 10, 5.35))
-        assert len(slices.too_narrow(both, 0.4)) == 2
-        (patch,) = slices.too_narrow(both, 0.4, within=shapely.box(-1, 4, 20, 6))
-        assert patch.bounds == pytest.approx((0, 5, 10, 5.35), abs=1e-3)
-        assert slices.least_width(both, slices.too_narrow(both, 0.4), 0.4) == pytest.approx(0.3, abs=0.011)
 
     @pytest.mark.parametrize(("neck", "narrow"), [(0.7, False), (1.5, True)])
     def test_what_leads_far_from_something_wider_is_no_tip(self, neck, narrow):

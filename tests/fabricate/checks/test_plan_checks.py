@@ -223,8 +223,7 @@ class TestSilicone:
         assert found(pad, "silicone_wall").status != "pass"
 
     @pytest.mark.parametrize(
-        ("from_wall_mm", "status"),
-        [(0.62, "pass"), (0.58, "warn"), (0.22, "warn"), (0.1, "fail")],
+        ("from_wall_mm", "status"), [(0.62, "pass"), (0.58, "warn"), (0.22, "warn"), (0.1, "fail")]
     )
     def test_a_track_beside_the_tray_wall(self, from_wall_mm, status):
         finding = found(level_pad(from_wall_mm / 10, 2.0), "tray_wall")

@@ -73,14 +73,6 @@ def test_bodies_that_reach_into_each_other(depth, counts):
         assert (np.abs(middles - [5 - depth / 2, 0.5]) <= [depth / 2 + 1e-9, 4.5 + 1e-9]).all()
 
 
-def test_a_point_through_a_face():
-    spike = np.array([[[0, 0, 4], [1, 0, 8], [0, 1, 8]]], dtype=float)
-    corners = np.concatenate([CUBE, spike])
-    pairs = penetrating(corners)
-    assert 12 in pairs
-    assert np.abs(places(corners, pairs) - 0.1).max() < 0.2
-
-
 def test_one_shell_through_itself():
     torus = trimesh.creation.torus(2, 3)
     pairs = penetrating(np.asarray(torus.triangles))
@@ -109,14 +101,3 @@ def test_the_rounding_of_an_stl_is_no_fault(turn, away):
 def test_needles_and_nothing():
     assert found(np.empty((0, 3, 3))) == 0
     assert found(np.array([[[0, 0, 0], [1, 1, 1], [2, 2, 2.0]]]), CUBE) == 0
-
-
-def test_no_more_pairs_than_wanted():
-    corners = np.concatenate([CUBE, moved(CUBE, 1, 2, 3)])
-    assert penetrating(corners, most=2).shape == (2, 2)
-    assert len(penetrating(corners)) > 2
-
-
-def test_a_heap_of_triangles_is_told_from_its_first_pairs():
-    corners = np.random.default_rng(0).normal(size=(20_000, 3, 3))
-    assert len(penetrating(corners)) == 1000

@@ -158,20 +158,6 @@ def test_the_frame_on_the_bed_is_that_of_the_mould():
     assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
 
 
-def test_a_lid_with_pins_and_spout_has_the_volume_that_arithmetic_gives():
-    plan = Plan(Morphology.straight(1), with_settings(EVERYTHING))
-    disc = 8 * math.sin(math.pi / 32)  # area of 64 sides around a diameter of 1
-    flare = 2 * 6 * math.tan(math.radians(30))
-
-    def cone(low, high, height):
-        return disc * height * (low**2 + low * high + high**2) / 3
-
-    plate = 3 * (sizes(plan)["tray_mm"] ** 2 - disc * (4 * 1.5**2 + 3 * (sizes(plan)["pin_mm"] + 0.3) ** 2 + 6.0**2))
-    cup = cone(10 + flare * 0.2 / 6.2, 10 + flare, 6.0)
-    lid = mesh(lid_body(plan))
-    assert lid.volume() == pytest.approx(plate + cup - cone(6.0, 6 + flare, 6.0), rel=1e-6)
-
-
 @pytest.mark.parametrize(("family", "heights"), [("horizontal", (1.2, 0.4)), ("vertical", (0.4, 1.2))])
 def test_each_family_gets_its_height(family, heights):
     plan = Plan(Morphology.straight(2, pitch_mm=10.0), with_settings({"number_mm": 0.0}, pad={"deep_family": family}))

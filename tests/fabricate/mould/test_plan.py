@@ -7,7 +7,6 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely import affinity
 
 from design.common.errors import InputError
 from design.pad.courses.curves import Crossing
@@ -172,21 +171,6 @@ DIGITS = """
 #.# ..# #.. ..# ..# ..# #.# ..# #.# ..#
 ### ..# ### ### ..# ### ### ..# ### ###
 """
-
-
-@pytest.mark.parametrize("digit", range(10))
-def test_every_digit_reads_as_it_should(digit):
-    """After an 8, turned over: corners, ends and middles of strokes are there or not."""
-    height, width = 2.5, 0.4
-    outline = affinity.scale(number_strokes(80 + digit, height, width), xfact=-1, origin=(0, 0))
-    left, low, right, _ = outline.bounds
-    assert right - left == pytest.approx(width + height * 0.5 * 2 + width + 0.25 * height)
-    place = np.array([right - width / 2 - 0.5 * height, low + width / 2])
-    rows = [row.split()[digit] for row in DIGITS.split("\n") if row]
-    for down, row in enumerate(rows):
-        for across, cell in enumerate(row):
-            point = shapely.Point(place + height * np.array([across / 4, 1 - down / 4]))
-            assert outline.covers(point) == (cell == "#")
 
 
 @pytest.mark.parametrize("pad", [Morphology.straight(5), Morphology.random(5, 3, seed=2)])

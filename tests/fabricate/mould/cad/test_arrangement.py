@@ -1,7 +1,7 @@
 """Cells of drawn shapes and the chains of curves between them, against places where circles and lines meet."""
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from shapely.geometry.base import BaseGeometry
 
 from fabricate.mould.cad.outlines.arrangement import Arrangement, Loop
-from fabricate.mould.cad.outlines.drawing import GRID_MM, Drawing
+from fabricate.mould.cad.outlines.drawing import Drawing
 from fabricate.mould.cad.outlines.pieces import ring_pieces, straight_pieces
 from fabricate.mould.plan import polygon_rings
 
@@ -87,36 +87,10 @@ def test_there_is_no_border_between_cells_of_one_kind():
     assert area_within(arrangement, next(arrangement.faces(range(len(drawing.cells))))) == pytest.approx(7)
 
 
-def test_cells_left_out_are_nothing():
-    drawing = drawn(shapely.box(0, 0, 2, 2), shapely.box(1, 1, 3, 3))
-    shared = [cell.area < 2 for cell in drawing.cells]
-    kinds: list[Hashable | None] = ["both" if both else None for both in shared]
-    arrangement = Arrangement(drawing, kinds)
-    assert len(arrangement.chains) == len(used(arrangement)) == 4
-    assert {max(chain.left, chain.right) for chain in arrangement.chains} == {shared.index(True)}
-
-
-def test_a_hole_is_a_loop_the_other_way():
-    arrangement, drawing = arranged(shapely.box(-5, -5, 5, 5) - disc(1, 0, 2.0))
-    (ring,) = (k for k, cell in enumerate(drawing.cells) if len(cell.interiors))
-    ((outer, hole),) = arrangement.faces([ring])
-    assert area_within(arrangement, [outer]) == pytest.approx(100)
-    assert area_within(arrangement, [hole]) == pytest.approx(-4 * math.pi)
-
-
 def test_cells_that_hang_together_are_one_face_and_others_are_not():
     arrangement, drawing = arranged(shapely.box(0, 0, 2, 2), shapely.box(1, 1, 3, 3), shapely.box(7, 7, 8, 8))
     faces = list(arrangement.faces(range(len(drawing.cells))))
     assert sorted(area_within(arrangement, loops) for loops in faces) == pytest.approx([1, 7])
-
-
-def test_lines_that_coincide_over_a_length_are_one_chain():
-    arrangement, drawing = arranged(shapely.box(0, 0, 2, 2), shapely.box(2, 0.5, 3, 1.5), shapely.box(2, 0.5, 4, 1.0))
-    between = [chain for chain in arrangement.chains if min(chain.left, chain.right) >= 0]
-    assert sum(chain.end - chain.start for chain in arrangement.chains) == pytest.approx(
-        shapely.union_all([cell.boundary for cell in drawing.cells]).length
-    )
-    assert sum(chain.end - chain.start for chain in between) == pytest.approx(1 + 1 + 0.5)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 5))
@@ -148,50 +122,3 @@ def test_a_circle_that_touches(other, apart):
         aside = math.sqrt(1 - (1 + apart) ** 2)
         for x in (-aside, aside):
             assert np.linalg.norm(used(arrangement) - (x, 0), axis=1).min() < 1e-8
-
-
-@st.composite
-def triangles(draw: st.DrawFn) -> list[shapely.Polygon]:
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    count = draw(st.integers(1, 6))
-    return [shapely.Polygon(corners) for corners in rng.uniform(0, 9, (count, 3, 2))]
-
-
-@given(triangles())
-@settings(max_examples=12)
-def test_every_edge_is_there_once_with_what_lies_beside_it(areas):
-    drawing = drawn(*areas)
-    known = set(drawing.edges)
-    assert len(known) == len(drawing.edges)
-    assert not known & {(b, a) for a, b in known}
-    for (a, b), (left, right), piece in zip(drawing.edges, drawing.sides, drawing.pieces_of, strict=True):
-        start, end = GRID_MM * np.array(a), GRID_MM * np.array(b)
-        middle, along = (start + end) / 2, (end - start) / np.linalg.norm(end - start)
-        assert shapely.LineString(drawing.pieces[piece].points).distance(shapely.Point(middle)) < 2 * GRID_MM
-        if np.linalg.norm(end - start) < 1e-3:
-            continue
-        for side, way in ((left, 1), (right, -1)):
-            beside = shapely.Point(middle + way * 1e-5 * np.array([-along[1], along[0]]))
-            inside = [k for k, cell in enumerate(drawing.cells) if cell.contains(beside)]
-            assert inside in ([side], []) if side >= 0 else inside == []
-    around = sum(
-        math.dist(a, b) * GRID_MM for (a, b), (_, right) in zip(drawing.edges, drawing.sides, strict=True) if right < 0
-    )
-    covered = shapely.union_all(drawing.cells)
-    assert around == pytest.approx(covered.length, rel=1e-6)
-    assert shapely.area(drawing.cells).sum() == pytest.approx(covered.area, rel=1e-6)
-    outer = [shapely.Polygon(part.exterior) for part in shapely.get_parts(shapely.union_all(areas))]
-    assert covered.area == pytest.approx(shapely.union_all(outer).area, rel=1e-6)  # what they enclose as well
-    assert shapely.contains_xy(drawing.cells, *drawing.middles.T).all()
-
-
-def test_slivers_belong_to_what_they_lie_along():
-    """Two squares that should share a side, drawn 3 nanometres apart."""
-    sliver = 3e-6
-    drawing = drawn(shapely.box(0, 0, 1, 1), shapely.box(1 + sliver, 0, 3, 1), shapely.box(-1, -1, 4, 2))
-    assert drawn(shapely.box(0, 0, 1, 1), shapely.box(1 + 1e-8, 0, 3, 1)).thin() == {}  # one line, on the grid
-    overlap = drawn(shapely.box(0, 0, 1, 1), shapely.box(1 - sliver, 0, 3, 1), shapely.box(-1, -1, 4, 2))
-    ((thin, beside),) = overlap.thin().items()
-    assert overlap.cells[thin].area == pytest.approx(sliver)
-    assert overlap.cells[beside].area == pytest.approx((1, 2)[overlap.cells[beside].area > 1.5], abs=1e-4)
-    assert drawing.thin() == {}  # what is open between them is part of what lies around

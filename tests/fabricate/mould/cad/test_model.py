@@ -5,7 +5,6 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
-import shapely
 from build123d import Compound, GeomType, Solid, import_step
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
@@ -15,18 +14,9 @@ from scipy.spatial import KDTree
 from design.common.errors import InputError
 from design.pad.courses.curves import lengths
 from design.pad.morphology import Morphology
-from fabricate.mould.assembly import (
-    conductive_body,
-    conductive_plan,
-    holder_body,
-    lid_body,
-    mould_body,
-    well_outlines,
-)
+from fabricate.mould.assembly import conductive_plan, holder_body, lid_body, mould_body, well_outlines
 from fabricate.mould.cad import model as of_model
-from fabricate.mould.cad.layout import HORIZONTAL, NUMBERS, TRAY, VERTICAL, Part, Surface, contact_mm2, layout
 from fabricate.mould.cad.model import FITS_MM, Model, assembly, body_model, build_mould, models, mould_model
-from fabricate.mould.cad.outlines.drawing import Drawing
 from fabricate.mould.cad.step_file import write_step
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
@@ -53,21 +43,27 @@ def judged(plan: Plan, **wells) -> Model:
     return model
 
 
-@pytest.mark.parametrize("draft_deg", [0.0, 2.0, 20.0])
-def test_a_straight_pad_has_the_volume_and_surface_that_arithmetic_gives(draft_deg):
-    plan = Plan(Morphology.straight(4), with_settings(PLAIN | {"wall_draft_deg": draft_deg}))
+@pytest.mark.parametrize(("draft_deg", "deep"), [(0.0, "horizontal"), (0.0, "vertical"), (20.0, "horizontal")])
+def test_a_straight_pad_has_the_volumes_and_contact_that_arithmetic_gives(draft_deg, deep):
+    settings = with_settings(PLAIN | {"wall_draft_deg": draft_deg}, pad={"deep_family": deep})
+    plan = Plan(Morphology.straight(4), settings)
     slope = math.tan(math.radians(draft_deg))
     inner, ridge, lean = 56.25, 0.4, 2 * 6 * slope
-    ridges = 4 * inner * ridge * (1.2 + 0.4) - 16 * ridge * ridge * 0.4  # the shallow ones end at the deep ones
+    behind = 2 * ridge * slope * 4 / 2  # where the wall leans off a ridge's end, times its height squared
     rim = inner + lean
-    hollow = 6 * (inner**2 + inner * rim + rim**2) / 3
-    behind = 2 * ridge * slope * 4 * (1.2**2 + 0.4**2) / 2  # where the wall leans off a ridge's end
-    expected = (rim + 4) ** 2 * 8 - hollow + ridges + behind
-    model = judged(plan)
-    assert sum(child.volume for child in model.shape.children) == pytest.approx(expected, rel=1e-9)
-    assert build_mould(plan.pad, plan.settings).volume == pytest.approx(expected, rel=1e-9)
+    tray = (rim + 4) ** 2 * 8 - 6 * (inner**2 + inner * rim + rim**2) / 3
+    deeper = 4 * inner * ridge * 1.2 + behind * 1.2**2
+    shallow = 4 * (inner - 4 * ridge) * ridge * 0.4 + behind * 0.4**2  # the taller ones go through
+    model, other = judged(plan), {"horizontal": "vertical", "vertical": "horizontal"}[deep]
+    volumes = {child.label: child.volume for child in model.shape.children}
+    expected = {"tray": tray, f"{deep} tracks": deeper, f"{other} tracks": shallow}
+    assert volumes == pytest.approx(expected, rel=1e-9)
+    assert build_mould(plan.pad, plan.settings).volume == pytest.approx(sum(expected.values()), rel=1e-9)
     assert max(model.apart(mesh(mould_body(plan)))) < 1e-7
     assert all(face.geom_type == GeomType.PLANE for face in model.shape.faces())
+    footprint = 4 * (inner + inner - 4 * ridge) * ridge
+    crossings, ends = 16 * 2 * ridge * 0.4, 4 * 2 * ridge * (1.2 + 0.4) * math.hypot(1, slope)
+    assert model.contact_mm2 == pytest.approx(footprint + crossings + ends, rel=1e-6)
 
 
 def test_the_walls_of_a_curved_fibre_are_as_long_as_its_exact_offsets():
@@ -158,68 +154,13 @@ def test_published_pads(published, name):
     judged(Plan(Morphology.load(published / f"{name}.mat")))
 
 
-UPRIGHT = with_settings({"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0})
-
-
-def volumes(drawing: Drawing, parts: list[Part]) -> dict[str, float]:
-    """Of every part, cell by cell: prisms under planes, whose mean height is that over the cell's centroid."""
-    middles = shapely.get_coordinates(shapely.centroid(drawing.cells))
-
-    def height(surface: Surface, cell: int) -> float:
-        return float(surface[0].plane(surface[1], middles[[cell]])[0]) if isinstance(surface, tuple) else surface
-
-    return {
-        part.name: sum(
-            drawing.cells[cell].area * (height(span.top, cell) - height(span.bottom, cell))
-            for cell, span in enumerate(part.spans)
-            if span is not None
-        )
-        for part in parts
-    }
-
-
-@pytest.mark.parametrize(("deep", "family"), [(HORIZONTAL, "horizontal"), (VERTICAL, "vertical")])
-def test_a_straight_pad_has_the_volumes_that_arithmetic_gives(deep, family):
-    settings = with_settings(UPRIGHT.mould.model_dump(), pad={"deep_family": family})
-    plan = Plan(Morphology.straight(3, pitch_mm=10.0), settings)
-    inner, ridge, tray = 40.0, 0.4, plan.tray.area
-    found = volumes(*layout(plan, FITS_MM[0]))
-    shallow = VERTICAL if deep == HORIZONTAL else HORIZONTAL
-    assert found == pytest.approx(
-        {
-            TRAY: tray * 8 - inner**2 * 6,
-            deep: 3 * inner * ridge * 1.2,
-            shallow: 3 * ridge * 0.4 * (inner - 3 * ridge),  # the taller ones go through
-        },
-        rel=1e-9,
-    )
-
-
-@pytest.mark.parametrize("draft_deg", [0.0, 10.0])
-def test_contact_is_what_tracks_stand_on_and_end_at(draft_deg):
-    settings = with_settings({"exit_mm": 0.0, "number_mm": 0.0, "wall_draft_deg": draft_deg})
-    drawing, parts = layout(Plan(Morphology.straight(1, pitch_mm=20.0), settings), FITS_MM[0])
-    lean = math.hypot(1, math.tan(math.radians(draft_deg)))  # of the wall, per mm of height
-    expected = 40 * 0.4 * 2 - 0.4**2 + 2 * 0.4 * 0.4 + 2 * 0.4 * (1.2 + 0.4) * lean  # floor, crossing, ends
-    assert contact_mm2(drawing, parts) == pytest.approx(expected, rel=1e-6)
-
-
-def test_wells_belong_to_their_tracks():
-    plan = conductive_plan(
-        Plan(winding_pad((0.6, 1.3), (1.5, 0.8), pitch_mm=12.0), with_settings({"conductive": True}))
-    )
-    sides = 64
-    with_wells = volumes(*layout(plan, FITS_MM[0], well_outlines(plan, sides)))
-    without = volumes(*layout(plan, FITS_MM[0]))
-    assert sum(with_wells.values()) == pytest.approx(mesh(conductive_body(plan)).volume(), rel=1e-5)
-    for name in (HORIZONTAL, VERTICAL):
-        assert with_wells[name] > without[name] + 2 * 0.3 * math.pi * 1.5**2
-    assert with_wells[NUMBERS] == pytest.approx(without[NUMBERS])
-
-
 def test_the_second_mould_has_its_wells():
     plan = conductive_plan(Plan(SOFT, with_settings({"conductive": True, "pins": True})))
     model = judged(plan, wells=well_outlines(plan, sides=512))
+    plain = mould_model(plan, "mould")
+    for name in ("horizontal tracks", "vertical tracks"):  # the wells belong to their tracks
+        assert part(model, name).volume > part(plain, name).volume + 2 * 0.3 * math.pi * 1.5**2
+    assert part(model, "numbers").volume == pytest.approx(part(plain, "numbers").volume)
     round_ = [face for face in part(model, "vertical tracks").faces() if face.geom_type == GeomType.CYLINDER]
     assert sum(face.area for face in round_) == pytest.approx(2 * (2 * math.pi * 1.5 - 2 * 0.4) * 0.4, rel=0.01)
 

@@ -13,14 +13,7 @@ from scipy.spatial import KDTree
 
 from design.pad.morphology import Morphology
 from fabricate.mould.cad.outlines.joints import joints, with_joints
-from fabricate.mould.cad.outlines.pieces import (
-    FINE_MM,
-    Piece,
-    arc_through,
-    outline_pieces,
-    ring_pieces,
-    straight_pieces,
-)
+from fabricate.mould.cad.outlines.pieces import FINE_MM, Piece, arc_through, ring_pieces
 from fabricate.mould.cad.outlines.splines import MOST_SPANS, breaks, lengths, spline, stretch
 from fabricate.mould.plan import Plan, polygon_rings
 from tests.fabricate.planted import exact_fibre, with_settings
@@ -190,35 +183,6 @@ def test_finer_walls_are_nearer():
     assert deviation(plan, 0, fit_mm=1e-4)[0] < 5e-4
 
 
-def test_the_area_within_pieces_is_that_of_the_outline():
-    """Green's theorem on the curves, against the area of what was drawn."""
-    plan = Plan(Morphology.random(2, 4, seed=8))
-    nodes, weights = np.polynomial.legendre.leggauss(12)
-    for level in range(len(plan.heights_mm)):
-        area = 0.0
-        for piece in (piece for pieces in walls(plan, level) for piece in pieces):
-            knots = np.unique(piece.curve.t) if piece.curve else np.linspace(0, piece.length, 9)
-            for a, b in pairwise(knots):
-                s = (a + b) / 2 + (b - a) / 2 * nodes
-                (x, y), (dx, dy) = piece.at(s).T, piece.tangent(s).T
-                area += (b - a) / 4 * weights @ (x * dy - y * dx)
-        outline = plan.outline(level, 0.0, FINE_MM)
-        assert area == pytest.approx(outline.area, abs=FIT_MM / 2 * outline.length)
-
-
-def test_outline_pieces_know_how_high_they_rise():
-    pieces = outline_pieces(shapely.box(0, 0, 2, 1) - shapely.box(0.5, 0.2, 1, 0.6), {}, (2.0, 3.2), FIT_MM)
-    assert len(pieces) == 8
-    assert {piece.rise for piece in pieces} == {(2.0, 3.2)}
-
-
-def test_straight_pieces_are_every_edge_of_lines_and_rings():
-    lines = shapely.union_all([shapely.box(0, 0, 2, 1).exterior, shapely.LineString([(5, 5), (6, 7), (9, 7)])])
-    pieces = straight_pieces(lines)
-    assert sorted(piece.length for piece in pieces) == pytest.approx([1, 1, 2, 2, math.sqrt(5), 3])
-    assert pieces[0].at(pieces[0].length / 2) == pytest.approx(pieces[0].points.mean(axis=0))
-
-
 PLAN = Plan(Morphology.random(2, 3, seed=5))
 HALF_MM = PLAN.settings.mould.ridge_width_mm / 2
 
@@ -308,21 +272,6 @@ def test_ends_and_their_directions_are_exact(waves, high, count, fit_mm):
     for s, along in zip((first, last), tangents, strict=True):
         derivative = curve(s, 1)
         assert derivative / np.linalg.norm(derivative) == pytest.approx(along, abs=1e-9)
-
-
-def test_a_straight_polyline_takes_next_to_no_spans():
-    points = np.linspace([0, 0], [3, 4], 50)
-    curve = spline(points, [np.array([0.6, 0.8])] * 2, 1e-4)
-    assert len(np.unique(curve.t)) <= 4
-    assert curve(2.0) == pytest.approx([1.2, 1.6])
-
-
-def test_a_spline_keeps_to_chords_between_far_vertices():
-    """Between two vertices far apart a curve through both might bulge; the polyline says where the outline is."""
-    points = np.array([[0, 0], [1, 0], [2, 0], [3, 0], [4, 0.5], [5, 2], [5.2, 3]])
-    curve = spline(points, [np.array([1.0, 0.0]), np.array([0.0, 1.0])], 1e-2)
-    places = curve(np.linspace(0, lengths(points)[2], 500))
-    assert np.abs(places[:, 1]).max() <= 1e-2
 
 
 @pytest.mark.parametrize("far", [[19, 5], [10, 10, 10], [25]])

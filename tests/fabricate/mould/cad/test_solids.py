@@ -13,14 +13,12 @@ from hypothesis import strategies as st
 from scipy.special import ellipe
 from shapely.geometry.base import BaseGeometry
 
-from design.pad.morphology import Morphology
 from fabricate.mould.cad.layout import Span, Surface
 from fabricate.mould.cad.outlines.drawing import Drawing
 from fabricate.mould.cad.outlines.pieces import ring_pieces, straight_pieces
 from fabricate.mould.cad.shells import solids
-from fabricate.mould.cad.walls import FLOOR, RIM, Walls, walls_of
-from fabricate.mould.plan import Plan, polygon_rings
-from tests.fabricate.planted import with_settings
+from fabricate.mould.cad.walls import FLOOR, RIM, Walls
+from fabricate.mould.plan import polygon_rings
 
 
 def disc(x: float, y: float, radius: float) -> BaseGeometry:
@@ -100,12 +98,6 @@ def test_walls_of_several_heights_end_at_shared_corners():
     assert solid.area == pytest.approx(4 + 4 + 2 * (1 + 2 + 3 + 4) + (1 + 1 + 1 + 3))
 
 
-def test_separate_cells_are_separate_solids():
-    found = built([shapely.box(0, 0, 1, 1), disc(5, 0, 1), disc(9, 0, 1)], lambda within: 1.0 if within else None)
-    assert [solid.is_valid for solid in found] == [True] * 3
-    assert sorted(solid.volume for solid in found) == pytest.approx([1, math.pi, math.pi])
-
-
 def test_circles_that_cross():
     (solid,) = built([disc(0, 0, 2), disc(2, 1, 1.5)], lambda within: float(len(within)) or None)
     assert solid.is_valid
@@ -117,49 +109,6 @@ def test_circles_that_cross():
 
 
 BOWL = Walls(np.array([[-3.0, -2.0, 3.0, 2.0]]), floor_mm=1.0, depth_mm=4.0, flare_mm=0.8)
-
-
-CROSS = Walls(np.array([[-10.0, -10.0, 10.0, 10.0], [9.0, -1.0, 12.0, 1.0]]), 2.0, 6.0, 0.5)
-
-
-@given(st.floats(-13, 13), st.floats(-13, 13), st.sampled_from([BOWL, CROSS]))
-@settings(max_examples=60)
-def test_planes_are_the_heights_over_their_places(x, y, walls):
-    place = np.array([[x, y]])
-    (sheet,) = walls.sheets(place).tolist()
-    expected = walls.floor_mm if sheet == FLOOR else walls.floor_mm + walls.depth_mm
-    plane = expected if sheet < 0 else walls.plane(sheet, place)[0]
-    assert walls.heights(place)[0] == pytest.approx(plane, abs=1e-9)
-    if sheet >= 0:
-        beside = walls.plane(sheet, place + np.eye(2)) - plane
-        assert walls.normal(sheet) == pytest.approx((-beside[0], -beside[1], 1))
-
-
-@pytest.mark.parametrize("share", [0.0, 0.07, 0.5, 1.0])
-@pytest.mark.parametrize("walls", [BOWL, CROSS, replace(BOWL, flare_mm=0.0)])
-def test_outlines_are_what_is_open_at_a_height(walls, share):
-    grown, z = share * walls.flare_mm, walls.floor_mm + share * walls.depth_mm
-    boxes = [shapely.box(*low - grown, *high + grown) for low, high in walls.hollows.reshape(-1, 2, 2)]
-    outline = walls.outline(z)
-    assert outline.symmetric_difference(shapely.union_all(boxes)).area == pytest.approx(0, abs=1e-9)
-    on = np.array([point.coords[0] for point in outline.exterior.interpolate(np.linspace(0, 1, 41), normalized=True)])
-    if walls.flare_mm:
-        assert walls.heights(on) == pytest.approx(np.full(41, z))
-        assert len(walls.creases()) == 1 + len(outline.exterior.coords) - 1  # one from every corner of the floor
-    else:
-        assert walls.heights(0.999 * on) == pytest.approx(np.full(41, walls.floor_mm))
-        assert walls.heights(1.001 * on) == pytest.approx(np.full(41, walls.floor_mm + walls.depth_mm))
-        assert len(walls.creases()) == 1
-
-
-@pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0}, {"wall_draft_deg": 0.0, "border_mm": 1.5}])
-def test_walls_of_a_plan(mould):
-    plan = Plan(Morphology.random(2, 2, seed=1), with_settings(mould))
-    walls = walls_of(plan)
-    assert walls.outline(walls.floor_mm).symmetric_difference(plan.silicone).area == pytest.approx(0, abs=1e-9)
-    assert (walls.floor_mm, walls.depth_mm) == (2.0, plan.silicone_mm)
-    assert walls.flare_mm == pytest.approx(6 * math.tan(math.radians(plan.settings.mould.wall_draft_deg)))
-    assert walls.outline(8.0).bounds[0] == pytest.approx(plan.silicone.bounds[0] - plan.flare_mm)
 
 
 def surfaces(drawing: Drawing) -> list[Surface]:
