@@ -8,14 +8,14 @@ import shapely
 
 from design.pad.courses.curves import beziers, cubic
 from design.pad.morphology import Morphology
-from design.settings import PadSettings, RulesSettings
+from design.settings import RulesSettings
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.plan_checks import check, check_plan
 from fabricate.checks.plan_checks.fibre_strain import strains
 from fabricate.checks.plan_checks.tracks import thinner
 from fabricate.mould.plan import Plan
-from fabricate.settings import DEFAULTS, FabricationSettings, FibreSettings
+from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 
@@ -294,9 +294,8 @@ class TestFolds:
         assert all(np.hypot(*(tight - place).T).min() < 0.02 for place in finding.places_mm)
 
 
-def bent(pad: Morphology, radius: float, **fibre) -> Plan:
-    own = PadSettings(**{**pad.layout.settings, "bent_radius_mm": radius})
-    return Plan(pad, replace(DEFAULTS, pad=own, fibre=FibreSettings(**fibre)))
+def bent(pad: Morphology, radius: float, **settings: dict[str, object]) -> Plan:
+    return Plan(pad, with_settings(pad={**pad.layout.settings, "bent_radius_mm": radius}, **settings))
 
 
 @pytest.mark.parametrize("radius", [5.0, 30.0])
@@ -318,25 +317,13 @@ def test_a_fibre_at_an_angle_is_strained_by_the_square_of_its_cosine():
 
 
 def test_fibres_below_the_middle_are_pressed():
-    plan = bent(Morphology.straight((2, 0), 10.0), 20.0, diameter_mm=0.3)
-    thin = Plan(
-        plan.pad,
-        replace(
-            plan.settings,
-            mould=plan.settings.mould.model_copy(
-                update={"silicone_mm": 0.8, "shallow_ridge_height_mm": 0.6, "deep_ridge_height_mm": 0.7}
-            ),
-        ),
-    )
-    assert strains(thin)[0].most < 0
+    thin = {"silicone_mm": 0.8, "shallow_ridge_height_mm": 0.6, "deep_ridge_height_mm": 0.7}
+    assert strains(bent(Morphology.straight((2, 0), 10.0), 20.0, mould=thin))[0].most < 0
 
 
 @pytest.mark.parametrize(("stretch", "status"), [(1.0, "pass"), (0.1, "warn"), (0.05, "fail")])
 def test_it_is_judged_by_what_the_fibre_bears(stretch, status):
-    found = [
-        f
-        for f in check_plan(bent(Morphology.straight(2, 10.0), 20.0, largest_stretch=stretch))
-        if f.name == "fibre_strain"
-    ]
-    assert [finding.status for finding in found] == [status]
-    assert found[0].measured == pytest.approx(1.95 / 23)
+    plan = bent(Morphology.straight(2, 10.0), 20.0, fibre={"largest_stretch": stretch})
+    (finding,) = (finding for finding in check_plan(plan) if finding.name == "fibre_strain")
+    assert finding.status == status
+    assert finding.measured == pytest.approx(1.95 / 23)

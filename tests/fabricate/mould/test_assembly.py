@@ -16,7 +16,6 @@ from fabricate.mould.assembly import (
     holder_body,
     lid_body,
     mould_body,
-    plan_mesh,
     sizes,
 )
 from fabricate.mould.cad.bodies import body_solid
@@ -61,19 +60,6 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
     return float((w[:, inside] * corners[up][inside][:, :, 2].T).sum(axis=0).max())
 
 
-def test_straight_pad_has_the_volume_that_arithmetic_gives():
-    plain = with_settings({"exit_mm": 0.0, "number_mm": 0.0})
-    plan = Plan(Morphology.straight(4), plain)
-    inner, ridge, lean = 56.25, 0.4, 2 * 6 * math.tan(math.radians(2))
-    ridges = 4 * inner * ridge * (1.2 + 0.4) - 16 * ridge * ridge * 0.4  # the shallow ones end at the deep ones
-    rim = inner + lean
-    hollow = 6 * (inner**2 + inner * rim + rim**2) / 3
-    behind = 2 * ridge * math.tan(math.radians(2)) * 4 * (1.2**2 + 0.4**2) / 2  # where the wall leans off a ridge's end
-    expected = (rim + 4) ** 2 * 8 - hollow + ridges + behind
-    assert plan_mesh(plan).volume() == pytest.approx(expected, rel=1e-9)
-    assert sizes(plan)["tray_mm"] == pytest.approx(rim + 4)
-
-
 @pytest.mark.parametrize(
     "pad",
     [
@@ -100,11 +86,6 @@ def test_random_and_published_moulds_are_closed(request, pad):
 def test_what_has_no_room_is_refused(make, pad, mould, line):
     with pytest.raises(InputError, match=line):
         make(Plan(Morphology.straight(*pad), with_settings(mould)))
-
-
-@pytest.mark.slow
-def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
-    assert_both_ways_agree(mould_body(Plan(Morphology.load(published / "1para.mat"))))
 
 
 @pytest.mark.parametrize(
@@ -156,20 +137,6 @@ def test_the_frame_on_the_bed_is_that_of_the_mould():
     assert (frame["centre_mm"], frame["angle_deg"], frame["mirrored"]) == ([150.0, 100.0], 0.0, True)
     assert frame["pad_mm"] == sizes(plan)["pad_mm"]
     assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
-
-
-@pytest.mark.parametrize(("family", "heights"), [("horizontal", (1.2, 0.4)), ("vertical", (0.4, 1.2))])
-def test_each_family_gets_its_height(family, heights):
-    plan = Plan(Morphology.straight(2, pitch_mm=10.0), with_settings({"number_mm": 0.0}, pad={"deep_family": family}))
-    read = as_read(mould_body(plan))
-    for place, height in (
-        ((0.1, -5.1), heights[0]),
-        ((-5.1, 0.1), heights[1]),
-        ((-5.05, -5.1), 1.2),
-        ((0.1, 0.2), 0.0),
-        ((15.9, 0.1), 6.0),
-    ):
-        assert height_at(read, *place) == pytest.approx(2 + height, abs=1e-4), place
 
 
 def test_tracks_run_out_of_the_pad_through_its_tongues():

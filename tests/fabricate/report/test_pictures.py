@@ -70,21 +70,15 @@ def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_the_drawn_mould_is_the_mould(mould):
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould))
-    drawn, _ = mould_relief(plan, 300, 300)
+    drawn, shown = mould_relief(plan, 300, 300)
     meshed, _ = mesh_relief(*mesh_of(plan), 300)
     assert drawn.shape == meshed.shape
     off = np.abs(meshed - plan.settings.mould.floor_mm - drawn)
     assert (off > 0.01).mean() < 2e-4  # pixels whose middle lies on an edge fall on either side
-
-
-def test_the_drawn_mould_of_a_published_pad_is_the_mould(published):
-    plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    drawn, shown = mould_relief(plan, 400, 400)
-    meshed, _ = mesh_relief(*mesh_of(plan), 400)
-    assert (np.abs(meshed - 2 - drawn) > 0.01).mean() < 2e-4
-    assert set(np.unique(shown)) == {FLOOR, WALL, NUMBER, *(RIDGE + level for level in range(4))}
+    kinds = {FLOOR, WALL, *(RIDGE + level for level in range(3))}
+    assert set(np.unique(shown)) == kinds | ({NUMBER} if plan.settings.mould.number_mm else set())
     for level, height in enumerate(plan.heights_mm):
-        assert np.unique(drawn[shown == RIDGE + level]) == pytest.approx([height])
+        assert drawn[shown == RIDGE + level].max() == pytest.approx(height)
 
 
 def test_heights_of_slopes_and_of_what_lies_over_them():

@@ -91,17 +91,6 @@ def test_a_polygon_is_its_edges(corners):
     assert sorted(turns(pieces)) == pytest.approx([360 / corners] * corners, abs=0.5)
 
 
-def test_a_stadium_is_two_lines_and_two_arcs():
-    pieces = pieces_of(shapely.LineString([(0, 0), (9, 0)]).buffer(1.5, quad_segs=FINE))
-    assert sorted("arc" if piece.arc else "line" for piece in pieces) == ["arc", "arc", "line", "line"]
-    assert [piece.arc[4] for piece in pieces if piece.arc] == pytest.approx([math.pi] * 2)
-    assert sum(abs(piece.arc[2] * piece.arc[4]) if piece.arc else piece.length for piece in pieces) == pytest.approx(
-        18 + 3 * math.pi
-    )
-    assert turns(pieces).max() < 0.01
-    assert gaps(pieces).max() < 1e-9
-
-
 def test_a_smooth_ring_that_is_no_circle_is_splines_that_close():
     t = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
     drawn = np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1)

@@ -108,6 +108,19 @@ def test_circles_that_cross():
     assert solid.area == pytest.approx(2 * (math.pi * (4 + 2.25) - lens.area) + walls, rel=1e-5)
 
 
+@pytest.mark.parametrize("apart", [0.0, 1e-7, -1e-7, 1e-5, -1e-5, -1e-3])
+@pytest.mark.parametrize("other", [shapely.box(-5, -5, 5, 0), disc(0, -1.5, 1.5)], ids=["a line", "a circle"])
+def test_a_circle_that_touches(other, apart):
+    """It comes no nearer than a grid's step, or overlaps in next to nothing."""
+    found = built([other, disc(0, 1 + apart, 1.0)], lambda within: sum(1.0 + 2 * k for k in within) or None)
+    assert all(solid.is_valid for solid in found)
+    assert sum(solid.volume for solid in found) == pytest.approx(other.area + 3 * math.pi, rel=1e-4)
+    if apart == -1e-3 and other.area == 50:
+        aside = math.sqrt(1 - (1 + apart) ** 2)
+        corners = [abs(vertex.X) for solid in found for vertex in solid.vertices() if abs(vertex.Y) < 1e-7]
+        assert min(abs(x - aside) for x in corners) < 1e-7
+
+
 BOWL = Walls(np.array([[-3.0, -2.0, 3.0, 2.0]]), floor_mm=1.0, depth_mm=4.0, flare_mm=0.8)
 
 

@@ -53,12 +53,6 @@ def test_geometry_is_said_once_and_in_few_digits():
     ]
 
 
-@pytest.mark.parametrize("name", ["VERTEX_POINT", "EDGE_CURVE", "ORIENTED_EDGE", "ADVANCED_FACE", "CLOSED_SHELL"])
-def test_topology_stays_one_each(name):
-    found = said_once(step(f"{name}('',#3)", f"{name}('',#3)", "DIRECTION('',(1.,0.,0.))"))
-    assert [content.partition("(")[0] for content in entities(found).values()] == [name, name, "DIRECTION"]
-
-
 REFERENCES = "( REPRESENTATION_RELATIONSHIP('','',#2,#1) SHAPE_REPRESENTATION_RELATIONSHIP() )"
 WORDS = ["#2", "a #2, b", "(#2)", "it''s  two   blanks", "'';#1=X", "CARTESIAN_POINT(", "1.23456789012", "DATA;"]
 
