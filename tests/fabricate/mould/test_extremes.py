@@ -10,7 +10,6 @@ from design.pad.knots import assemble
 from design.pad.morphology import Morphology
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.plan_checks import meshed
-from fabricate.mould.cad.model import build_mould
 from fabricate.mould.plan import Plan
 from tests.fabricate.planted import with_settings
 
@@ -77,18 +76,7 @@ def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_wild_pad_has_a_closed_mould(kind):
     require_closed(wild(kind), {})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_wild_pad_has_a_valid_cad_solid_or_one_line_says_why_not(kind):
-    try:
-        solid = build_mould(wild(kind, 1))
-    except InputError as error:
-        require_one_line(error)
-        return
-    assert solid.is_valid
-    assert solid.volume > 0
+    require_closed(wild(kind, 1, 6), {"ridge_width_mm": 1.5, "border_mm": 1.0})
 
 
 @pytest.mark.parametrize("key", ENDS)

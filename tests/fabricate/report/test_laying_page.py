@@ -57,6 +57,10 @@ def test_silicone_of_a_straight_pad(draft_deg):
     assert silicone["volume_ml"] == pytest.approx(expected, abs=1e-3)
     assert silicone["mass_g"] == pytest.approx(expected * 1.07 * 1.1, abs=0.02)
     assert silicone["part_a_g"] == silicone["part_b_g"] == pytest.approx(silicone["mass_g"] / 2)
+    other = with_settings(plan.settings.mould.model_dump(), silicone={"density_g_per_ml": 1.3, "parts": [10.0, 1.0]})
+    mixed = guide.document(Plan(plan.pad, other), plan_mesh(plan).volume())["silicone"]
+    assert mixed["mass_g"] == pytest.approx(expected * 1.3 * 1.1, abs=0.02)
+    assert mixed["part_a_g"] == pytest.approx(10 * mixed["part_b_g"], abs=0.06)
 
 
 def test_pins_take_no_silicone_and_a_thicker_pad_takes_more(tmp_path):
@@ -176,14 +180,6 @@ def test_every_fibre_has_its_resistance_by_its_length_and_its_resistor():
     assert "carbon-black TPE bears 80 % of stretch at most and bends of no less than 2.5 mm radius." in page
 
 
-def test_an_unknown_resistance_is_said_to_be_and_not_made_up():
-    document = whole(Plan(Morphology.straight(2)))
-    assert {fibre["resistance_ohm"] for fibre in document["fibres"]} == {None}
-    wire = guide.laying_page(document).partition("## Wire")[2].partition("##")[0]
-    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
-    assert "|" not in wire
-
-
 @pytest.mark.parametrize(
     ("silicone", "pot_life", "cure"),
     [
@@ -202,13 +198,6 @@ def test_the_page_follows_the_silicone(silicone, pot_life, cure):
     assert ("shrinks by 0.1 %" in page) == bool(silicone)
 
 
-def test_parts_are_weighed_by_their_ratio():
-    mixed = with_settings(silicone={"density_g_per_ml": 1.3, "parts": [10.0, 1.0]})
-    silicone = whole(Plan(Morphology.straight(2), mixed))["silicone"]
-    assert silicone["part_a_g"] == pytest.approx(10 * silicone["part_b_g"], abs=0.06)
-    assert silicone["mass_g"] == pytest.approx(silicone["volume_ml"] * 1.3 * 1.1, abs=0.011)
-
-
 def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
     plain = whole(Plan(Morphology.straight(2)))
     page = guide.laying_page(plain)
@@ -218,6 +207,11 @@ def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
     assert orientation.sentence((2, 2), "edges") in section
     assert "Horizontal fibres are 1 to 2, vertical ones 3 to 4." in section
     assert f"]({orientation.FILE})" in section
+    wire = page.partition("## Wire")[2].partition("##")[0]
+    assert {fibre["resistance_ohm"] for fibre in plain["fibres"]} == {None}
+    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
+    assert "|" not in wire
+    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.1 mm"], "Layer Height: 0.1 mm"]
     table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
@@ -239,17 +233,11 @@ def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
     assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 place,")
     assert "pour through its spout" in page
     assert "of resin" in page
+    assert "PrusaSlicer" not in page
+    assert page.index("- Slice it") < page.index("- Turn anti-aliasing") < page.index("- Wash and cure")
     assert "read the right way" not in page
     plain = guide.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
-
-
-def test_the_page_says_what_to_set_for_the_printer_at_hand():
-    page = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"layer_mm": 0.2}))))
-    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.2 mm"], "Layer Height: 0.2 mm"]
-    resin = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"resin": True}))))
-    assert "PrusaSlicer" not in resin
-    assert resin.index("- Slice it") < resin.index("- Turn anti-aliasing") < resin.index("- Wash and cure")
 
 
 def found(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:

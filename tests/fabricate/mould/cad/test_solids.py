@@ -48,35 +48,16 @@ def kinds(solid: Solid) -> dict[str, int]:
     return {name: names.count(name) for name in sorted(set(names))}
 
 
-def test_a_box():
-    (solid,) = built([shapely.box(0, 0, 1, 2)], lambda within: 3.0 if within else None)
-    assert solid.is_valid
-    assert (len(solid.faces()), len(solid.edges()), len(solid.vertices())) == (6, 12, 8)
-    assert (solid.volume, solid.area) == pytest.approx((6, 22))
-
-
-def test_a_washer():
-    (solid,) = built([disc(0, 0, 3), disc(0.5, 0, 1)], lambda within: 2.0 if within == {0} else None)
-    assert solid.is_valid
-    assert solid.volume == pytest.approx(2 * math.pi * 8, rel=1e-9)
-    assert solid.area == pytest.approx(2 * math.pi * 8 + 2 * 2 * math.pi * 4, rel=1e-9)
-    assert kinds(solid) == {"CYLINDER": 4, "PLANE": 2}
-
-
-@pytest.mark.parametrize("upper", [False, True])
-def test_what_is_drawn_as_an_ellipse_has_walls_of_splines(upper):
-    """Alone, or over half of its outline, where the walls of a block that it overlaps rise higher."""
+def test_what_is_drawn_as_an_ellipse_has_walls_of_splines():
+    """Over half of its outline the walls of a block that it overlaps rise higher."""
     t = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
     ellipse = shapely.Polygon(np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1))
-    block = [shapely.box(0, -5, 20, 5)] if upper else []
-    (solid,) = built([ellipse, *block], lambda within: {(): None, (0,): 1.0}.get(tuple(within), 2.0))
+    heights = {(): None, (0,): 1.0}
+    (solid,) = built([ellipse, shapely.box(0, -5, 20, 5)], lambda within: heights.get(tuple(within), 2.0))
     assert solid.is_valid
-    half = 24 * math.pi / 2
-    assert solid.volume == pytest.approx(half + 200 * 2 if upper else 2 * half, rel=1e-3)
-    length = 32 * float(ellipe(1 - 9 / 64))
-    assert solid.area == pytest.approx(
-        2 * (half + 200) + length / 2 + 2 * 60 - 6 if upper else 4 * half + length, rel=1e-3
-    )
+    half, length = 24 * math.pi / 2, 32 * float(ellipe(1 - 9 / 64))
+    assert solid.volume == pytest.approx(half + 200 * 2, rel=1e-3)
+    assert solid.area == pytest.approx(2 * (half + 200) + length / 2 + 2 * 60 - 6, rel=1e-3)
     assert kinds(solid)["BSPLINE"] >= 2
 
 
@@ -166,10 +147,6 @@ def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
     places = np.stack(np.meshgrid(x + grid, y + grid), axis=-1).reshape(-1, 2)
     places = places[np.hypot(*(places - (x, y)).T) < 0.5]
     assert solid.volume == pytest.approx(np.maximum(3.0 - BOWL.heights(places), 0).sum() * 1e-6, rel=1e-3)
-    rest = [Span(0.0, top) for top in surfaces(drawing)]
-    (tray,) = solids(drawing, rest)
-    assert tray.is_valid
-    assert tray.volume == pytest.approx(10 * 8 * 5 - 4 * (6 * 4 + 4 * 6.8 * 4.8 + 7.6 * 5.6) / 6, rel=1e-9)
 
 
 def test_a_curve_that_strays_past_its_top_on_a_wall_ends_at_it():
