@@ -22,6 +22,7 @@ def test_defaults_come_back_from_their_own_file(tmp_path):
 
 
 BOX = {"box_mm": [0.0, 9.0, 5.0, 5.0, 0.0, 9.0]}
+NEEDED = "; or a material of your own with cure_h, density_g_per_ml, parts, pot_life_min, shrinkage set"
 FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
 
 
@@ -51,6 +52,8 @@ FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
         ("silicone", {"shrinkage": -0.01}, ("[silicone] shrinkage: got ",)),
         ("silicone", {"cure_h": math.nan}, ("[silicone] cure_h: got ",)),
         ("silicone", {"name": "a | b"}, ("[silicone] name: got ",)),
+        ("silicone", {"name": "Ecoflex 00-31"}, (f"'Ecoflex 00-31', allowed are {', '.join(SILICONES)}", NEEDED)),
+        ("fibre", {"name": "yarn"}, (f"'yarn', allowed are {', '.join(FIBRES)}; or", "own with diameter_mm set")),
         ("fibre", {"diameter_mm": 11.0}, ("[fibre] diameter_mm: got ",)),
         ("fibre", {"ohm_per_mm": "unknown"}, ("[fibre] ohm_per_mm: got ",)),
         ("fibre", {"least_bend_mm": -1.0}, ("[fibre] least_bend_mm: got ",)),
@@ -180,22 +183,6 @@ def test_a_preset_is_found_however_its_name_is_written(written, preset):
     settings = SiliconeSettings(name=written)
     assert settings.name == preset
     assert settings.material == SILICONES[preset]
-
-
-@pytest.mark.parametrize(
-    ("section", "model", "presets", "needed"),
-    [
-        ("silicone", SiliconeSettings, SILICONES, "cure_h, density_g_per_ml, parts, pot_life_min, shrinkage"),
-        ("fibre", FibreSettings, FIBRES, "diameter_mm"),
-    ],
-)
-def test_an_unknown_preset_gets_the_list(section, model, presets, needed):
-    with pytest.raises(InputError) as error:
-        Spec({section: {"name": "Ecoflex 00-31"}}, "pad.toml").section(model)
-    assert str(error.value) == (
-        f"pad.toml: [{section}] name: got 'Ecoflex 00-31', allowed are {', '.join(presets)};"
-        f" or a material of your own with {needed} set"
-    )
 
 
 def test_what_is_set_stands_in_place_of_the_preset():

@@ -121,19 +121,6 @@ def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches,
     assert np.diff(exits).min() > apart - 1e-6
 
 
-def test_leads_turn_no_tighter_than_the_fibre_bears():
-    plan = Plan(
-        PAD, replace(settings(PAD, leads="one side"), fibre=DEFAULTS.fibre.model_copy(update={"least_bend_mm": 4.0}))
-    )
-    for lead in (lead for pair in plan.leads.pairs for lead in pair if len(lead.spans)):
-        way = np.vstack([lead.end_mm, lead.bends(1e-6)])
-        turns = np.abs((np.diff(np.arctan2(*np.diff(way, axis=0).T)) + np.pi) % (2 * np.pi) - np.pi)
-        steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
-        bent = turns > 1e-9
-        inner = bent[1:] & bent[:-1]
-        assert (steps[1:-1][inner] / turns[1:][inner]).min() > 3.99
-
-
 def test_leads_of_a_shrinking_silicone_come_out_as_planned():
     plan = Plan(
         PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))

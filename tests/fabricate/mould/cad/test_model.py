@@ -117,6 +117,7 @@ ODD = {
     "two that lie on each other": (level_pad(1.5, 1.5), {}),
     "two nearly so": (level_pad(1.5, 1.501), {}),
     "two that overlap by a micrometre": (level_pad(1.5, 1.5399), {}),
+    "two that overlap by three nanometres": (level_pad(1.5, 1.5399997), {}),
     "two a micrometre apart": (level_pad(1.5, 1.5401), {}),
     "along the wall": (level_pad(0.0, 1.5), {"wall_draft_deg": 0.0}),
     "half in the wall": (level_pad(0.01, 1.5), {}),
