@@ -49,6 +49,7 @@ def test_all_files_are_there_with_their_digests_and_nothing_else(built):
     assert document["sha256"] == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
 
 
+@pytest.mark.slow
 def test_the_same_work_gives_the_same_bytes(built, tmp_path):
     out, _ = built
     build(PAD, tmp_path / "again", FORMATS, SETTINGS)
@@ -138,16 +139,17 @@ def test_step_reads_back_as_the_same_solid_which_the_meshes_judge(built):
     assert found["message"].endswith("curves within 2 µm")
 
 
-def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path):
+@pytest.mark.parametrize("size", [(1, 2), pytest.param((2, 12), marks=pytest.mark.slow)])
+def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path, size):
     """What chords take away of the volume grows with the tolerance."""
     settings = with_settings({"tolerance_mm": 0.099, "ridge_width_mm": 1.2})
     (found,) = (
         finding
-        for finding in build(Morphology.random(2, 12, seed=0), tmp_path, ["step"], settings)["findings"]
+        for finding in build(Morphology.random(*size, seed=0), tmp_path, ["step"], settings)["findings"]
         if finding["name"] == "cad_solid"
     )
     assert found["limit"] == pytest.approx([9.9 * 5e-4, 9.9 * 5e-3])
-    assert 5e-4 < found["measured"][0] < found["limit"][0]
+    assert (5e-4 if size == (2, 12) else 0) < found["measured"][0] < found["limit"][0]
 
 
 def test_the_document_has_what_a_lab_needs(built, tmp_path):
@@ -234,7 +236,6 @@ def full_step(*_, **__):
         (None, ["svg"], "2 crossings"),
         (in_pieces, ["stl"], r"the mesh has 2 bodies.*nothing was written"),
         (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid is not of its mesh \(.*written"),
-        (partial(other_solid, body="conductive"), ["step"], r"^conductive: the CAD solid is not of its mesh"),
         (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
         (lambda m: m.setattr(Solid, "is_valid", False), ["step"], "mould: the CAD kernel finds a solid invalid"),
         (
@@ -245,7 +246,7 @@ def full_step(*_, **__):
     ],
 )
 def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, planted, formats, line):
-    pad, settings = PAD, SETTINGS
+    pad, settings = Morphology.straight(1), with_settings({"lid": True})
     if planted:
         planted(monkeypatch)
     else:
@@ -264,21 +265,21 @@ def full_disk(*_, **__):
 
 
 @pytest.mark.parametrize(
-    ("last", "stop"), [("draw_tracks", full_disk), ("draw_tracks", KeyboardInterrupt), ("write_json", full_disk)]
+    ("last", "stop"), [("write_utf8", full_disk), ("write_utf8", KeyboardInterrupt), ("write_json", full_disk)]
 )
 def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last, stop):
     build(PAD, tmp_path, ["stl", "svg"])
     before = contents(tmp_path)
 
-    def stopped(*arguments):
+    def stopped(*_, **__):
         raise stop if stop is KeyboardInterrupt else stop()
 
     monkeypatch.setattr(export, last, stopped)
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError) as told:
-        build(Morphology.straight(2), tmp_path, ["stl", "png"])
+        build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert contents(tmp_path) == before
-    if last == "draw_tracks" and stop is full_disk:
-        assert str(told.value) == f"{tmp_path / 'tracks.png'}: cannot be written (No space left on device)"
+    if last == "write_utf8" and stop is full_disk:
+        assert str(told.value) == f"{tmp_path / 'tracks.svg'}: cannot be written (No space left on device)"
 
 
 def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
@@ -291,7 +292,7 @@ def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
 
 
 def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
-    build(PAD, tmp_path, ["stl", "svg", "dxf", "png"])
+    build(PAD, tmp_path, ["3mf", "stl", "svg", "dxf"])
     (tmp_path / "tracks.dxf").write_text("drawn upon")
     for name in ("mine.stl", "mould.step"):
         (tmp_path / name).write_text("somebody's own")
@@ -302,7 +303,7 @@ def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
     assert document["sha256"].keys() == {"mould.stl", "laying.md", "orientation.svg"}
     gone = "is gone: it was of the mould before this one"
     assert told == [
-        *(f"{tmp_path / name} {gone}" for name in ("mould.png", "tracks.png", "tracks.svg")),
+        *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
         f"{tmp_path / 'tracks.dxf'} is left from the mould before this one: it is not as it was written",
     ]
 

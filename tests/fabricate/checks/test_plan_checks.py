@@ -1,6 +1,7 @@
 """Plans with a known shape or a known fault, and what the checks find in them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,8 +39,8 @@ def test_published_pad_that_was_built_shows_its_crossings(published):
 @pytest.mark.parametrize(
     ("grid", "knots", "seed"),
     [
-        *((4, 1, 1006), (2, 20, 1003)),
-        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((4, 5, 1001), (4, 30, 1032))),
+        *((4, 1, 1006), (2, 8, 1003)),
+        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((2, 20, 1003), (4, 30, 1032))),
     ],
 )
 def test_tangled_pads_are_measured_and_sound(grid, knots, seed):
@@ -294,7 +295,7 @@ class TestFolds:
         assert all(np.hypot(*(tight - place).T).min() < 0.02 for place in finding.places_mm)
 
 
-def bent(pad: Morphology, radius: float, **settings: dict[str, object]) -> Plan:
+def bent(pad: Morphology, radius: float, **settings: dict[str, Any]) -> Plan:
     return Plan(pad, with_settings(pad={**pad.layout.settings, "bent_radius_mm": radius}, **settings))
 
 

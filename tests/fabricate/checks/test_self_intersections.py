@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import settings as effort
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -33,7 +32,7 @@ def interiors_meet(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(found.status == 0 and -found.fun > 1e-9)
 
 
-@effort(max_examples=150)
+@settings(max_examples=100)
 @given(TRIANGLES)
 def test_two_triangles_against_linear_programming(corners):
     pair = np.array(corners, dtype=float).reshape(2, 3, 3) * 10  # none penetrates by less than the limit then
@@ -88,7 +87,7 @@ def test_a_fold_in_a_plane():
     assert found(sheet[[[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]])
 
 
-@effort(max_examples=8)
+@settings(max_examples=8)
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-60, 60)] * 3))
 def test_the_rounding_of_an_stl_is_no_fault(turn, away):
     solid = trimesh.creation.icosphere(3, 20)

@@ -57,7 +57,7 @@ class TestGood:
         adds = [ridge(outline, height + further) for outline in lines]
         assert not faults(inspected(tray(*adds, ridge(across, height), draft_deg=draft_deg, wall=wall)))
 
-    @pytest.mark.parametrize("angle_deg", [30, 45, 60, 90, 120])
+    @pytest.mark.parametrize("angle_deg", [30, 60, 120])
     def test_ridges_of_one_height_that_cross(self, angle_deg):
         crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
         assert not faults(inspected(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5)))))
@@ -230,9 +230,7 @@ class TestLean:
         assert undercut.places_mm
         assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.places_mm)
 
-    @pytest.mark.parametrize(
-        ("lean_deg", "status"), [(30, "pass"), (45, "pass"), (45.8, "pass"), (46.3, "fail"), (50, "fail")]
-    )
+    @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45.8, "pass"), (46.3, "fail")])
     def test_a_funnel_on_a_plate_is_no_cavity(self, lean_deg, status):
         top = 4 + 4 * math.tan(math.radians(lean_deg))
         cup = Manifold.cylinder(4, 4, top, 64) - Manifold.cylinder(5, 2, 2, 64).translate((0, 0, -0.5))

@@ -91,9 +91,14 @@ def test_what_has_no_room_is_refused(make, pad, mould, line):
 @pytest.mark.parametrize(
     "settings",
     [
-        with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
+        pytest.param(
+            with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
+            marks=pytest.mark.slow,
+        ),
         with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
-        with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}),  # the oracle's pins are round
+        pytest.param(  # the oracle's pins are round
+            with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_both_ways_to_the_mould_agree(settings):
@@ -215,7 +220,7 @@ def test_corners_that_meet_by_chance_are_drawn_apart():
     assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(2, abs=2e-3)
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(5, 4), (20, 5)])
+@pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])
 def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
     plan = Plan(Morphology.random(2, knots, seed))

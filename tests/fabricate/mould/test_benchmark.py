@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -10,13 +11,15 @@ from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, MouldSettings
 
 
+@pytest.mark.slow
 def test_every_way_stays_within_the_tolerance_and_walls_that_stray_are_seen(monkeypatch):
     for key, value in {"GRID": 1, "KNOTS": (1,), "TOLERANCES_MM": (0.05,)}.items():
         monkeypatch.setattr(bench, key, value)
     trials = {trial.way: trial for trial in bench.trials()}
     assert set(trials) == {"manifold3d", "direct CAD", "fused CAD", "curved CAD"}
     for way, trial in trials.items():
-        row, curved = trial.judge(trial.work()), way == "curved CAD"
+        row: dict[str, Any] = {**trial.judge(trial.work())}
+        curved = way == "curved CAD"
         drawn = 1000 * FINE_MM if curved else 0  # it follows outlines that are drawn so finely
         assert 0 < row["error"] <= (trial.size + drawn) / 1000  # mm and micrometres
         assert row["faces"] > (40 if curved else 100)

@@ -133,6 +133,7 @@ def test_every_place_that_fails_or_warns_is_marked_and_no_other(mould_picture):
     assert all(count > 0 for count in marked(*MARKED))
 
 
+@pytest.mark.slow
 def test_checks_have_marks_of_their_own(mould_picture):
     place = (0.0, 4.0)
     both = [finding("fail", place), finding("fail", place, name="bend")]
@@ -174,7 +175,7 @@ def test_pictures_are_small(tmp_path, published):
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["mould", "tracks", "mesh"])
+@pytest.mark.parametrize("kind", ["mesh", *(pytest.param(k, marks=pytest.mark.slow) for k in ("mould", "tracks"))])
 def test_pictures_are_the_same_each_time(tmp_path, kind):
     def draw(path: Path) -> bytes:
         if kind == "mould":

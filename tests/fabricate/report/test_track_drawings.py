@@ -188,6 +188,7 @@ def test_dxf_is_sound_and_complete(tmp_path):
     assert np.ptp(spans) == pytest.approx(10)
 
 
+@pytest.mark.slow
 def test_dxf_is_the_same_in_every_process():
     script = (
         "import sys; from design.pad.morphology import Morphology; from fabricate.mould.plan import Plan;"

@@ -148,9 +148,9 @@ def test_walls_close_and_turn_at_real_corners_only(knots, seed):
     ("grid", "knots", "seed", "mould"),
     [
         (1, 1, 0, {}),
-        (2, 5, 1, {}),
+        pytest.param(2, 5, 1, {}, marks=pytest.mark.slow),
         (2, 3, 3, {"ridge_width_mm": 1.5}),
-        (1, 20, 4, {}),
+        pytest.param(1, 20, 4, {}, marks=pytest.mark.slow),
         (1, 8, 5, {"tolerance_mm": 0.05}),
     ],
 )
