@@ -220,9 +220,9 @@ def other_solid(monkeypatch, body: str) -> None:
         monkeypatch.setattr(model, makes, other)
 
 
-def in_pieces(monkeypatch) -> None:
+def in_pieces(monkeypatch, body: str) -> None:
     pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
-    monkeypatch.setattr(export, "mould_body", lambda plan: pieces)
+    monkeypatch.setattr(export, body, lambda plan: pieces)
 
 
 def full_step(*_, **__):
@@ -234,7 +234,8 @@ def full_step(*_, **__):
     [
         (None, ["obj"], "'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode, urscript"),
         (None, ["svg"], "2 crossings"),
-        (in_pieces, ["stl"], r"the mesh has 2 bodies.*nothing was written"),
+        (partial(in_pieces, body="mould_body"), ["stl"], r"^mould: .*the mesh has 2 bodies.*nothing was written"),
+        (partial(in_pieces, body="lid_body"), ["stl"], r"^lid: .*the mesh has 2 bodies.*nothing was written"),
         (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid is not of its mesh \(.*written"),
         (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
         (lambda m: m.setattr(Solid, "is_valid", False), ["step"], "mould: the CAD kernel finds a solid invalid"),

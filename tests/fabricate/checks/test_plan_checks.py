@@ -281,6 +281,7 @@ class TestFolds:
         pad = self.course([0, 0.8 - 1e-6, 0.8, 1.2, 2], cross, 0)
         assert found(pad, "folds").status == "pass"
 
+    @pytest.mark.slow
     def test_a_dense_scan_finds_such_bends_where_they_are_told(self, published):
         assert found(Morphology.load(published / "1para.mat"), "folds").status == "pass"
         pad = Morphology.load(published / "5para_dis.mat")

@@ -32,7 +32,7 @@ def interiors_meet(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(found.status == 0 and -found.fun > 1e-9)
 
 
-@settings(max_examples=100)
+@settings(max_examples=70)
 @given(TRIANGLES)
 def test_two_triangles_against_linear_programming(corners):
     pair = np.array(corners, dtype=float).reshape(2, 3, 3) * 10  # none penetrates by less than the limit then

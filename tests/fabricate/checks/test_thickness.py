@@ -37,7 +37,7 @@ class TestGood:
         assert found["wall_thickness"].measured == pytest.approx(WALL, rel=0.03)
         assert found["floor_thickness"].measured == pytest.approx(FLOOR)
 
-    @settings(max_examples=10)
+    @settings(max_examples=6)
     @given(
         st.floats(0, 8),
         st.floats(0.8, 4),

@@ -63,8 +63,8 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
 @pytest.mark.parametrize(
     "pad",
     [
-        *((1, 1, 0), (2, 10, 2), (2, 30, 1032), "5para_dis"),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "1para", "20para")),
+        *((1, 1, 0), (2, 10, 2), (1, 30, 1032)),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "5para_dis", "20para")),
     ],
 )
 def test_random_and_published_moulds_are_closed(request, pad):

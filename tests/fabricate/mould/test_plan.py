@@ -20,7 +20,7 @@ from sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 
-@pytest.mark.parametrize("tolerance_mm", [0.05, 0.002])
+@pytest.mark.parametrize("tolerance_mm", [0.05, pytest.param(0.002, marks=pytest.mark.slow)])
 def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
     pad = Morphology.random(3, 5, seed=1)
     plan = Plan(pad, with_settings({"tolerance_mm": tolerance_mm}))

@@ -89,7 +89,10 @@ def test_the_walls_of_a_curved_fibre_are_as_long_as_its_exact_offsets():
     assert curved > 0.9 * (2 * length * 1.2 - 2 * 2 * 3.0 * 1.2)  # the fibre begins and ends 3 mm straight
 
 
-@pytest.mark.parametrize(("pad", "mould"), [(SOFT, {}), (Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8})])
+@pytest.mark.parametrize(
+    ("pad", "mould"),
+    [(SOFT, {}), pytest.param(Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8}, marks=pytest.mark.slow)],
+)
 def test_edges_of_tracks_are_half_a_width_from_the_exact_fibres(pad, mould):
     """Thousands of places on the kernel's own curves, on the floor, against scipy's own PCHIP."""
     plan = Plan(pad, with_settings(PLAIN | mould))
@@ -136,7 +139,8 @@ ODD = {
 }
 
 
-RARE = [*SETTINGS, *ODD][2::3] + [*SETTINGS, *ODD][1::3]
+NARROW = "two that overlap by three nanometres"
+RARE = {*SETTINGS, *ODD} - {*[*SETTINGS, *ODD][::3], NARROW}
 
 
 @pytest.mark.parametrize(

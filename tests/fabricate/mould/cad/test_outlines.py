@@ -130,7 +130,7 @@ def test_what_is_no_arc_or_too_few_vertices_to_tell():
     assert arc_through(np.stack([np.cos(angles), np.sin(angles)], axis=1)) is None
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(1, 0), (8, 2), (20, 3)])
+@pytest.mark.parametrize(("knots", "seed"), [(1, 0), (8, 2), pytest.param(20, 3, marks=pytest.mark.slow)])
 def test_walls_close_and_turn_at_real_corners_only(knots, seed):
     plan = Plan(Morphology.random(1, knots, seed), with_settings({"border_mm": 2.0}))
     for level in range(2):

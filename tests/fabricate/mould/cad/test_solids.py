@@ -137,7 +137,7 @@ def test_a_tray_with_walls_that_lean():
     assert kinds(solid) == {"PLANE": 6 + 5}
 
 
-@pytest.mark.parametrize(("x", "y"), [(0, 0), (2.5, 0.3), (3.0, 0.0), (2.9, 1.9), (0, -2.45)])
+@pytest.mark.parametrize(("x", "y"), [(2.5, 0.3), (3.0, 0.0), (2.9, 1.9)])
 def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
     """It ends where the wall comes out of its top; wherever it stands, its volume is that above what is below."""
     round_ = disc(x, y, 0.5)
