@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
 from design.settings import PadSettings, RulesSettings
 from fabricate.materials import FibreSettings, SiliconeSettings
-from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
+from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 
 
 def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:
@@ -35,6 +36,7 @@ def with_settings(
     rules: dict[str, object] | None = None,
     silicone: dict[str, object] | None = None,
     fibre: dict[str, object] | None = None,
+    dispenser: dict[str, object] | None = None,
 ) -> FabricationSettings:
     """The defaults with some keys changed."""
     return replace(
@@ -45,6 +47,7 @@ def with_settings(
         rules=RulesSettings.model_validate(rules or {}),
         silicone=SiliconeSettings.model_validate(silicone or {}),
         fibre=FibreSettings.model_validate(fibre or {}),
+        dispenser=DispenserSettings.model_validate(dispenser or {}),
     )
 
 
@@ -58,3 +61,13 @@ def mild_pad(grid: int, knots: int, seed: int) -> Morphology:
     straight = Morphology.straight(grid)
     ends = [straight.knots[:, :1], places, straight.knots[:, -1:]]
     return Morphology(np.concatenate(ends, axis=1), straight.pitch_mm)
+
+
+def exact_fibre(pad: Morphology, fibre: int, step_mm: float = 5e-3) -> np.ndarray:
+    """(n, 2) mm: places of a fibre by scipy's own PCHIP, a step apart along it, and its knots."""
+    family, knots = pad.layout.family(fibre), pad.to_mm(pad.knots[fibre])
+    curve = PchipInterpolator(knots[:, family], knots[:, 1 - family])
+    t = np.unique(np.linspace(knots[:-1, family], knots[1:, family], 3000))
+    along = np.concatenate([[0], np.cumsum(np.hypot(np.diff(t), np.diff(curve(t))))])
+    t = np.union1d(np.interp(np.arange(0, along[-1], step_mm), along, t), knots[:, family])
+    return np.stack([t, curve(t)], axis=1)[:, :: -1 if family else 1]

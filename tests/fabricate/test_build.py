@@ -1,30 +1,31 @@
+"""Moulds made and written: all files or none, whole, read back by others, the same bytes again."""
+
 import errno
 import json
 import math
 import os
-import zipfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import shapely
 import trimesh
+from build123d import Solid, import_step
 
 from design.common.errors import InputError
 from design.common.files import sha256
 from design.pad.morphology import Morphology
 from fabricate import export
 from fabricate.export import FORMATS, build
-from fabricate.mesh_files import COLOURS, write_3mf
+from fabricate.mesh_files import COLOURS
+from fabricate.mould.cad import model
 from fabricate.mould.prisms import Body, Prism
 from fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 PAD = Morphology.random(1, 2, seed=7)
-
-
 FILES = {
     *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")),
     "mould.step",
@@ -40,18 +41,15 @@ def built(tmp_path_factory) -> tuple[Path, dict]:
     return out, build(PAD, out, FORMATS, SETTINGS)
 
 
-def test_all_files_are_there_and_nothing_else(built):
+def test_all_files_are_there_with_their_digests_and_nothing_else(built):
     out, document = built
     assert {path.name for path in out.iterdir()} == FILES
     assert {*document["files"]} == FILES - {"fabrication.json", "laying.md", "orientation.svg"}
     assert json.loads((out / "fabrication.json").read_text()) == document
-
-
-def test_the_document_has_the_digest_of_every_other_file(built):
-    out, document = built
     assert document["sha256"] == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
 
 
+@pytest.mark.slow
 def test_the_same_work_gives_the_same_bytes(built, tmp_path):
     out, _ = built
     build(PAD, tmp_path / "again", FORMATS, SETTINGS)
@@ -83,15 +81,7 @@ def test_stl_normals_point_out(built):
     assert ((area * records["normal"]).sum(axis=1) > 0)[large].all()
 
 
-def test_3mf_is_in_millimetres(built):
-    out, _ = built
-    with zipfile.ZipFile(out / "mould.3mf") as archive:
-        assert archive.testzip() is None
-        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
-    assert model.get("unit") == "millimeter"
-
-
-@pytest.mark.parametrize("body", ["mould", "lid", "conductive", "holder"])
+@pytest.mark.parametrize("body", ["mould", "lid", "holder"])
 def test_3mf_is_strictly_one_named_object_of_one_material(built, body):
     lib3mf = pytest.importorskip("lib3mf")
     out, document = built
@@ -129,31 +119,40 @@ def listed(iterator, current: str) -> list:
     return found
 
 
-def test_3mf_opens_in_cad_by_its_name_and_colour(built):
-    from build123d import Mesher
-
-    out, _ = built
-    (solid,) = Mesher().read(out / "lid.3mf")
-    assert solid.label == "lid"
-    assert solid.color
-    assert solid.is_valid
-    red, green, blue, _ = solid.color
-    assert "#{:02X}{:02X}{:02X}".format(*(round(255 * part) for part in (red, green, blue))) == COLOURS["lid"]
-
-
-def test_words_of_a_3mf_are_text(tmp_path):
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
-    triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    path, hostile = tmp_path / "odd.3mf", '<a href="&amp;">"\''
-    write_3mf(path, corners, triangles, name="mould", title=hostile, material=hostile)
-    with zipfile.ZipFile(path) as archive:
-        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
-    core = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
-    assert model.findtext(f"{core}metadata[@name='Title']") == hostile
-    assert [base.get("name") for base in model.iter(f"{core}base")] == [hostile]
+def test_step_reads_back_as_the_same_solid_which_the_meshes_judge(built):
+    out, document = built
+    whole = import_step(out / "mould.step")
+    assert whole.is_valid
+    assert {part.label: [each.label for each in part.children] for part in whole.children} == {
+        "mould": ["tray", "horizontal_tracks", "vertical_tracks", "numbers", "pins"],
+        "lid": [],
+        "conductive": ["tray", "horizontal_tracks", "vertical_tracks", "numbers", "pins"],
+        "holder": [],
+    }
+    volume = {part.label: part.volume for part in whole.children}
+    assert volume["mould"] / 1000 == pytest.approx(document["mould_volume_ml"], rel=1e-4)
+    for name in ("lid", "conductive", "holder"):  # the mesh has polygons for circles
+        assert volume[name] == pytest.approx(trimesh.load_mesh(out / f"{name}.stl").volume, rel=1e-4)
+    (found,) = (finding for finding in document["findings"] if finding["name"] == "cad_solid")
+    assert found["status"] == "pass"
+    assert all(0 < share < 2e-4 < most for share, most in zip(found["measured"], found["limit"], strict=True))
+    assert found["message"].endswith("curves within 2 µm")
 
 
-def test_the_document_has_what_a_lab_needs(built):
+@pytest.mark.parametrize("size", [(1, 2), pytest.param((2, 12), marks=pytest.mark.slow)])
+def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path, size):
+    """What chords take away of the volume grows with the tolerance."""
+    settings = with_settings({"tolerance_mm": 0.099, "ridge_width_mm": 1.2})
+    (found,) = (
+        finding
+        for finding in build(Morphology.random(*size, seed=0), tmp_path, ["step"], settings)["findings"]
+        if finding["name"] == "cad_solid"
+    )
+    assert found["limit"] == pytest.approx([9.9 * 5e-4, 9.9 * 5e-3])
+    assert (5e-4 if size == (2, 12) else 0) < found["measured"][0] < found["limit"][0]
+
+
+def test_the_document_has_what_a_lab_needs(built, tmp_path):
     _, document = built
     assert document["format"] == "padforge-fabrication/1"
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
@@ -167,28 +166,35 @@ def test_the_document_has_what_a_lab_needs(built):
     first, second, x, y, *_ = document["crossings"]["table"][0]
     assert {first.split()[0], second.split()[0]} <= {"horizontal", "vertical"}
     assert max(abs(x), abs(y)) < 22.5 / 2
+    other = build(level_pad(1.8, 1.2), tmp_path, [])
+    assert other["crossings"]["same_family"] == 2
+    assert "frame" not in other  # without a holder nobody knows where the pad lies
 
 
-def test_same_family_crossings_are_counted(tmp_path):
-    assert build(level_pad(1.8, 1.2), tmp_path, [])["crossings"]["same_family"] == 2
-
-
-def test_without_a_holder_nobody_knows_where_the_pad_lies(tmp_path):
-    assert "frame" not in build(PAD, tmp_path, [])
-
-
-def test_nothing_is_written_from_a_mould_in_two_pieces(tmp_path, monkeypatch):
-    pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
-    monkeypatch.setattr(export, "mould_body", lambda plan: pieces)
-    with pytest.raises(InputError, match=r"the mesh has 2 bodies.*nothing was written"):
-        build(PAD, tmp_path / "out", ["stl"])
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_pad_the_settings_refuse_writes_nothing(tmp_path):
-    with pytest.raises(InputError, match="2 crossings"):
-        build(level_pad(1.8, 1.2), tmp_path / "out", ["svg"], with_settings({"levels": "two"}))
-    assert not (tmp_path / "out").exists()
+def test_a_shrinking_silicone_gets_a_larger_mould_and_the_same_pad(tmp_path):
+    pad, mould = Morphology.straight(2, 12.0), {"holder": True, "number_mm": 0.0, "exit_mm": 0.0}
+    kept = build(pad, tmp_path / "kept", ["stl"], with_settings(mould))
+    grown = build(pad, tmp_path / "grown", ["stl"], with_settings(mould, silicone={"shrinkage": 0.04}))
+    floors = []
+    for folder in ("kept", "grown"):
+        mesh = trimesh.load_mesh(tmp_path / folder / "mould.stl")
+        assert isinstance(mesh, trimesh.Trimesh)
+        floors.append(mesh.vertices[np.isclose(mesh.vertices[:, 2], 2.0)][:, :2].max())
+    assert floors == pytest.approx([18.0, 18.0 / 0.96], abs=1e-5)
+    sizes = grown["sizes"]
+    assert sizes["cavity_mm"] * 0.96 == pytest.approx(sizes["pad_mm"]) == pytest.approx(kept["sizes"]["pad_mm"])
+    assert sizes["cavity_depth_mm"] == 6.2  # 6.25 mm in whole layers
+    assert sizes["pad_thickness_mm"] == pytest.approx(6.2 * 0.96)
+    assert grown["frame"]["surface_mm"] == pytest.approx(2 + 6.2 * 0.96)
+    assert grown["frame"]["pad_mm"] == kept["frame"]["pad_mm"]
+    assert (tmp_path / "kept" / "holder.stl").read_bytes() == (tmp_path / "grown" / "holder.stl").read_bytes()
+    for key in ("in_pad_mm", "cut_mm"):
+        assert [fibre[key] for fibre in grown["fibres"]] == [fibre[key] for fibre in kept["fibres"]]
+    assert [row[2:4] for row in grown["crossings"]["table"]] == [row[2:4] for row in kept["crossings"]["table"]]
+    assert [fibre["ridge_mm"] * 0.96 for fibre in grown["fibres"]] == pytest.approx(
+        [fibre["depth_mm"] for fibre in grown["fibres"]]
+    )
+    assert {finding["status"] for finding in grown["findings"]} == {"pass"}
 
 
 def test_what_stops_the_needle_is_told(tmp_path):
@@ -202,10 +208,53 @@ def test_what_stops_the_needle_is_told(tmp_path):
     assert by_machine["files"] == ["laying.script", "dispensing.svg"]
 
 
-def test_an_unknown_format_is_refused(tmp_path):
-    with pytest.raises(InputError, match="'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode, urscript"):
-        build(PAD, tmp_path / "out", ["obj"])
-    assert not (tmp_path / "out").exists()
+def other_solid(monkeypatch, body: str) -> None:
+    """Plant a box in place of a body's CAD model."""
+    for makes in ("mould_model", "body_model"):
+        right = getattr(model, makes)
+
+        def other(of, name, *rest, right=right):
+            made = right(of, name, *rest)
+            return replace(made, shape=Solid.make_box(1, 1, 1)) if name == body else made
+
+        monkeypatch.setattr(model, makes, other)
+
+
+def in_pieces(monkeypatch, body: str) -> None:
+    pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
+    monkeypatch.setattr(export, body, lambda plan: pieces)
+
+
+def full_step(*_, **__):
+    raise RuntimeError("Failed to write STEP file")  # what build123d makes of a full disk
+
+
+@pytest.mark.parametrize(
+    ("planted", "formats", "line"),
+    [
+        (None, ["obj"], "'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode, urscript"),
+        (None, ["svg"], "2 crossings"),
+        (partial(in_pieces, body="mould_body"), ["stl"], r"^mould: .*the mesh has 2 bodies.*nothing was written"),
+        (partial(in_pieces, body="lid_body"), ["stl"], r"^lid: .*the mesh has 2 bodies.*nothing was written"),
+        (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid is not of its mesh \(.*written"),
+        (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
+        (lambda m: m.setattr(Solid, "is_valid", False), ["step"], "mould: the CAD kernel finds a solid invalid"),
+        (
+            lambda m: m.setattr("build123d.export_step", full_step),
+            ["stl", "step"],
+            r"mould\.step: cannot be written \(the CAD kernel could not write it",
+        ),
+    ],
+)
+def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, planted, formats, line):
+    pad, settings = Morphology.straight(1), with_settings({"lid": True})
+    if planted:
+        planted(monkeypatch)
+    else:
+        pad, settings = level_pad(1.8, 1.2), with_settings({"levels": "two"})
+    with pytest.raises(InputError, match=line):
+        build(pad, tmp_path / "out", formats, settings)
+    assert not (tmp_path / "out").exists() or not contents(tmp_path / "out")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -217,21 +266,21 @@ def full_disk(*_, **__):
 
 
 @pytest.mark.parametrize(
-    ("last", "stop"), [("draw_tracks", full_disk), ("draw_tracks", KeyboardInterrupt), ("write_json", full_disk)]
+    ("last", "stop"), [("write_utf8", full_disk), ("write_utf8", KeyboardInterrupt), ("write_json", full_disk)]
 )
 def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last, stop):
-    build(PAD, tmp_path, ["stl", "svg", "png"])
+    build(PAD, tmp_path, ["stl", "svg"])
     before = contents(tmp_path)
 
-    def stopped(*arguments):
+    def stopped(*_, **__):
         raise stop if stop is KeyboardInterrupt else stop()
 
     monkeypatch.setattr(export, last, stopped)
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError) as told:
-        build(Morphology.straight(2), tmp_path, ["stl", "png"])
+        build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert contents(tmp_path) == before
-    if last == "draw_tracks" and stop is full_disk:
-        assert str(told.value) == f"{tmp_path / 'tracks.png'}: cannot be written (No space left on device)"
+    if last == "write_utf8" and stop is full_disk:
+        assert str(told.value) == f"{tmp_path / 'tracks.svg'}: cannot be written (No space left on device)"
 
 
 def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
@@ -243,18 +292,8 @@ def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
     assert (tmp_path / "mould.stl").read_bytes() == before
 
 
-def test_a_step_file_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise RuntimeError("Failed to write STEP file")  # what build123d makes of a full disk
-
-    monkeypatch.setattr("build123d.export_step", full)
-    with pytest.raises(InputError, match=r"mould\.step: cannot be written \(the CAD kernel could not write it"):
-        build(PAD, tmp_path, ["stl", "step"])
-    assert contents(tmp_path) == {}
-
-
 def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
-    build(PAD, tmp_path, ["stl", "svg", "dxf", "png"])
+    build(PAD, tmp_path, ["3mf", "stl", "svg", "dxf"])
     (tmp_path / "tracks.dxf").write_text("drawn upon")
     for name in ("mine.stl", "mould.step"):
         (tmp_path / name).write_text("somebody's own")
@@ -265,7 +304,7 @@ def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
     assert document["sha256"].keys() == {"mould.stl", "laying.md", "orientation.svg"}
     gone = "is gone: it was of the mould before this one"
     assert told == [
-        *(f"{tmp_path / name} {gone}" for name in ("mould.png", "tracks.png", "tracks.svg")),
+        *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
         f"{tmp_path / 'tracks.dxf'} is left from the mould before this one: it is not as it was written",
     ]
 

@@ -55,18 +55,30 @@ def test_check_of_a_morphology(morphology):
 
 
 @pytest.mark.parametrize(
-    ("table", "line"),
+    ("file", "table", "line"),
     [
-        ('[silicone]\nname = "Eco 20"', "[silicone] name: got 'Eco 20', allowed are published, EcoFlex 00-10, "),
-        ("[pad]\nfibre_diameter_mm = 0.4", "[pad] fibre_diameter_mm: no such key, it is [fibre] diameter_mm now"),
+        (
+            "pad.json",
+            '[silicone]\nname = "Eco 20"',
+            "[silicone] name: got 'Eco 20', allowed are published, EcoFlex 00-1",
+        ),
+        (
+            "pad.json",
+            "[pad]\nfibre_diameter_mm = 0.4",
+            "[pad] fibre_diameter_mm: no such key, it is [fibre] diameter_mm",
+        ),
+        ("pad.json", '[mould]\nlevels = "two"', "2 crossings"),
+        ("absent.json", "", "absent.json"),
     ],
 )
-def test_materials_that_cannot_be_are_one_line(morphology, tmp_path, table, line):
+def test_what_is_refused_is_one_line_and_leaves_nothing(tmp_path, file, table, line):
+    level_pad(1.8, 1.2).save(tmp_path / "pad.json")
     (tmp_path / "pad.toml").write_text(table, encoding="utf-8")
-    result = invoke(morphology, "--spec", tmp_path / "pad.toml")
-    assert isinstance(result.exception, InputError)
-    assert line in str(result.exception)
-    assert not (tmp_path / "mould.stl").exists()
+    error = invoke(tmp_path / file, "--out", tmp_path / "out", "--spec", tmp_path / "pad.toml").exception
+    assert isinstance(error, InputError)
+    assert line in str(error)
+    assert "\n" not in str(error)
+    assert not (tmp_path / "out").exists()
 
 
 def test_check_exits_1_when_a_check_fails(tmp_path):
@@ -96,45 +108,22 @@ def test_the_spec_shapes_the_mould(morphology, tmp_path):
     assert set(document["provenance"]["inputs"]) == {"morphology.json", "pad.toml"}
 
 
-def test_bad_input_is_an_input_error(tmp_path):
-    for arguments in ([tmp_path / "absent.json", "--out", tmp_path], ["check", tmp_path / "absent.stl"]):
-        error = invoke(*arguments).exception
-        assert isinstance(error, InputError)
-        assert "absent" in str(error)
-        assert "\n" not in str(error)
-
-
-def test_help_shows_both_forms():
-    result = invoke("--help")
-    assert result.exit_code == 0
-    for words in ("fabricate MORPHOLOGY", "fabricate check MESH_OR_MORPHOLOGY", "exit 1"):
-        assert words in result.output
-    assert "--formats" in invoke("build", "--help").output
-
-
-def test_imports_stay_light():
+@pytest.mark.parametrize("commands", [3, pytest.param(5, marks=pytest.mark.slow)])
+def test_imports_and_a_build_without_step_and_png_stay_light(morphology, tmp_path, commands):
     """One after the other in one process, each with more behind it than the one before."""
+    always = ["build123d", "OCP", "torch", "matplotlib"]
     light = [
-        ("fabricate", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "shapely", "matplotlib", "pydantic"]),
-        ("fabricate.cli", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
-        ("fabricate.settings", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "shapely", "numpy"]),
-        ("fabricate.export", ["build123d", "OCP", "torch", "trimesh", "manifold3d", "matplotlib"]),
+        ("import fabricate", [*always, "trimesh", "manifold3d", "shapely", "pydantic"]),
+        ("import fabricate.cli", [*always, "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
+        ("import fabricate.settings", [*always, "trimesh", "manifold3d", "shapely", "numpy"]),
+        ("import fabricate.export, design", [*always, "trimesh", "manifold3d"]),
+        (f"fabricate.build(design.Morphology.load({str(morphology)!r}), {str(tmp_path)!r}, ['stl', 'svg'])", always),
     ]
     code = (
-        "import importlib, sys\n"
-        f"for module, heavy in {light}:\n"
-        "    importlib.import_module(module)\n"
-        "    print(*(f'{module} loads {name}' for name in heavy if name in sys.modules))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.split() == []
-
-
-def test_a_build_without_step_and_png_loads_neither_cad_nor_plots(morphology, tmp_path):
-    code = (
-        "import sys; from pathlib import Path; from design.pad.morphology import Morphology; import fabricate;"
-        f"fabricate.build(Morphology.load({str(morphology)!r}), Path({str(tmp_path)!r}), ['stl', '3mf', 'svg']);"
-        "print(*(name for name in ('build123d', 'OCP', 'torch', 'matplotlib') if name in sys.modules))"
+        "import sys\n"
+        f"for command, heavy in {light[:commands]}:\n"
+        "    exec(command)\n"
+        "    print(*(f'{command} loads {name}' for name in heavy if name in sys.modules))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == []
@@ -146,11 +135,3 @@ def test_check_draws_where_the_findings_are(morphology, tmp_path):
     assert invoke("check", morphology, "--picture", picture, "--spec", tmp_path / "pad.toml").exit_code == 1
     with Image.open(picture) as image:
         assert image.format == "PNG"
-
-
-def test_a_refused_pad_is_one_line_and_leaves_nothing(tmp_path):
-    level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
-    (tmp_path / "pad.toml").write_text('[mould]\nlevels = "two"\n', encoding="utf-8")
-    result = invoke(tmp_path / "crossed.json", "--out", tmp_path / "out", "--spec", tmp_path / "pad.toml")
-    assert isinstance(result.exception, InputError)
-    assert not (tmp_path / "out").exists()

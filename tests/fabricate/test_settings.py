@@ -1,3 +1,5 @@
+"""Settings and materials: defaults, what is refused in one line, and what a shrinking silicone makes of them."""
+
 import math
 
 import numpy as np
@@ -5,8 +7,9 @@ import pytest
 
 from design.common.errors import InputError
 from design.common.settings import Spec, commented_toml
-from design.settings import Layout
-from fabricate.materials import FibreSettings, SiliconeSettings
+from design.pad.morphology import Morphology
+from fabricate.materials import FIBRES, SILICONES, Fibre, FibreSettings, Silicone, SiliconeSettings, divider_ohm
+from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import with_settings
 
@@ -18,56 +21,81 @@ def test_defaults_come_back_from_their_own_file(tmp_path):
     assert FabricationSettings.from_spec(Spec.load(path)) == DEFAULTS
 
 
+BOX = {"box_mm": [0.0, 9.0, 5.0, 5.0, 0.0, 9.0]}
+NEEDED = "; or a material of your own with cure_h, density_g_per_ml, parts, pot_life_min, shrinkage set"
+FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
+
+
 @pytest.mark.parametrize(
-    ("tables", "parts"),
+    ("section", "keys", "parts"),
     [
-        ({"mould": {"ridge_width": 1.0}}, ("[mould] ridge_width", "no such key", "ridge_width_mm")),
-        ({"mould": {"wall_mm": 0.1}}, ("[mould] wall_mm", "0.1", "greater than or equal to 0.8")),
-        ({"mould": {"floor_mm": "2"}}, ("[mould] floor_mm", "'2'", "number")),
-        ({"printer": {"bed_mm": [100.0, 100.0]}}, ("[printer] bed_mm", "at least 3")),
-        ({"dispenser": {"box_mm": [0.0, 9.0, 5.0, 5.0, 0.0, 9.0]}}, ("[dispenser] box_mm", "5.0", "from low to high")),
-        ({"dispenser": {"arm_pose": [0.0, 1.0]}}, ("[dispenser] arm_pose", "1.0")),
-        ({"dispenser": {"arm_pose": "known"}}, ("[dispenser] arm_pose", "'known'")),
-        ({"dispenser": {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}}, ("[dispenser] arm_pose", "400.0", "10")),
-        ({"printer": {"layer_mm": 0.0}}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
+        ("mould", {"ridge_width": 1.0}, ("[mould] ridge_width", "no such key", "ridge_width_mm")),
+        ("mould", {"wall_mm": 0.1}, ("[mould] wall_mm", "0.1", "greater than or equal to 0.8")),
+        ("mould", {"floor_mm": "2"}, ("[mould] floor_mm", "'2'", "number")),
+        ("mould", {"floor_mm": 0.0}, ("[mould] floor_mm", "0.0")),
+        ("mould", {"silicone_mm": 0.0}, ("[mould] silicone_mm", "0.0")),
+        ("mould", {"silicone_mm": math.inf}, ("[mould] silicone_mm", "inf")),
+        ("mould", {"wall_draft_deg": -1.0}, ("[mould] wall_draft_deg", "-1.0")),
+        ("mould", {"ridge_draft_deg": -1.0}, ("[mould] ridge_draft_deg", "-1.0")),
+        ("mould", {"ridge_draft_deg": math.nan}, ("[mould] ridge_draft_deg", "nan")),
+        ("mould", {"levels": "three"}, ("[mould] levels", "'three'")),
+        ("printer", {"bed_mm": [100.0, 100.0]}, ("[printer] bed_mm", "at least 3")),
+        ("printer", {"layer_mm": 0.0}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
+        ("dispenser", BOX, ("[dispenser] box_mm", "5.0", "from low to high")),
+        ("dispenser", {"arm_pose": [0.0, 1.0]}, ("[dispenser] arm_pose", "1.0")),
+        ("dispenser", {"arm_pose": "known"}, ("[dispenser] arm_pose", "'known'")),
+        ("dispenser", FAR, ("[dispenser] arm_pose", "400.0", "10")),
+        ("silicone", {"density_g_per_ml": 0.0}, ("[silicone] density_g_per_ml: got ",)),
+        ("silicone", {"parts": [1.0, 0.0]}, ("[silicone] parts.1: got ",)),
+        ("silicone", {"parts": [1.0]}, ("[silicone] parts.1: got ",)),
+        ("silicone", {"shrinkage": 0.3}, ("[silicone] shrinkage: got ",)),
+        ("silicone", {"shrinkage": -0.01}, ("[silicone] shrinkage: got ",)),
+        ("silicone", {"cure_h": math.nan}, ("[silicone] cure_h: got ",)),
+        ("silicone", {"name": "a | b"}, ("[silicone] name: got ",)),
+        ("silicone", {"name": "Ecoflex 00-31"}, (f"'Ecoflex 00-31', allowed are {', '.join(SILICONES)}", NEEDED)),
+        ("fibre", {"name": "yarn"}, (f"'yarn', allowed are {', '.join(FIBRES)}; or", "own with diameter_mm set")),
+        ("fibre", {"diameter_mm": 11.0}, ("[fibre] diameter_mm: got ",)),
+        ("fibre", {"ohm_per_mm": "unknown"}, ("[fibre] ohm_per_mm: got ",)),
+        ("fibre", {"least_bend_mm": -1.0}, ("[fibre] least_bend_mm: got ",)),
+        ("fibre", {"name": ""}, ("[fibre] name: got ",)),
+        ("fibre", {"name": "two\nlines"}, ("[fibre] name: got ",)),
     ],
 )
-def test_a_bad_key_is_one_clear_line(tables, parts):
-    spec = Spec(tables, "pad.toml")
+def test_a_bad_key_is_one_clear_line(section, keys, parts):
     with pytest.raises(InputError) as error:
-        FabricationSettings.from_spec(spec)
+        FabricationSettings.from_spec(Spec({section: keys}, "pad.toml"))
+    assert str(error.value).startswith("pad.toml: ")
     assert all(part in str(error.value) for part in parts), error.value
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
+    ("mould", "pitch_mm", "line"),
     [
-        ("ridge_width_mm", 12.0),
-        ("floor_mm", 0.0),
-        ("wall_mm", 0.0),
-        ("silicone_mm", 0.0),
-        ("wall_draft_deg", -1.0),
-        ("ridge_draft_deg", -1.0),
-        ("ridge_draft_deg", math.nan),
-        ("silicone_mm", math.nan),
-        ("silicone_mm", math.inf),
-        ("exit_width_mm", 11.0),
-        ("exit_width_mm", 0.3),
-        ("levels", "three"),
-        ("spout", True),
+        ({"ridge_width_mm": 12.0}, 11.25, "[mould] ridge_width_mm: got 12, allowed is less than the pitch, 11.25 mm"),
+        ({"spout": True}, 11.25, "[mould] spout: "),
+        ({"exit_width_mm": 11.0}, 11.25, "[mould] exit_width_mm: "),
+        ({"exit_width_mm": 0.3}, 11.25, "[mould] exit_width_mm: "),
+        ({}, 0.1, "[mould] ridge_width_mm: got 0.4, allowed is less than the pitch, 0.1 mm"),
+        ({}, 3.0, "[mould] exit_width_mm: "),
+        (
+            {"shallow_ridge_height_mm": 1.2},
+            11.25,
+            "[mould] shallow_ridge_height_mm: got 1.2, allowed is less than deep_ridge_height_mm, 1.2 mm",
+        ),
+        ({"silicone_mm": 1.0}, 11.25, "[mould] deep_ridge_height_mm: got 1.2, allowed is less than silicone_mm, 1 mm"),
+        (
+            {"tolerance_mm": 0.1},
+            11.25,
+            "[mould] tolerance_mm: got 0.1, allowed is less than a quarter of ridge_width_mm, 0.1 mm",
+        ),
     ],
 )
-def test_hostile_values_are_one_clear_line(key, value):
-    with pytest.raises(InputError, match=rf"\[mould\] {key}: (got )?") as refusal:
-        FabricationSettings.from_spec(Spec({"mould": {key: value}})).require_consistent(Layout.of(4))
-    assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize("pitch_mm", [0.1, 3.0])
-def test_a_pitch_too_small_for_the_ridges_or_the_exits(pitch_mm):
-    with pytest.raises(InputError, match="allowed is less than the pitch"):
-        DEFAULTS.require_consistent(Layout.of(4, pitch_mm))
+def test_settings_that_contradict_each_other_or_the_pad_are_one_clear_line(mould, pitch_mm, line):
+    with pytest.raises(InputError) as error:
+        Plan(Morphology.straight(4, pitch_mm), with_settings(mould))
+    assert str(error.value).startswith(line)
+    assert "\n" not in str(error.value)
 
 
 def test_terraces_are_whole_layers_with_steps_no_printer_places():
@@ -77,18 +105,7 @@ def test_terraces_are_whole_layers_with_steps_no_printer_places():
     assert FabricationSettings().terrace_mm == math.inf
 
 
-def test_default_ridges_are_whole_layers_of_common_printers():
-    for layer_mm in (0.1, 0.2):
-        for height in (
-            MouldSettings().deep_ridge_height_mm,
-            MouldSettings().shallow_ridge_height_mm,
-            MouldSettings().floor_mm,
-        ):
-            assert height / layer_mm == pytest.approx(round(height / layer_mm))
-    assert PrinterSettings().layer_mm == 0.1
-
-
-@pytest.mark.parametrize("shrinkage", [1e-3, 0.013, 0.2])
+@pytest.mark.parametrize("shrinkage", [0.013, 0.2])
 def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
     asked = with_settings({"border_mm": 1.5}, silicone={"shrinkage": shrinkage})
     mould = asked.enlarged().mould
@@ -99,8 +116,7 @@ def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
     assert asked.enlarged().shrunk == 1
 
 
-@pytest.mark.parametrize("layer_mm", [0.1, 0.2])
-@pytest.mark.parametrize("shrinkage", [1e-3, 0.02, 0.13])
+@pytest.mark.parametrize(("layer_mm", "shrinkage"), [(0.1, 1e-3), (0.1, 0.02), (0.2, 0.13)])
 def test_heights_of_whole_layers_stay_so_and_come_out_within_half_a_layer(layer_mm, shrinkage):
     asked = with_settings(printer={"layer_mm": layer_mm}, silicone={"shrinkage": shrinkage})
     for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
@@ -147,14 +163,66 @@ def test_the_defaults_are_those_the_pads_were_made_with():
     }
 
 
-@pytest.mark.parametrize("other", [None, 3, "pad.toml", {"mould": {}}])
-def test_settings_are_read_from_a_spec_and_nothing_else(other):
-    with pytest.raises(InputError, match=r"spec is .*, expected a Spec"):
-        FabricationSettings.from_spec(other)
-
-
 def test_numbers_of_numpy_are_numbers():
     assert Spec({}).section(MouldSettings, wall_mm=np.int64(3)) == MouldSettings(wall_mm=3)
     assert Spec({}).section(PrinterSettings, bed_mm=np.array([200, 210, 220])) == PrinterSettings(
         bed_mm=[200, 210, 220]
     )
+
+
+@pytest.mark.parametrize(
+    ("written", "preset"),
+    [
+        ("ecoflex 0030", "EcoFlex 00-30"),
+        ("DRAGON SKIN 10 Slow", "Dragon Skin 10 slow"),
+        ("dragonskin20", "Dragon Skin 20"),
+        ("Published", "published"),
+    ],
+)
+def test_a_preset_is_found_however_its_name_is_written(written, preset):
+    settings = SiliconeSettings(name=written)
+    assert settings.name == preset
+    assert settings.material == SILICONES[preset]
+
+
+def test_what_is_set_stands_in_place_of_the_preset():
+    grade = SiliconeSettings(name="Dragon Skin 30", shrinkage=0.004).material
+    assert (grade.shrinkage, grade.cure_h, grade.density_g_per_ml) == (0.004, 16, 1.08)
+    assert FibreSettings(ohm_per_mm=120.0).material == Fibre("carbon-black TPE", 0.3, 120.0, None, 0.8)
+
+
+def test_materials_of_ones_own():
+    spec = Spec(
+        {
+            "silicone": {
+                **{"name": "Sylgard 184", "density_g_per_ml": 1.03, "parts": [10, 1]},
+                **{"pot_life_min": 90, "cure_h": 48, "shrinkage": "preset"},
+            },
+            "fibre": {"name": "silvered yarn", "diameter_mm": 0.2},
+        }
+    )
+    with pytest.raises(InputError, match="of your own with shrinkage set"):
+        spec.section(SiliconeSettings)
+    whole = spec.section(SiliconeSettings, shrinkage=0.01)
+    assert whole.material == Silicone("Sylgard 184", 1.03, (10, 1), 90, 48, 0.01)
+    assert spec.section(FibreSettings).material == Fibre("silvered yarn", 0.2)
+
+
+def test_the_default_silicone_is_that_of_the_published_pads_whose_moulds_were_as_large():
+    assert SiliconeSettings().material == Silicone("EcoFlex 00-20", 1.07, (1, 1), 30, 4, 0)
+    assert FibreSettings().material.diameter_mm == 0.3
+    assert {grade.shrinkage for name, grade in SILICONES.items() if name != "published"} == {0.001}
+
+
+@pytest.mark.parametrize("fibre_ohm", [0.3, 1.0, 99.0, 105.0, 9.6e4, 3.14159e6])
+def test_no_resistor_of_the_series_shows_a_change_better(fibre_ohm):
+    series = "1 1.1 1.2 1.3 1.5 1.6 1.8 2 2.2 2.4 2.7 3 3.3 3.6 3.9 4.3 4.7 5.1 5.6 6.2 6.8 7.5 8.2 9.1"
+    sold = [float(f"{value}e{decade}") for value in series.split() for decade in range(-2, 8)]
+
+    def swing(ohm: float) -> float:
+        return ohm / (ohm + fibre_ohm) - ohm / (ohm + 1.0001 * fibre_ohm)
+
+    found = divider_ohm(fibre_ohm)
+    assert found in sold
+    assert swing(found) >= max(map(swing, sold)) * (1 - 1e-4)
+    assert swing(found) > 0.99 * 1e-4 / 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from manifold3d import CrossSection, Manifold, Mesh, OpType
 
@@ -26,7 +26,6 @@ from tests.fabricate.checks.trays import (
     spanning,
     tray,
 )
-from tests.helpers.effort import few
 
 
 class TestGood:
@@ -38,7 +37,7 @@ class TestGood:
         assert found["wall_thickness"].measured == pytest.approx(WALL, rel=0.03)
         assert found["floor_thickness"].measured == pytest.approx(FLOOR)
 
-    @few(25)
+    @settings(max_examples=6)
     @given(
         st.floats(0, 8),
         st.floats(0.8, 4),
@@ -58,7 +57,7 @@ class TestGood:
         adds = [ridge(outline, height + further) for outline in lines]
         assert not faults(inspected(tray(*adds, ridge(across, height), draft_deg=draft_deg, wall=wall)))
 
-    @pytest.mark.parametrize("angle_deg", [30, 45, 60, 90, 120])
+    @pytest.mark.parametrize("angle_deg", [30, 60, 120])
     def test_ridges_of_one_height_that_cross(self, angle_deg):
         crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
         assert not faults(inspected(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5)))))
@@ -78,14 +77,13 @@ class TestGood:
         assert found["silicone_wall"].measured == found["wall_thickness"].measured == 24
         assert faults(inspected(lid, genus=0)) == {"genus": "fail"}
 
-    def test_a_round_body_has_no_levels(self):
-        mesh = trimesh.creation.torus(10, 2)
-        found = inspected(mesh, genus=1)
-        assert set(faults(found)) == {"overhang"}
+    def test_bodies_without_levels_and_of_less_than_a_layer(self):
+        assert set(faults(inspected(trimesh.creation.torus(10, 2), genus=1))) == {"overhang"}
+        assert faults(inspected(block(10, 10, 0.03))) == {"floor_thickness": "fail"}
 
 
 class TestWidth:
-    @pytest.mark.parametrize(("width", "status"), [(0.2, "fail"), (0.3, "fail"), (0.36, "fail"), (0.39, "pass")])
+    @pytest.mark.parametrize(("width", "status"), [(0.2, "fail"), (0.36, "fail"), (0.39, "pass")])
     def test_a_narrow_ridge(self, width, status):
         thin = ridge(line((2, -6), (7, -5), width=width), 0.8)
         found = inspected(tray(*CROSS, thin))
@@ -102,12 +100,15 @@ class TestWidth:
             ({"nozzle_mm": 0.6}, "fail"),
             ({"nozzle_mm": 0.05, "resin": True}, "pass"),
             ({"nozzle_mm": 0.25, "resin": True}, "fail"),
+            ({"nozzle_mm": 0.25}, "pass"),
         ],
     )
     def test_what_a_printer_draws(self, printer, status):
         assert inspected(tray(*CROSS), printer=PrinterSettings.model_validate(printer))["ridge_width"].status == status
 
-    @pytest.mark.parametrize(("gap", "status"), [(0.05, "fail"), (0.3, "warn"), (0.35, "warn"), (0.4, "pass")])
+    @pytest.mark.parametrize(
+        ("gap", "status"), [(0.05, "fail"), (0.09, "fail"), (0.12, "warn"), (0.35, "warn"), (0.4, "pass")]
+    )
     def test_narrow_silicone_between_ridges(self, gap, status):
         found = inspected(
             tray(*CROSS, ridge(spanning(3.4 + gap), 1.2), ridge(spanning(-7)), ridge(spanning(-6.6 + gap)))
@@ -116,6 +117,8 @@ class TestWidth:
         if status != "pass":
             assert found["silicone_wall"].measured == pytest.approx(gap, abs=0.015)
             assert {round(y) for _, y in found["silicone_wall"].places_mm} == {3, -7}
+            allowed = tray(*CROSS, ridge(spanning(3.4 + gap), 1.2))
+            assert not faults(inspected(allowed, min_silicone_mm=gap - 0.04)) or gap < 0.1
 
     def test_ridges_of_one_height_that_cross_at_a_flat_angle(self):
         crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), 10, (0, 0.5)))
@@ -135,21 +138,10 @@ class TestWidth:
         found = inspected(tray(*CROSS, ridge(spanning(3.7), 1.2)) - slot)
         assert faults(found) == {"silicone_wall": "warn", "tight": "fail"}
 
-    def test_tracks_of_two_depths_may_come_close(self):
-        assert not faults(inspected(tray(*CROSS, ridge(spanning(3.7)))))
-
-    @pytest.mark.parametrize(("height", "status"), [(0.55, "pass"), (0.65, "warn")])
+    @pytest.mark.parametrize(("height", "status"), [(0.4, "pass"), (0.55, "pass"), (0.65, "warn")])
     def test_tracks_whose_depths_differ_by_less_than_one_and_a_half_walls_are_of_one_depth(self, height, status):
         found = inspected(tray(*CROSS, ridge(spanning(3.7), height)))
         assert found["silicone_wall"].status == status
-
-    @pytest.mark.parametrize(("gap", "status"), [(0.09, "fail"), (0.12, "warn")])
-    def test_silicone_that_does_not_come_out_in_one_piece(self, gap, status):
-        found = inspected(tray(*CROSS, ridge(spanning(3.4 + gap), 1.2)))
-        assert found["silicone_wall"].status == status
-
-    def test_less_silicone_may_be_allowed(self):
-        assert not faults(inspected(tray(*CROSS, ridge(spanning(3.6), 1.2)), min_silicone_mm=0.2))
 
     @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn"), (0.85, "pass")])
     def test_a_thin_wall(self, wall, status):
@@ -173,19 +165,14 @@ class TestWidth:
         ]
         assert found.measured == pytest.approx(0.5 + layer / 2 * 0.5, abs=0.015)
 
-    @pytest.mark.parametrize(("floor", "status"), [(0.2, "fail"), (0.35, "fail"), (0.5, "pass")])
-    def test_a_thin_floor(self, floor, status):
-        found = inspected(tray(floor=floor))
-        assert found["floor_thickness"].status == status
-        assert found["floor_thickness"].measured == pytest.approx(floor)
-
     @pytest.mark.parametrize(
         ("floor", "layer", "status"),
-        [(0.37, 0.1, "fail"), (0.39, 0.1, "pass"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
+        [(0.2, 0.1, "fail"), (0.37, 0.1, "fail"), (0.39, 0.1, "pass"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
     )
     def test_a_floor_is_two_layers_and_at_least_four_tenths_thick(self, floor, layer, status):
         found = inspected(tray(floor=floor), printer=PrinterSettings(layer_mm=layer))["floor_thickness"]
         assert (found.status, found.limit) == (status, pytest.approx(max(0.4, 2 * layer)))
+        assert found.measured == pytest.approx(floor)
 
     @pytest.mark.parametrize(("lean_deg", "status"), [(0, "fail"), (8, "fail"), (12, "pass")])
     def test_a_floor_is_level_to_ten_degrees(self, lean_deg, status):
@@ -197,9 +184,6 @@ class TestWidth:
         assert floor.status == status
         if status == "fail":
             assert floor.measured == pytest.approx(0.3, abs=0.02)
-
-    def test_less_than_a_layer(self):
-        assert faults(inspected(block(10, 10, 0.03))) == {"floor_thickness": "fail"}
 
     def test_a_pit_from_below(self):
         pit = Manifold.cylinder(FLOOR - 0.3, 1.0).translate((4, -5, 0))
@@ -246,9 +230,7 @@ class TestLean:
         assert undercut.places_mm
         assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.places_mm)
 
-    @pytest.mark.parametrize(
-        ("lean_deg", "status"), [(30, "pass"), (45, "pass"), (45.8, "pass"), (46.3, "fail"), (50, "fail")]
-    )
+    @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45.8, "pass"), (46.3, "fail")])
     def test_a_funnel_on_a_plate_is_no_cavity(self, lean_deg, status):
         top = 4 + 4 * math.tan(math.radians(lean_deg))
         cup = Manifold.cylinder(4, 4, top, 64) - Manifold.cylinder(5, 2, 2, 64).translate((0, 0, -0.5))
@@ -262,8 +244,3 @@ class TestLean:
 
 def _manifold(mesh: trimesh.Trimesh) -> Manifold:
     return Manifold(Mesh(np.float32(mesh.vertices), np.uint32(mesh.faces)))
-
-
-@pytest.mark.parametrize(("resin", "least"), [(False, 0.3), (True, 0.6)])
-def test_the_narrowest_line(resin, least):
-    assert PrinterSettings(nozzle_mm=0.3, resin=resin).line_mm == least

@@ -3,15 +3,14 @@
 import math
 import re
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 import shapely
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial import KDTree
 
 from design.pad.knots import Array
 from fabricate.mould.plan import Plan
+from tests.fabricate.planted import exact_fibre
 
 G_CODE = re.compile(r"([A-Z])([-+]?\d+(?:\.\d+)?)")
 POPUP = re.compile(r'  popup\("([^"]+)", title="padforge", blocking=True\)')
@@ -131,18 +130,12 @@ def blended(corners: list[list[float]], blends: list[float]) -> Array:
     return np.vstack([*out, whole[-1:]])
 
 
-def exact_course(plan: Plan, fibre: int, points: int = 10_000) -> Array:
-    """(n, 2) a fibre from lead to lead by scipy's PCHIP, n > `points`, on the pad turned over, from its middle."""
-    mould, family = plan.settings.mould, plan.family(fibre)
-    knots = plan.pad.to_mm(plan.pad.knots[fibre])
-    travel, cross = knots[:, family], knots[:, 1 - family]
-    within = [np.linspace(a, b, 200) for a, b in pairwise(travel)]
-    t = np.unique(np.concatenate([np.linspace(travel[0], travel[-1], points), *within]))
-    lead = mould.border_mm + mould.exit_mm + mould.lead_mm
-    v = np.concatenate([cross[:1], PchipInterpolator(travel, cross)(t), cross[-1:]])
-    t = np.concatenate([t[:1] - lead, t, t[-1:] + lead])
-    x, y = (t, v) if family == 0 else (v, t)
-    return np.column_stack([-x, y])
+def exact_course(plan: Plan, fibre: int) -> Array:
+    """(n, 2) a fibre from lead to lead by scipy's PCHIP, on the pad turned over, from its middle."""
+    mould, line = plan.settings.mould, exact_fibre(plan.pad, fibre)
+    ends = line[[0, -1]]
+    ends[:, plan.family(fibre)] += np.array([-1, 1]) * (mould.border_mm + mould.exit_mm + mould.lead_mm)
+    return np.vstack([ends[:1], line, ends[1:]]) * (-1, 1)
 
 
 def apart(one: Array, other: Array, points: int) -> float:

@@ -1,5 +1,6 @@
+"""How fast a needle goes along fibres, and whether it has room and fits its tracks."""
+
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,15 +9,11 @@ from scipy.interpolate import PchipInterpolator
 
 from design.pad.knots import assemble
 from design.pad.morphology import Morphology
-from design.settings import PadSettings, RulesSettings
+from fabricate.dispensing.clearance import check_course
 from fabricate.dispensing.course import Stroke, laying_steps
 from fabricate.mould.plan import Plan
 from fabricate.report.laying import guide
-from fabricate.settings import DEFAULTS, DispenserSettings
-
-
-def with_dispenser(**keys: object):
-    return replace(DEFAULTS, dispenser=DispenserSettings.model_validate(keys))
+from tests.fabricate.planted import with_settings
 
 
 def strokes(plan: Plan, stretch: float = math.inf) -> list[Stroke]:
@@ -42,7 +39,9 @@ def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
 
 @pytest.mark.parametrize("stretch", [math.inf, 0.3])
 def test_no_bend_is_taken_faster_than_machine_and_fibre_can(stretch):
-    plan = Plan(Morphology.random(2, 3, seed=6), with_dispenser(acceleration_mm_s2=60.0, feed_mm_s=12.0))
+    plan = Plan(
+        Morphology.random(2, 3, seed=6), with_settings(dispenser={"acceleration_mm_s2": 60.0, "feed_mm_s": 12.0})
+    )
     slow = 0
     for stroke in strokes(plan, stretch):
         radius = least_radii(plan, stroke, 0.3)
@@ -65,10 +64,10 @@ def test_no_bend_is_taken_faster_than_machine_and_fibre_can(stretch):
 )
 def test_the_feed_in_a_bend_is_what_its_radius_allows(radius_mm, acceleration, stretch, feed):
     """Leads to one side turn by quarters of a circle, of the least radius of the rules; all else here is straight."""
-    settings = replace(
-        with_dispenser(acceleration_mm_s2=acceleration, feed_mm_s=10.0),
-        pad=PadSettings(leads="one side"),
-        rules=RulesSettings(min_bend_radius_mm=radius_mm),
+    settings = with_settings(
+        pad={"leads": "one side"},
+        rules={"min_bend_radius_mm": radius_mm},
+        dispenser={"acceleration_mm_s2": acceleration, "feed_mm_s": 10.0},
     )
     (horizontal,) = (each for each in strokes(Plan(Morphology.straight(2), settings), stretch) if each.fibre == 0)
     assert (horizontal.feeds_mm_s.min(), horizontal.feeds_mm_s.max()) == (feed, 10.0)
@@ -84,6 +83,7 @@ def test_bends_only_where_they_are_slow_a_fibre_down():
     inner[1] = [(1, 0.5), (1, 1.0), (1, 1.5)]
     bent, straight = strokes(Plan(Morphology(assemble(inner), 10.0)))
     assert straight.feeds_mm_s.tolist() == [10.0]
+    assert len(straight.places_mm) == 2
     at_most = bent.feeds_mm_s == 10
     assert 0 < bent.steps_mm[~at_most].sum() < 6
     assert at_most[[0, -1]].all()
@@ -107,7 +107,54 @@ def test_as_long_as_the_laying_page_has_it_cut():
         assert stroke.steps_mm.sum() == pytest.approx(cut[stroke.fibre], abs=0.02)
 
 
-def test_few_corners_where_a_fibre_is_straight():
-    plan = Plan(Morphology.straight(3))
-    assert all(len(stroke.places_mm) == 2 for stroke in strokes(plan, 1.0))
-    assert {stroke.feeds_mm_s.item() for stroke in strokes(plan, 1.0)} == {10.0}
+PAD = Morphology.straight(2)  # 33.75 mm, with leads 97.75 mm
+
+
+EDGE = 33.75 / 2 + 2 + 30
+
+
+def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object):
+    plan = Plan(pad, with_settings(mould, dispenser=dispenser))
+    return {finding.name: finding for finding in check_course(plan, laying_steps(plan, 0.3))}
+
+
+@pytest.mark.parametrize(
+    ("keys", "room", "places"),
+    [
+        ({"origin_mm": [EDGE, EDGE]}, 0.0, None),
+        ({"origin_mm": [EDGE - 0.5, 110.0]}, -0.5, [(EDGE, -5.625), (EDGE, 5.625)]),
+        ({"box_mm": [0.0, 220.0, 0.0, 110 + EDGE - 2, -5.0, 9.0]}, -2.0, [(-5.625, EDGE), (5.625, EDGE)]),
+        ({"box_mm": [0.0, 220.0, 0.0, 220.0, -0.5, 9.0]}, -0.4, [(-EDGE, -5.625), (-EDGE, 5.625)]),
+        ({"travel_height_mm": 10.0, "box_mm": [0.0, 220.0, 0.0, 220.0, -5.0, 9.0]}, -1.0, None),
+    ],
+)
+def test_the_box_holds_all_ways_or_it_is_told_where_not(keys, room, places):
+    found = findings(**keys)["dispenser_box"]
+    assert found.measured == pytest.approx(room, abs=1e-9)
+    assert found.status == ("pass" if room == 0 else "fail")
+    if places is not None:
+        assert np.array(sorted(found.places_mm)) == pytest.approx(np.array(places))
+    else:
+        assert len(found.places_mm) == (4 if room else 0)
+
+
+@pytest.mark.parametrize(
+    ("tip", "mould", "status"),
+    [
+        (0.37, {}, "pass"),
+        (0.41, {}, "fail"),
+        (0.64, {"ridge_width_mm": 0.7}, "pass"),
+        (0.71, {"ridge_width_mm": 0.7}, "fail"),
+    ],
+)
+def test_a_needle_wider_than_a_track_would_cut_the_silicone(tip, mould, status):
+    found = findings(mould, tip_mm=tip)["dispenser_tip"]
+    assert (found.status, found.measured) == (status, tip)
+    assert bool(found.places_mm) == (status == "fail")
+    assert all(max(map(abs, place)) < EDGE - 29 for place in found.places_mm)  # leads lie outside
+
+
+def test_by_default_the_needle_can_go_its_way():
+    found = findings(pad=Morphology.random(3, 5, seed=4))
+    assert {finding.status for finding in found.values()} == {"pass"}
+    assert 0.38 < float(str(found["dispenser_tip"].limit)) <= 0.4

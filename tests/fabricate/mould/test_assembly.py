@@ -16,7 +16,6 @@ from fabricate.mould.assembly import (
     holder_body,
     lid_body,
     mould_body,
-    plan_mesh,
     sizes,
 )
 from fabricate.mould.cad.bodies import body_solid
@@ -61,48 +60,45 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
     return float((w[:, inside] * corners[up][inside][:, :, 2].T).sum(axis=0).max())
 
 
-def test_straight_pad_has_the_volume_that_arithmetic_gives():
-    plain = with_settings({"exit_mm": 0.0, "number_mm": 0.0})
-    plan = Plan(Morphology.straight(4), plain)
-    inner, ridge, lean = 56.25, 0.4, 2 * 6 * math.tan(math.radians(2))
-    ridges = 4 * inner * ridge * (1.2 + 0.4) - 16 * ridge * ridge * 0.4  # the shallow ones end at the deep ones
-    rim = inner + lean
-    hollow = 6 * (inner**2 + inner * rim + rim**2) / 3
-    behind = 2 * ridge * math.tan(math.radians(2)) * 4 * (1.2**2 + 0.4**2) / 2  # where the wall leans off a ridge's end
-    expected = (rim + 4) ** 2 * 8 - hollow + ridges + behind
-    assert plan_mesh(plan).volume() == pytest.approx(expected, rel=1e-9)
-    assert sizes(plan)["tray_mm"] == pytest.approx(rim + 4)
-
-
-@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
-def test_published_moulds_are_closed(published, name):
-    plan = Plan(Morphology.load(published / f"{name}.mat"))
-    assert_one_closed_body(as_read(mould_body(plan)))
-
-
-@pytest.mark.slow
-def test_all_ways_to_the_solid_of_a_published_pad_agree(published):
-    assert_both_ways_agree(mould_body(Plan(Morphology.load(published / "1para.mat"))))
+@pytest.mark.parametrize(
+    "pad",
+    [
+        *((1, 1, 0), (2, 10, 2), (1, 30, 1032)),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "5para_dis", "20para")),
+    ],
+)
+def test_random_and_published_moulds_are_closed(request, pad):
+    if isinstance(pad, str):
+        pad = Morphology.load(request.getfixturevalue("published") / f"{pad}.mat")
+    else:
+        pad = Morphology.random(*pad)
+    assert_one_closed_body(as_read(mould_body(Plan(pad))))
 
 
 @pytest.mark.parametrize(
-    ("grid", "knots", "seed"),
+    ("make", "pad", "mould", "line"),
     [
-        *((1, 1, 0), (2, 3, 1), (2, 10, 2), (2, 30, 1032), (5, 2, 4)),
-        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((4, 10, 2), (4, 30, 1032), (9, 4, 4))),
+        (lid_body, (1, 3.5), {"lid": True, "spout": True}, "spout: got true for a pad 7 mm wide, allowed from 19"),
+        (mould_body, (2,), {"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}, r"pins.*1 mm wide"),
+        (conductive_plan, (2, 5.0), {}, "exit_width_mm"),
     ],
 )
-def test_random_moulds_are_closed(grid, knots, seed):
-    plan = Plan(Morphology.random(grid, knots, seed))
-    assert_one_closed_body(as_read(mould_body(plan)))
+def test_what_has_no_room_is_refused(make, pad, mould, line):
+    with pytest.raises(InputError, match=line):
+        make(Plan(Morphology.straight(*pad), with_settings(mould)))
 
 
 @pytest.mark.parametrize(
     "settings",
     [
-        with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
+        pytest.param(
+            with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
+            marks=pytest.mark.slow,
+        ),
         with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
-        with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}),  # the oracle's pins are round
+        pytest.param(  # the oracle's pins are round
+            with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_both_ways_to_the_mould_agree(settings):
@@ -148,34 +144,6 @@ def test_the_frame_on_the_bed_is_that_of_the_mould():
     assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
 
 
-def test_a_lid_with_pins_and_spout_has_the_volume_that_arithmetic_gives():
-    plan = Plan(Morphology.straight(1), with_settings(EVERYTHING))
-    disc = 8 * math.sin(math.pi / 32)  # area of 64 sides around a diameter of 1
-    flare = 2 * 6 * math.tan(math.radians(30))
-
-    def cone(low, high, height):
-        return disc * height * (low**2 + low * high + high**2) / 3
-
-    plate = 3 * (sizes(plan)["tray_mm"] ** 2 - disc * (4 * 1.5**2 + 3 * (sizes(plan)["pin_mm"] + 0.3) ** 2 + 6.0**2))
-    cup = cone(10 + flare * 0.2 / 6.2, 10 + flare, 6.0)
-    lid = mesh(lid_body(plan))
-    assert lid.volume() == pytest.approx(plate + cup - cone(6.0, 6 + flare, 6.0), rel=1e-6)
-
-
-@pytest.mark.parametrize(("family", "heights"), [("horizontal", (1.2, 0.4)), ("vertical", (0.4, 1.2))])
-def test_each_family_gets_its_height(family, heights):
-    plan = Plan(Morphology.straight(2, pitch_mm=10.0), with_settings({"number_mm": 0.0}, pad={"deep_family": family}))
-    read = as_read(mould_body(plan))
-    for place, height in (
-        ((0.1, -5.1), heights[0]),
-        ((-5.1, 0.1), heights[1]),
-        ((-5.05, -5.1), 1.2),
-        ((0.1, 0.2), 0.0),
-        ((15.9, 0.1), 6.0),
-    ):
-        assert height_at(read, *place) == pytest.approx(2 + height, abs=1e-4), place
-
-
 def test_tracks_run_out_of_the_pad_through_its_tongues():
     plan = Plan(Morphology.straight(1, pitch_mm=10.0), with_settings({"number_mm": 0.0, "border_mm": 1.0}))
     read = as_read(mould_body(plan))
@@ -218,6 +186,7 @@ def test_lid_has_the_holes_that_fit_the_pins():
     assert_one_closed_body(read)
     spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
     assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
+    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))  # just room enough
 
 
 @pytest.mark.parametrize(
@@ -231,18 +200,6 @@ def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
         assert_one_closed_body(as_read(body))
 
 
-def test_a_spout_needs_room_between_the_vents():
-    with pytest.raises(InputError, match=r"spout: got true for a pad 7 mm wide, allowed from 19"):
-        lid_body(Plan(Morphology.straight(1, 3.5), with_settings({"lid": True, "spout": True})))
-    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))
-
-
-def test_pins_need_room():
-    plan = Plan(Morphology.straight(2), with_settings({"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}))
-    with pytest.raises(InputError, match=r"pins.*1 mm wide"):
-        mould_body(plan)
-
-
 def test_the_second_mould_has_a_well_at_every_ridge_end():
     plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
     read = as_read(conductive_body(plan))
@@ -252,8 +209,6 @@ def test_the_second_mould_has_a_well_at_every_ridge_end():
         for offset in (0.0, 0.9 * WELL_MM / 2):
             assert height_at(read, x, -7.5 + offset + 0.01) == pytest.approx(2 + 1.2, abs=1e-4)
         assert height_at(read, x, -7.5 + 1.1 * WELL_MM / 2) == pytest.approx(2.0, abs=1e-4)
-    with pytest.raises(InputError, match="exit_width_mm"):
-        conductive_plan(Plan(Morphology.straight(2, pitch_mm=5.0)))
 
 
 def test_corners_that_meet_by_chance_are_drawn_apart():
@@ -265,14 +220,14 @@ def test_corners_that_meet_by_chance_are_drawn_apart():
     assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(2, abs=2e-3)
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(1, 3), (5, 4), (20, 5)])
+@pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])
 def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
     plan = Plan(Morphology.random(2, knots, seed))
     read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm
     floors = []
     for line in plan.lines:
-        places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 60))
+        places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 40))
         # Deeper tracks that cross are seen too: the least is the fibre's own.
         floors.append(min(height_at(read, *place) for place in shapely.get_coordinates(places)))
     (stated,) = [f.measured for f in check_plan(plan) if f.name == "crossing_gap"]

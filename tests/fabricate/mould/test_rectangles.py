@@ -1,23 +1,31 @@
-"""Moulds of pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
+"""Pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
 from hypothesis import given
+from hypothesis import settings as effort
 from hypothesis import strategies as st
 
 from design.pad.morphology import Morphology
 from design.settings import PadSettings
 from fabricate.checks.plan_checks import check_plan, meshed
+from fabricate.dispensing.course import laying_steps, turned_over
+from fabricate.export import build
 from fabricate.mould.assembly import bed_frame, holder_body, lid_body, plan_mesh, sizes
 from fabricate.mould.mesh import mesh
 from fabricate.mould.plan import Plan
-from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings
-from tests.helpers.effort import few
+from fabricate.report.laying.orientation import orientation_svg, sentence
+from fabricate.report.relief import WALL, mould_relief
+from fabricate.report.track_drawings import tracks_svg
+from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, FibreSettings, MouldSettings
 
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
+
+
 HOLE = ((-2.5, 3.0), (2.5, 3.0), (2.5, 11.0), (-2.5, 11.0))
 """Between fibres of `PAD`."""
 
@@ -44,12 +52,8 @@ def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
     more = plan_mesh(with_hole).volume() - plan_mesh(without).volume()
     assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
     rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
-    section = plan_mesh(with_hole).slice(rim - 1e-3).to_polygons()
-    assert any(
-        shapely.Polygon(ring).equals_exact(shapely.Polygon(HOLE).normalize(), 1e-3)
-        or shapely.Polygon(ring).symmetric_difference(shapely.Polygon(HOLE)).area < 1e-2
-        for ring in section
-    )
+    section = [shapely.Polygon(ring) for ring in plan_mesh(with_hole).slice(rim - 1e-3).to_polygons()]
+    assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
 
 
 def test_a_keep_out_at_the_edge_joins_the_wall():
@@ -90,7 +94,7 @@ def test_few_fibres_have_a_mould_as_any_other(fibres, leads):
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
 
 
-@few(40)
+@effort(max_examples=20)
 @given(
     st.tuples(st.integers(0, 8), st.integers(0, 8)).filter(any),
     st.tuples(st.floats(4, 25), st.floats(4, 25)),
@@ -117,19 +121,6 @@ def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches,
     assert np.diff(exits).min() > apart - 1e-6
 
 
-def test_leads_turn_no_tighter_than_the_fibre_bears():
-    plan = Plan(
-        PAD, replace(settings(PAD, leads="one side"), fibre=DEFAULTS.fibre.model_copy(update={"least_bend_mm": 4.0}))
-    )
-    for lead in (lead for pair in plan.leads.pairs for lead in pair if len(lead.spans)):
-        way = np.vstack([lead.end_mm, lead.bends(1e-6)])
-        turns = np.abs((np.diff(np.arctan2(*np.diff(way, axis=0).T)) + np.pi) % (2 * np.pi) - np.pi)
-        steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
-        bent = turns > 1e-9
-        inner = bent[1:] & bent[:-1]
-        assert (steps[1:-1][inner] / turns[1:][inner]).min() > 3.99
-
-
 def test_leads_of_a_shrinking_silicone_come_out_as_planned():
     plan = Plan(
         PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))
@@ -143,9 +134,79 @@ def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
     pad = Morphology.straight((1, 3), (9.0, 12.0))
     plan = Plan(pad, settings(pad, {"holder": True}, leads="one side"))
     walls = mesh(holder_body(plan)).slice(DEFAULTS.mould.floor_mm + 0.5)
-    solid = shapely.union_all([shapely.Polygon(ring) for ring in walls.to_polygons()])
+    solid = shapely.Polygon()
+    for ring in walls.to_polygons():
+        solid = solid.symmetric_difference(shapely.Polygon(ring))
     for lead in (lead for pair in plan.leads.pairs for lead in pair):
         x, y = lead.beyond(DEFAULTS.mould.exit_mm + 1)
-        assert not solid.boundary.dwithin(shapely.Point(-x, y), 1e-3)
+        assert solid.distance(shapely.Point(-x, y)) > 1
     low, high = plan.tray.bounds[1], plan.tray.bounds[3]
     assert bed_frame(plan)["centre_mm"] == pytest.approx([110.0, 110.0 - (low + high) / 2])
+
+
+@pytest.mark.parametrize(
+    ("fibres", "leads", "says"),
+    [
+        ((2, 3), "edges", "horizontal fibres count from near to far and start on the right, vertical ones"),
+        ((0, 3), "edges", "all fibres are vertical: they count from right to left and start at the near side."),
+        ((2, 0), "edges", "all fibres are horizontal: they count from near to far and start on the right."),
+        ((2, 3), "one side", "all leads leave at the near side: horizontal fibres"),
+    ],
+)
+def test_one_sentence_says_which_way_round(fibres, leads, says):
+    pad = Morphology.straight(fibres, (8.0, 15.0))
+    assert says in sentence(fibres, leads)
+    assert says in re.sub(r"\s+", " ", orientation_svg(Plan(pad, settings(pad, leads=leads))))
+
+
+def test_the_page_and_drawings_have_holes_bending_exits_and_lengths(tmp_path):
+    pad, hole = Morphology.straight((2, 3), (8.0, 15.0)), ((-7.0, -5.0), (-1.0, -5.0), (-1.0, 5.0), (-7.0, 5.0))
+    own = settings(pad, leads="one side", keep_out_mm=(hole,), bent_radius_mm=30.0)
+    own = replace(own, fibre=FibreSettings(ohm_per_mm=10.0))
+    document = build(pad, tmp_path, [], own)
+    page = (tmp_path / "laying.md").read_text(encoding="utf-8")
+    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 5." in page
+    assert "around every pillar" in page
+    assert "bent to 30 mm, fibres are stretched by up to" in page
+    assert "from left to right as the pad lies for laying, these fibres end: 5, 2, 1, 5, 4, 3, 1, 2, 3, 4." in page
+    assert document["settings"]["pad"]["horizontals"] == 2
+    plan = Plan(pad, own)
+    for entry, line in zip(document["fibres"], plan.lines, strict=True):
+        assert entry["in_pad_mm"] == pytest.approx(line.length - 1.0, abs=0.01)  # less what runs into the walls
+        assert entry["resistance_ohm"] == pytest.approx(10 * entry["cut_mm"], rel=1e-3)
+    whole = build(pad, tmp_path, [], settings(pad, leads="one side"))
+    less = whole["silicone_volume_ml"] - document["silicone_volume_ml"]
+    assert less == pytest.approx(6 * 10 * 6 / 1000, abs=1e-3)
+    left, low, right, high = plan.tray.bounds
+    heights, shown = mould_relief(plan, round(10 * (right - left)), round(10 * (high - low)))
+    row, column = round(10 * high), round(10 * (-4 - left))
+    assert (shown[row, column], heights[row, column]) == (WALL, plan.silicone_mm)
+    assert heights.shape == shown.shape == (round(10 * (high - low)), round(10 * (right - left)))
+    drawing = tracks_svg(plan)
+    edge = re.search(r'<path id="edge" d="([^"]*)"', drawing)
+    assert edge is not None
+    assert edge[1].count("M") == 2
+    assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
+
+
+def test_a_pad_without_crossings_has_a_page(tmp_path):
+    document = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
+    assert document["crossings"]["gap_mm"] is None
+    assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("bend_mm", "acceleration", "least_mm_s"), [(3.0, 100.0, 10.0), (1.0, 25.0, 5.0)])
+def test_a_needle_follows_the_leads_and_is_slow_in_tight_bends(bend_mm, acceleration, least_mm_s):
+    """The root of acceleration times radius, 17 and 5 mm/s, of which the feed is at most 10 mm/s."""
+    own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(least_bend_mm=bend_mm))
+    own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
+    plan = Plan(PAD, own)
+    strokes = [stroke for step in laying_steps(plan, 0.3) for stroke in step.strokes]
+    for stroke in strokes:
+        line = shapely.LineString(turned_over(stroke.places_mm))
+        assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
+        places = np.asarray(shapely.points(turned_over(stroke.places_mm)))
+        places = places[shapely.within(places, plan.silicone)]
+        assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
+    assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)
+    assert strokes[0].feeds_mm_s.max() == 10.0

@@ -70,21 +70,15 @@ def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_the_drawn_mould_is_the_mould(mould):
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould))
-    drawn, _ = mould_relief(plan, 300, 300)
+    drawn, shown = mould_relief(plan, 300, 300)
     meshed, _ = mesh_relief(*mesh_of(plan), 300)
     assert drawn.shape == meshed.shape
     off = np.abs(meshed - plan.settings.mould.floor_mm - drawn)
     assert (off > 0.01).mean() < 2e-4  # pixels whose middle lies on an edge fall on either side
-
-
-def test_the_drawn_mould_of_a_published_pad_is_the_mould(published):
-    plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    drawn, shown = mould_relief(plan, 400, 400)
-    meshed, _ = mesh_relief(*mesh_of(plan), 400)
-    assert (np.abs(meshed - 2 - drawn) > 0.01).mean() < 2e-4
-    assert set(np.unique(shown)) == {FLOOR, WALL, NUMBER, *(RIDGE + level for level in range(4))}
+    kinds = {FLOOR, WALL, *(RIDGE + level for level in range(3))}
+    assert set(np.unique(shown)) == kinds | ({NUMBER} if plan.settings.mould.number_mm else set())
     for level, height in enumerate(plan.heights_mm):
-        assert np.unique(drawn[shown == RIDGE + level]) == pytest.approx([height])
+        assert drawn[shown == RIDGE + level].max() == pytest.approx(height)
 
 
 def test_heights_of_slopes_and_of_what_lies_over_them():
@@ -139,6 +133,7 @@ def test_every_place_that_fails_or_warns_is_marked_and_no_other(mould_picture):
     assert all(count > 0 for count in marked(*MARKED))
 
 
+@pytest.mark.slow
 def test_checks_have_marks_of_their_own(mould_picture):
     place = (0.0, 4.0)
     both = [finding("fail", place), finding("fail", place, name="bend")]
@@ -170,6 +165,7 @@ def test_any_mesh_is_drawn_with_its_findings(tmp_path):
     assert not where(pixels(path), ALARM).any()
 
 
+@pytest.mark.slow
 def test_pictures_are_small(tmp_path, published):
     plan = Plan(Morphology.load(published / "20para.mat"))
     findings = [finding("fail", *as_places(plan.pad.to_mm([c.place for c in plan.clashes])))]
@@ -179,7 +175,7 @@ def test_pictures_are_small(tmp_path, published):
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["mould", "tracks", "mesh"])
+@pytest.mark.parametrize("kind", ["mesh", *(pytest.param(k, marks=pytest.mark.slow) for k in ("mould", "tracks"))])
 def test_pictures_are_the_same_each_time(tmp_path, kind):
     def draw(path: Path) -> bytes:
         if kind == "mould":

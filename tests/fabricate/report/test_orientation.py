@@ -15,8 +15,14 @@ from sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 
 SVG, XLINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}"
-DOCS = Path(__file__).parents[4] / "docs"
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
 LYING = {"mould": (False, 0.0), "turned": (True, 0.0), "used": (True, TURN_DEG)}
+
+
 PADS = [Morphology.straight(1), Morphology.random(3, 2, seed=4), Morphology.straight(12, pitch_mm=6.0)]
 
 

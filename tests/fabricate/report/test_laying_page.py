@@ -1,18 +1,21 @@
+"""The page for the bench: what to mix, cut, lay and wire, by integration and by the curves, and what it says of it."""
+
 import math
+import re
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import shapely
 from scipy.integrate import quad
-from scipy.interpolate import PchipInterpolator
 
 from design.pad.morphology import Morphology
-from fabricate.mould.assembly import mould_body, plan_mesh
-from fabricate.mould.mesh import mesh
+from fabricate.export import build
+from fabricate.mould.assembly import plan_mesh
 from fabricate.mould.plan import Plan
-from fabricate.report.laying import guide, orientation
-from fabricate.settings import DEFAULTS, FabricationSettings
-from tests.fabricate.planted import level_pad, with_settings
+from fabricate.report.laying import guide, orientation, print_settings
+from fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
+from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 
 def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
@@ -54,28 +57,22 @@ def test_silicone_of_a_straight_pad(draft_deg):
     assert silicone["volume_ml"] == pytest.approx(expected, abs=1e-3)
     assert silicone["mass_g"] == pytest.approx(expected * 1.07 * 1.1, abs=0.02)
     assert silicone["part_a_g"] == silicone["part_b_g"] == pytest.approx(silicone["mass_g"] / 2)
+    other = with_settings(plan.settings.mould.model_dump(), silicone={"density_g_per_ml": 1.3, "parts": [10.0, 1.0]})
+    mixed = guide.document(Plan(plan.pad, other), plan_mesh(plan).volume())["silicone"]
+    assert mixed["mass_g"] == pytest.approx(expected * 1.3 * 1.1, abs=0.02)
+    assert mixed["part_a_g"] == pytest.approx(10 * mixed["part_b_g"], abs=0.06)
 
 
-def test_a_thicker_pad_takes_more_silicone(published):
-    plan = Plan(Morphology.load(published / "20para.mat"))
+def test_pins_take_no_silicone_and_a_thicker_pad_takes_more(tmp_path):
+    pad = Morphology.straight(2)
+    volumes = [build(pad, tmp_path, [], with_settings({"pins": pins}))["silicone_volume_ml"] for pins in (True, False)]
+    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
+    plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
     silicone = guide.document(plan, plan_mesh(plan).volume())["silicone"]
-    assert silicone["thickness_mm"] == plan.silicone_mm == 7.0
-    empty = plan.silicone.area * 7
+    assert silicone["thickness_mm"] == plan.silicone_mm == 3.0
+    empty = plan.silicone.area * 3
     tracks = sum(area.area * height for area, height in zip(plan.ridges, plan.heights_mm, strict=True))
     assert empty - tracks < 1000 * silicone["volume_ml"] < empty * 1.02
-
-
-def test_pins_take_no_silicone():
-    pad = Morphology.straight(3)
-    with_pins = Plan(pad, with_settings({"pins": True}))
-    height = DEFAULTS.mould.floor_mm + with_pins.silicone_mm
-    inner = mesh(mould_body(with_pins)).trim_by_plane((0, 0, -1), -height)
-    plain = Plan(pad)
-    volumes = [
-        guide.document(p, v)["silicone"]["volume_ml"]
-        for p, v in ((with_pins, inner.volume()), (plain, plan_mesh(plain).volume()))
-    ]
-    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
 
 
 @pytest.mark.parametrize("mould", [{}, {"border_mm": 1.5, "exit_mm": 0.0, "lead_mm": 12.5}])
@@ -83,15 +80,12 @@ def test_lengths_are_those_of_the_curves(mould):
     plan = Plan(Morphology.random(3, 4, seed=3), with_settings(mould))
     tongue = plan.settings.mould.border_mm + plan.settings.mould.exit_mm
     for fibre, entry in enumerate(guide.document(plan, 1.0)["fibres"]):
-        axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
-        slope = PchipInterpolator(knots[:, axis], knots[:, 1 - axis]).derivative()
-        stretches = zip(knots[:-1, axis], knots[1:, axis], strict=True)
-        course = sum(quad(lambda t, slope=slope: np.hypot(1, slope(t)), *ends, limit=200)[0] for ends in stretches)
+        course = shapely.LineString(exact_fibre(plan.pad, fibre)).length
         assert entry["in_pad_mm"] == pytest.approx(course + 2 * tongue, abs=0.006)
         assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
 
 
-def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
+def test_a_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
     document = guide.document(plan, 1.0)
     assert [fibre["number"] for fibre in document["fibres"]] == list(range(1, 9))
@@ -100,26 +94,20 @@ def test_every_fibre_is_there_once_and_the_deepest_are_laid_first(published):
     assert depths == [{2.8}, {2.0}, {1.2}, {0.4}]
     assert sorted(n for step in document["laying_order"] for n in step) == list(range(1, 9))
     assert [fibre["level"] for fibre in document["fibres"]] == list(plan.levels)
-
-
-def test_silicone_between_fibres_at_every_crossing(published):
-    plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    crossings = guide.document(plan, 1.0)["crossings"]
+    crossings = document["crossings"]
     assert crossings["total"] == len(crossings["table"]) == 30
-    assert crossings["same_family"] == 6
+    assert (crossings["same_family"], crossings["gap_mm"]) == (6, 0.5)
     assert all(len(row) == len(crossings["columns"]) for row in crossings["table"])
     for *_, first_mm, second_mm, gap in crossings["table"]:
         assert gap == pytest.approx(abs(first_mm - second_mm) - 0.3)
-    assert crossings["gap_mm"] == 0.5
+    table = rows(guide.laying_page(whole(plan)), "depths")  # so many crossings are counted by depth
+    assert sum(int(count) for *_, count in table) == 30
+    assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
 
 
 @pytest.mark.parametrize(
     ("settings", "gap"),
-    [
-        (DEFAULTS, 0.5),
-        (with_settings(fibre={"diameter_mm": 1.0}), -0.2),
-        (with_settings({"levels": "two"}), -0.3),
-    ],
+    [(DEFAULTS, 0.5), (with_settings(fibre={"diameter_mm": 1.0}), -0.2), (with_settings({"levels": "two"}), -0.3)],
 )
 def test_fibres_that_touch_are_told(settings: FabricationSettings, gap: float):
     crossings = guide.document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
@@ -143,14 +131,6 @@ def test_tracks_over_each_other_are_listed_from_twice_a_right_angled_crossing_on
             assert shared["place_mm"] == pytest.approx([0, 0], abs=1e-3)
             ((tracks, *_, length),) = rows(guide.laying_page(document), "tracks")
             assert (tracks, length) == ("2 over 1", f"{shared['length_mm']:.1f} mm")
-
-
-def test_of_many_tracks_over_each_other_the_page_has_the_longest():
-    document = whole(Plan(Morphology.straight(4), with_settings({"ridge_width_mm": 0.5})))
-    one = {"shallow": 5, "deep": 1, "length_mm": 3.0, "place_mm": [0.0, 0.0]}
-    page = guide.laying_page(document | {"common_tracks": [one | {"length_mm": 90.0 - n} for n in range(30)]})
-    assert [row[-1] for row in rows(page, "tracks")] == [f"{90.0 - n:.1f} mm" for n in range(24)]
-    assert "the 24 longest of 30" in page
 
 
 @pytest.mark.parametrize("draft_deg", [0.0, 5.0])
@@ -200,14 +180,6 @@ def test_every_fibre_has_its_resistance_by_its_length_and_its_resistor():
     assert "carbon-black TPE bears 80 % of stretch at most and bends of no less than 2.5 mm radius." in page
 
 
-def test_an_unknown_resistance_is_said_to_be_and_not_made_up():
-    document = whole(Plan(Morphology.straight(2)))
-    assert {fibre["resistance_ohm"] for fibre in document["fibres"]} == {None}
-    wire = guide.laying_page(document).partition("## Wire")[2].partition("##")[0]
-    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
-    assert "|" not in wire
-
-
 @pytest.mark.parametrize(
     ("silicone", "pot_life", "cure"),
     [
@@ -226,48 +198,27 @@ def test_the_page_follows_the_silicone(silicone, pot_life, cure):
     assert ("shrinks by 0.1 %" in page) == bool(silicone)
 
 
-def test_parts_are_weighed_by_their_ratio():
-    mixed = with_settings(silicone={"density_g_per_ml": 1.3, "parts": [10.0, 1.0]})
-    silicone = whole(Plan(Morphology.straight(2), mixed))["silicone"]
-    assert silicone["part_a_g"] == pytest.approx(10 * silicone["part_b_g"], abs=0.06)
-    assert silicone["mass_g"] == pytest.approx(silicone["volume_ml"] * 1.3 * 1.1, abs=0.011)
-
-
-def test_the_page_tells_how_the_pad_lies_in_its_holder():
-    page = guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
-    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
-    assert "holder" not in guide.laying_page(whole(Plan(Morphology.straight(4))))
-
-
-def test_the_page_has_the_places_of_the_plan():
-    plan = Plan(Morphology.straight(2))
-    page = guide.laying_page(whole(plan))
-    assert "x runs to the left" in page
+def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
+    plain = whole(Plan(Morphology.straight(2)))
+    page = guide.laying_page(plain)
+    for absent in ("holder", "machine", "the lid", "of resin", "pour through its spout"):
+        assert absent not in page
+    section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
+    assert orientation.sentence((2, 2), "edges") in section
+    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 4." in section
+    assert f"]({orientation.FILE})" in section
+    wire = page.partition("## Wire")[2].partition("##")[0]
+    assert {fibre["resistance_ohm"] for fibre in plain["fibres"]} == {None}
+    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
+    assert "|" not in wire
+    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.1 mm"], "Layer Height: 0.1 mm"]
     table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-
-
-def test_the_page_names_the_ways_of_a_machine_where_there_are_some():
-    document = whole(Plan(Morphology.straight(2)))
-    assert "machine" not in guide.laying_page(document)
-    page = guide.laying_page(document | {"files": ["mould.stl", "laying.gcode", "laying.script", "dispensing.svg"]})
+    page = guide.laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "dispensing.svg"]})
     assert "in `laying.gcode` and `laying.script` and drawn in `dispensing.svg`" in page.partition("## Lay\n")[2]
-
-
-def test_the_page_says_and_shows_which_way_round():
-    page = guide.laying_page(whole(Plan(Morphology.straight(4))))
-    section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
-    assert orientation.sentence((4, 4), "edges") in section
-    assert "Horizontal fibres are 1 to 4, vertical ones 5 to 8." in section
-    assert f"]({orientation.FILE})" in section
-
-
-def test_many_crossings_are_counted_by_depth(published):
-    page = guide.laying_page(whole(Plan(Morphology.load(published / "5para_dis.mat"))))
-    table = rows(page, "depths")
-    assert sum(int(count) for *_, count in table) == 30
-    assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
+    page = guide.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
+    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
 
 
 def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
@@ -282,15 +233,61 @@ def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
     assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 place,")
     assert "pour through its spout" in page
     assert "of resin" in page
+    assert "PrusaSlicer" not in page
+    assert page.index("- Slice it") < page.index("- Turn anti-aliasing") < page.index("- Wash and cure")
     assert "read the right way" not in page
     plain = guide.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
-    assert "the lid" not in plain
 
 
-def test_the_page_says_what_to_set_for_the_printer_at_hand():
-    page = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"layer_mm": 0.2}))))
-    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.2 mm"], "Layer Height: 0.2 mm"]
-    resin = guide.laying_page(whole(Plan(Morphology.straight(2), with_settings(printer={"resin": True}))))
-    assert "PrusaSlicer" not in resin
-    assert resin.index("- Slice it") < resin.index("- Turn anti-aliasing") < resin.index("- Wash and cure")
+def found(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:
+    """The value of a setting as PrusaSlicer has it, and why."""
+    row = next(row for row in print_settings.rows(mould, printer) if row[0].startswith(f"{name}: "))
+    return row[0].removeprefix(f"{name}: "), row[-1]
+
+
+def test_every_slicer_is_told_every_setting_and_why():
+    told = list(print_settings.rows(MouldSettings(), PrinterSettings()))
+    assert {len(row) for row in told} == {len(print_settings.HEAD)}
+    assert all(cell for row in told for cell in row)
+    for columns in zip(*told, strict=True):
+        assert len(set(columns)) == len(told)
+    for prusa, orca, cura, _ in told:  # where all give a size, it is the same one, but for its sign
+        sizes = [re.findall(r"([\d.]+) mm", cell) for cell in (prusa, orca, cura)]
+        assert sizes[0] == sizes[1]
+        assert sizes[2] in (sizes[0], [])
+
+
+@pytest.mark.parametrize(
+    ("floor", "layer", "nozzle", "first"),
+    [(2, 0.1, 0.4, 0.2), (2, 0.2, 0.4, 0.2), (2, 0.3, 0.4, 0.2), (2.05, 0.1, 0.4, 0.15), (0.4, 0.2, 1, 0.4)],
+)
+def test_whole_layers_are_left_of_the_floor(floor, layer, nozzle, first):
+    printer = PrinterSettings(layer_mm=layer, nozzle_mm=nozzle)
+    assert found("First layer height", MouldSettings(floor_mm=floor), printer)[0] == f"{first:g} mm"
+    perimeters = [found("Perimeters", MouldSettings(wall_mm=wall), PrinterSettings())[0] for wall in (0.8, 2.0, 20.0)]
+    assert perimeters == ["2", "3", "4"]  # walls are solid where they are thin
+    assert (floor - first) / layer == pytest.approx(round((floor - first) / layer), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("ridge", "nozzle", "width", "why"),
+    [
+        (0.4, 0.4, "0.4 mm", "0.4 mm wide is one line"),
+        (0.5, 0.4, "0.5 mm", "0.5 mm wide is one line"),
+        (0.8, 0.4, "0.4 mm", "0.8 mm wide is 2 lines"),
+        (0.4, 0.6, "0.51 mm", "0.4 mm wide is narrower than the nozzle: see the checks"),
+    ],
+)
+def test_a_ridge_is_whole_lines(ridge, nozzle, width, why):
+    mould, printer = MouldSettings(ridge_width_mm=ridge), PrinterSettings(nozzle_mm=nozzle)
+    assert found("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
+
+
+def test_resin_is_told_in_pixels_and_layers():
+    text = "\n".join(
+        print_settings.for_resin(MouldSettings(), PrinterSettings(resin=True, nozzle_mm=0.05, layer_mm=0.05))
+    )
+    assert "in layers of 0.05 mm" in text
+    assert "A ridge is 8 pixels wide" in text
+    assert "the floor is 2 mm, 40 layers" in text

@@ -1,4 +1,7 @@
+"""Plans with a known shape or a known fault, and what the checks find in them."""
+
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from design.settings import RulesSettings
 from fabricate.checks.findings import Finding
 from fabricate.checks.mesh_checks import SOUND
 from fabricate.checks.plan_checks import check, check_plan
+from fabricate.checks.plan_checks.fibre_strain import strains
 from fabricate.checks.plan_checks.tracks import thinner
 from fabricate.mould.plan import Plan
 from fabricate.settings import DEFAULTS, FabricationSettings
@@ -21,106 +25,97 @@ def found(pad: Morphology, name: str, settings: FabricationSettings = DEFAULTS) 
 
 
 def test_a_buildable_pad_passes_every_check():
-    findings = check(Morphology.straight(4))
+    findings = check(Morphology.straight(2))
     assert {finding.status for finding in findings} == {"pass"}
     assert len({finding.name for finding in findings}) == len(findings)
+    assert "fibre_strain" not in {finding.name for finding in findings}  # it lies flat
 
 
 def test_published_pad_that_was_built_shows_its_crossings(published):
-    (finding,) = [f for f in check(Morphology.load(published / "5para_dis.mat")) if f.name == "same_family_crossings"]
+    finding = found(Morphology.load(published / "5para_dis.mat"), "same_family_crossings")
     assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 6, 6)
 
 
 @pytest.mark.parametrize(
     ("grid", "knots", "seed"),
     [
-        *((4, 1, 1006), (4, 5, 1001), (2, 20, 1003), (2, 30, 1032)),
-        *(pytest.param(4, *dense, marks=pytest.mark.slow) for dense in ((20, 1003), (30, 1032))),
+        *((4, 1, 1006), (2, 8, 1003)),
+        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((2, 20, 1003), (4, 30, 1032))),
     ],
 )
 def test_tangled_pads_are_measured_and_sound(grid, knots, seed):
-    found = check(Morphology.random(grid, knots, seed))
-    findings = {finding.name: finding for finding in found}
+    findings = {finding.name: finding for finding in check(Morphology.random(grid, knots, seed))}
     assert {findings[name].status for name in SOUND} == {"pass"}
-    assert len(found) == len(findings)
 
 
-class TestPrinter:
-    straight = Morphology.straight(1)
+RESIN = {"nozzle_mm": 0.2, "resin": True}
+SHRINKING = {"silicone": {"shrinkage": 0.02}, "fibre": {"diameter_mm": 0.395}}
 
-    @pytest.mark.parametrize(
-        ("layer_mm", "status", "least"), [(0.1, "pass", 4), (0.2, "pass", 2), (0.16, "warn", 2.5), (0.3, "fail", 4 / 3)]
-    )
-    def test_layers(self, layer_mm, status, least):
-        finding = found(self.straight, "layers", with_settings(printer={"layer_mm": layer_mm}))
-        assert finding.status == status
-        assert finding.measured == pytest.approx(least)
 
-    def test_a_floor_between_layers_moves_every_ridge(self):
-        finding = found(self.straight, "layers", with_settings({"floor_mm": 2.05}))
-        assert finding.status == "warn"
-        assert "floor_mm" in finding.message
+@pytest.mark.parametrize(
+    ("name", "settings", "status", "measured", "limit"),
+    [
+        ("layers", {"printer": {"layer_mm": 0.1}}, "pass", 4, ...),
+        ("layers", {"printer": {"layer_mm": 0.2}}, "pass", 2, ...),
+        ("layers", {"printer": {"layer_mm": 0.16}}, "warn", 2.5, ...),
+        ("layers", {"printer": {"layer_mm": 0.3}}, "fail", 4 / 3, ...),
+        ("ridge_width", {}, "pass", 0.4, 0.4),
+        ("ridge_width", {"mould": {"ridge_width_mm": 0.39}}, "fail", 0.39, 0.4),
+        ("ridge_width", {"printer": RESIN}, "pass", 0.4, 0.4),
+        ("ridge_width", {"printer": RESIN | {"nozzle_mm": 0.21}}, "fail", 0.4, 0.42),
+        ("ridge_width", {"printer": {"nozzle_mm": 0.21}}, "pass", 0.4, 0.21),
+        ("track_size", {"fibre": {"diameter_mm": 0.5}}, "fail", 0.4, 0.5),
+        ("track_size", {"fibre": {"diameter_mm": 0.4}}, "pass", 0.4, 0.4),
+        ("track_size", {"mould": {"ridge_width_mm": 0.5}, "fibre": {"diameter_mm": 0.41}}, "fail", 0.4, 0.41),
+        ("track_size", {"mould": {"shallow_ridge_height_mm": 0.6}, "fibre": {"diameter_mm": 0.41}}, "fail", 0.4, 0.41),
+        # Tracks shrink and fibres do not: 0.408 mm are rounded to 4 layers, and shrink.
+        ("track_size", SHRINKING, "fail", 0.392, 0.395),
+        ("ridge_width", SHRINKING, "pass", 0.4 / 0.98, ...),
+        ("crossing_gap", SHRINKING, "warn", 0.98 * 0.8 - 0.395, ...),
+        ("layers", SHRINKING, "pass", 4, ...),
+        ("crossing_gap", {"mould": {"deep_ridge_height_mm": 1.1}}, "pass", 0.4, ...),
+        ("crossing_gap", {"mould": {"deep_ridge_height_mm": 1.09}}, "warn", 0.39, ...),
+        ("crossing_gap", {"mould": {"deep_ridge_height_mm": 0.7}}, "fail", 0.0, ...),
+        ("slenderness", {"mould": {"deep_ridge_height_mm": 2.0}}, "pass", 5.0, ...),
+        ("slenderness", {"mould": {"deep_ridge_height_mm": 2.04}}, "warn", 5.1, ...),
+        ("slenderness", {"mould": {"deep_ridge_height_mm": 4.0}}, "warn", 10.0, ...),
+        ("slenderness", {"mould": {"deep_ridge_height_mm": 4.04}}, "fail", 10.1, ...),
+        ("cover", {"mould": {"silicone_mm": 2.2}}, "pass", 1.0, ...),
+        ("cover", {"mould": {"silicone_mm": 2.19}}, "warn", 0.99, ...),
+        ("cover", {"mould": {"silicone_mm": 2.0}}, "warn", 0.8, ...),
+    ],
+)
+def test_a_straight_pad_is_judged_by_its_settings(name, settings, status, measured, limit):
+    finding = found(Morphology.straight(1), name, with_settings(**settings))
+    assert finding.status == status
+    assert finding.measured == pytest.approx(measured, abs=1e-9)
+    assert limit is ... or finding.limit == pytest.approx(limit)
+    if name in ("ridge_width", "slenderness"):
+        assert len(finding.places_mm) == (0 if status == "pass" else {"ridge_width": 2, "slenderness": 1}[name])
 
-    @pytest.mark.parametrize(
-        ("key", "height"), [("floor_mm", 2.05), ("shallow_ridge_height_mm", 0.45), ("deep_ridge_height_mm", 1.25)]
-    )
-    def test_every_height_is_to_be_a_whole_number_of_layers(self, key, height):
-        finding = found(self.straight, "layers", with_settings({key: height}))
-        assert finding.status == "warn"
-        assert finding.message == f"{key}: not a whole number of 0.1 mm layers"
 
-    @pytest.mark.parametrize(
-        ("width", "printer", "status", "limit"),
-        [
-            (0.4, {}, "pass", 0.4),
-            (0.39, {}, "fail", 0.4),
-            (0.4, {"nozzle_mm": 0.2, "resin": True}, "pass", 0.4),
-            (0.4, {"nozzle_mm": 0.21, "resin": True}, "fail", 0.42),
-            (0.4, {"nozzle_mm": 0.21}, "pass", 0.21),
-        ],
-    )
-    def test_ridges_as_wide_as_what_is_printed(self, width, printer, status, limit):
-        finding = found(self.straight, "ridge_width", with_settings({"ridge_width_mm": width}, printer))
-        assert (finding.status, finding.measured) == (status, width)
-        assert finding.limit == pytest.approx(limit)
-        assert len(finding.places_mm) == (0 if status == "pass" else 2)
+@pytest.mark.parametrize(
+    ("key", "height"), [("floor_mm", 2.05), ("shallow_ridge_height_mm", 0.45), ("deep_ridge_height_mm", 1.25)]
+)
+def test_every_height_is_to_be_a_whole_number_of_layers(key, height):
+    finding = found(Morphology.straight(1), "layers", with_settings({key: height}))
+    assert (finding.status, finding.message) == ("warn", f"{key}: not a whole number of 0.1 mm layers")
+
+
+@pytest.mark.parametrize(("grid", "named"), [(2, "numbers 1, 2, 3, 4"), (5, "10 numbers")])
+def test_numbers_without_room_are_named_or_counted(grid, named):
+    finding = found(Morphology.straight(grid, 4.0), "numbers", with_settings({"number_mm": 9.0, "exit_mm": 0.0}))
+    assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 0, 2 * grid)
+    assert finding.message == f"no room beside the fibre's start for {named}"
 
 
 class TestFibres:
-    def test_a_fibre_thicker_than_its_track(self):
-        finding = found(Morphology.straight(1), "track_size", with_settings(fibre={"diameter_mm": 0.5}))
-        assert (finding.status, finding.measured, finding.limit) == ("fail", 0.4, 0.5)
-
-    @pytest.mark.parametrize(
-        ("width", "height", "fibre", "status"),
-        [(0.4, 0.4, 0.4, "pass"), (0.5, 0.4, 0.41, "fail"), (0.4, 0.6, 0.41, "fail"), (0.5, 0.6, 0.41, "pass")],
-    )
-    def test_a_track_is_as_wide_and_as_deep_as_its_fibre(self, width, height, fibre, status):
-        mould = {"ridge_width_mm": width, "shallow_ridge_height_mm": height}
-        finding = found(Morphology.straight(1), "track_size", with_settings(mould, fibre={"diameter_mm": fibre}))
-        assert (finding.status, finding.measured) == (status, min(width, height))
-
-    def test_tracks_shrink_and_fibres_do_not(self):
-        shrinking = with_settings(silicone={"shrinkage": 0.02}, fibre={"diameter_mm": 0.395})
-        assert found(Morphology.straight(1), "ridge_width", shrinking).measured == pytest.approx(0.4 / 0.98)
-        finding = found(Morphology.straight(1), "track_size", shrinking)  # 0.408 mm rounded to 4 layers, and shrunk
-        assert (finding.status, finding.measured) == ("fail", pytest.approx(0.392))
-        assert found(Morphology.straight(1), "crossing_gap", shrinking).measured == pytest.approx(0.98 * 0.8 - 0.395)
-        assert found(Morphology.straight(1), "layers", shrinking).status == "pass"
-
-    @pytest.mark.parametrize(
-        ("deep", "status", "gap"),
-        [(1.1, "pass", 0.4), (1.09, "warn", 0.39), (1.2, "pass", 0.5), (0.9, "warn", 0.2), (0.7, "fail", 0.0)],
-    )
-    def test_gap_where_families_cross(self, deep, status, gap):
-        finding = found(Morphology.straight(1), "crossing_gap", with_settings({"deep_ridge_height_mm": deep}))
-        assert finding.status == status
-        assert finding.measured == pytest.approx(gap, abs=1e-12)
-
     @pytest.mark.parametrize(("levels", "status"), [("as_needed", "warn"), ("two", "fail")])
     def test_crossings_of_one_family(self, levels, status):
         finding = found(level_pad(1.8, 1.2), "same_family_crossings", with_settings({"levels": levels}))
         assert (finding.status, finding.measured) == (status, 2)
+        assert all(isinstance(value, float) for place in finding.document()["places_mm"] for value in place)
+        assert found(level_pad(1.8, 1.2), "silicone_wall").status == "pass"  # they lie at two depths
         (left, y), (right, _) = finding.places_mm
         assert left == pytest.approx(-right, abs=1e-3)
         assert y == pytest.approx(0, abs=1e-3)
@@ -174,35 +169,15 @@ class TestFibres:
         finding = {each.name: each for each in check_plan(plan)}["fibre_bend"]
         assert (finding.status, finding.measured) == ("fail", pytest.approx(3.0, rel=1e-3))
 
-    @pytest.mark.parametrize(("deep", "status"), [(2.0, "pass"), (2.04, "warn"), (4.0, "warn"), (4.04, "fail")])
-    def test_slender_ridges(self, deep, status):
-        finding = found(Morphology.straight(1), "slenderness", with_settings({"deep_ridge_height_mm": deep}))
-        assert (finding.status, finding.measured) == (status, pytest.approx(deep / 0.4))
-        assert finding.places_mm == (() if status == "pass" else ((0.0, 0.0),))
-
-    def test_numbers_without_room(self):
-        finding = found(Morphology.straight(2, 4.0), "numbers", with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
-        assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 0, 4)
-
-    @pytest.mark.parametrize(("silicone", "status"), [(6.0, "pass"), (2.2, "pass"), (2.19, "warn"), (2.0, "warn")])
-    def test_silicone_beyond_the_tracks(self, silicone, status):
-        finding = found(Morphology.straight(1), "cover", with_settings({"silicone_mm": silicone}))
-        assert (finding.status, finding.measured) == (status, pytest.approx(silicone - 1.2))
-
     def test_many_depths_make_a_thicker_pad(self):
         """Three depths of 0.4, 1.2 and 2.0 mm need 3 mm of silicone."""
         for silicone, status, cover in ((3.2, "pass", 1.2), (2.5, "warn", 1.0)):
             finding = found(level_pad(1.8, 1.2), "cover", with_settings({"silicone_mm": silicone}))
             assert (finding.status, finding.measured) == (status, pytest.approx(cover))
 
-    @pytest.mark.parametrize(("grid", "named"), [(4, "numbers 1, 2, 3, 4, 5, 6, 7, 8"), (5, "10 numbers")])
-    def test_more_than_eight_are_counted_instead_of_named(self, grid, named):
-        finding = found(Morphology.straight(grid, 4.0), "numbers", with_settings({"number_mm": 9.0, "exit_mm": 0.0}))
-        assert finding.message == f"no room beside the fibre's start for {named}"
-
 
 class TestSilicone:
-    @pytest.mark.parametrize(("gap_mm", "status"), [(2.0, "pass"), (0.42, "pass"), (0.38, "warn"), (0.1, "warn")])
+    @pytest.mark.parametrize(("gap_mm", "status"), [(0.42, "pass"), (0.38, "warn"), (0.1, "warn")])
     def test_wall_between_two_tracks(self, gap_mm, status):
         away = (gap_mm + 0.4) / 20
         finding = found(level_pad(1.5 - away, 1.5 + away), "silicone_wall")
@@ -243,18 +218,13 @@ class TestSilicone:
         assert over[0, 1] > 10 or over[1, 0] > 10
         assert found(level_pad(1.51, 1.49), "common_tracks").status == "warn"
 
-    def test_tracks_of_different_depths_may_come_near(self):
-        """Two horizontals that cross lie at two depths, and their verticals far apart."""
-        assert found(level_pad(1.8, 1.2), "silicone_wall").status == "pass"
-
     def test_a_fibre_that_turns_back_on_itself(self):
         turns = np.array([[0, 1], [0.95, 1], [0.98, 1.8], [1.04, 0.2], [1.07, 1], [2, 1]])
         pad = Morphology(np.stack([turns, np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=1)]), 11.25)
         assert found(pad, "silicone_wall").status != "pass"
 
     @pytest.mark.parametrize(
-        ("from_wall_mm", "status"),
-        [(0.7, "pass"), (0.62, "pass"), (0.58, "warn"), (0.4, "warn"), (0.22, "warn"), (0.1, "fail")],
+        ("from_wall_mm", "status"), [(0.62, "pass"), (0.58, "warn"), (0.22, "warn"), (0.1, "fail")]
     )
     def test_a_track_beside_the_tray_wall(self, from_wall_mm, status):
         finding = found(level_pad(from_wall_mm / 10, 2.0), "tray_wall")
@@ -311,6 +281,7 @@ class TestFolds:
         pad = self.course([0, 0.8 - 1e-6, 0.8, 1.2, 2], cross, 0)
         assert found(pad, "folds").status == "pass"
 
+    @pytest.mark.slow
     def test_a_dense_scan_finds_such_bends_where_they_are_told(self, published):
         assert found(Morphology.load(published / "1para.mat"), "folds").status == "pass"
         pad = Morphology.load(published / "5para_dis.mat")
@@ -325,7 +296,36 @@ class TestFolds:
         assert all(np.hypot(*(tight - place).T).min() < 0.02 for place in finding.places_mm)
 
 
-def test_findings_are_plain_json():
-    document = found(level_pad(1.8, 1.2), "same_family_crossings").document()
-    assert list(document) == ["name", "status", "measured", "limit", "message", "places_mm"]
-    assert all(isinstance(value, float) for place in document["places_mm"] for value in place)
+def bent(pad: Morphology, radius: float, **settings: dict[str, Any]) -> Plan:
+    return Plan(pad, with_settings(pad={**pad.layout.settings, "bent_radius_mm": radius}, **settings))
+
+
+@pytest.mark.parametrize("radius", [5.0, 30.0])
+def test_straight_fibres_strain_as_a_bent_plate_does(radius):
+    """Horizontals, 1.2 mm deep, lie 3 - 1.2 + 0.15 mm above the middle of 6 mm; verticals stay as they are."""
+    shallow, deep = strains(bent(Morphology.straight((3, 2), (8.0, 15.0)), radius))
+    assert (shallow.depth_mm, shallow.most) == (0.4, 0.0)
+    assert deep.most == pytest.approx(1.95 / (radius + 3))
+
+
+def test_a_fibre_at_an_angle_is_strained_by_the_square_of_its_cosine():
+    knots = Morphology.straight((0, 1), 10.0).knots
+    middle = np.array([[[0.7, 0.3], [1.3, 0.7]]])
+    pad = Morphology(np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1), 10.0, fibres=(0, 1))
+    (found,) = strains(bent(pad, 20.0))
+    steps = np.concatenate([np.diff(line.coords, axis=0) for line in bent(pad, 20.0).lines])
+    steepest = np.abs(steps[:, 0] / steps[:, 1]).max()
+    assert found.most == pytest.approx((3 - 0.4 + 0.15) / 23 * steepest**2 / (1 + steepest**2))
+
+
+def test_fibres_below_the_middle_are_pressed():
+    thin = {"silicone_mm": 0.8, "shallow_ridge_height_mm": 0.6, "deep_ridge_height_mm": 0.7}
+    assert strains(bent(Morphology.straight((2, 0), 10.0), 20.0, mould=thin))[0].most < 0
+
+
+@pytest.mark.parametrize(("stretch", "status"), [(1.0, "pass"), (0.1, "warn"), (0.05, "fail")])
+def test_it_is_judged_by_what_the_fibre_bears(stretch, status):
+    plan = bent(Morphology.straight(2, 10.0), 20.0, fibre={"largest_stretch": stretch})
+    (finding,) = (finding for finding in check_plan(plan) if finding.name == "fibre_strain")
+    assert finding.status == status
+    assert finding.measured == pytest.approx(1.95 / 23)
