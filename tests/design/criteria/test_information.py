@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import PchipInterpolator
 
 from design import Contact, Morphology, published_objective, signals
 from design.criteria import benchmark as objective
@@ -77,17 +76,6 @@ def test_disorder_area_is_what_disorder_samples():
     assert disorder_area(Morphology.straight(4)) == 0
 
 
-def test_disorder_area_of_a_known_bump():
-    """Fibre 1 rises by 2 over a knot in the middle and back: area above fibre 2 between the crossings, by SciPy."""
-    knots = Morphology.straight(2).knots
-    knots = np.insert(knots, 1, (knots[:, 0] + knots[:, 1]) / 2, axis=1)
-    knots[0, 1, 1] = 3.0
-    curve = PchipInterpolator(knots[0, :, 0], knots[0, :, 1])
-    at = np.linspace(0, 3, 300_001)
-    expected = np.trapezoid(np.maximum(curve(at) - 2, 0), at)
-    assert disorder_area(Morphology(knots)) == pytest.approx(expected, rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("name", "value"), [("1para", 0.107365610641), ("5para_dis", 0.105238467812), ("20para", 0.137526632287)]
 )
@@ -116,14 +104,6 @@ def test_the_objective_is_that_of_plain_numpy_and_comes_nearer_to_the_exact_one_
     assert abs(many / exact - 1) < abs(few / exact - 1) < 0.1
 
 
-def test_the_bench_of_the_objective_judges_every_way(monkeypatch, taken):
-    for name, value in {"SAMPLES": (250,), "KNOTS": (2,)}.items():
-        monkeypatch.setattr(objective, name, value)
-    rounds = taken(objective.BENCH)
-    assert list(rounds) == [("N=2", "plain", 250, 0), ("N=2", "compiled", 250, 0), ("N=2", "exact", 0, 0)]
-    assert 0 < rounds["N=2", "plain", 250, 0]["error"] == pytest.approx(rounds["N=2", "compiled", 250, 0]["error"])
-
-
 def test_published_presses_cover_the_grid():
     places = published_presses(Layout.of(4))
     assert places.shape == (49, 2)
@@ -148,8 +128,8 @@ def test_idle_share_counts_changes_within_the_threshold():
 def test_information_does_not_stop_at_the_number_of_presses():
     """Each tenfold drop in noise adds log2 10 bits along both axes, where the pad tells all places apart."""
     pad = Morphology.random(4, 20, seed=0)
-    coarse, fine = information(pad, noise=1.0), information(pad, noise=0.1)
-    assert fine > np.log2(400)
+    coarse, fine = information(pad, noise=1.0, side=12), information(pad, noise=0.1, side=12)
+    assert fine > np.log2(144)
     assert fine - coarse == pytest.approx(2 * np.log2(10), rel=0.05)
 
 

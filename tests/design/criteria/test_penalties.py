@@ -13,6 +13,7 @@ from design.pad.contact import fibre_axes
 from design.pad.courses.curves import crossings, lengths, refine
 from design.settings import PadSettings, RulesSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 NONE = RulesSettings(
     min_bend_radius_mm=0,
     min_gap_mm=0,
@@ -50,35 +51,12 @@ def slanting(shift):
     return Morphology(np.concatenate([knots[:, :1], inner, knots[:, -1:]], axis=1))
 
 
-@pytest.mark.parametrize(
-    ("limits", "mild", "worse"),
-    [
-        ({"min_bend_radius_mm": 60.0}, bent(1.75), bent(1.9)),
-        ({"min_gap_mm": 5.0}, bent(1.7), bent(1.9)),
-        ({"same_family_crossings": 0}, bent(2.2), bent(2.8)),
-        ({"border_mm": 4.0}, bent(4.6, travel=0.3), bent(4.6, travel=0.2)),
-        ({"max_length_mm": 60.0}, bent(2.8), bent(3.8)),
-        ({"max_crossings": 10}, bent(1.1), bent(3.5, travel=4.5)),
-        ({"min_crossing_angle_deg": 85.0}, bent(1.3), bent(1.9)),
-        ({"max_common_track_mm": 1.0}, slanting(2.0), slanting(3.0)),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
-)
-def test_a_broken_rule_has_a_penalty_that_grows(limits, mild, worse):
-    rules = NONE.model_copy(update=limits)
-    (rule,) = limits
-    grid, little, much = (found(pad, rules)[rule] for pad in (Morphology.straight(4), mild, worse))
-    if rule != "max_crossings":
-        assert grid == pytest.approx(0, abs=1e-9)
-    assert 0 < little <= much
-
-
 def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
     """On random gentle pads; those with a penalty are only counted, so that the test is seen to look at both kinds."""
     rng, rules = np.random.default_rng(0), RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70)
     assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
     passed = 0
-    for _ in range(30):
+    for _ in range(16):
         knots = Morphology.straight(4).knots
         inner = np.linspace(knots[:, 0], knots[:, -1], 7).transpose(1, 0, 2)[:, 1:-1]
         scatter = rng.uniform(0.02, 0.3)
@@ -88,7 +66,7 @@ def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
         if sum(found(pad, rules, margin=1.05).values()) == 0:
             passed += 1
             assert check_rules(pad, rules) == []
-    assert 5 < passed < 25
+    assert 2 < passed < 14
 
 
 def test_the_soft_number_of_crossings_is_the_number_of_crossings():

@@ -56,25 +56,6 @@ def bent(cross, travel=2.5, fibre=0):
     return Morphology(knots)
 
 
-def zigzag(apart_mm, legs=3):
-    """A pad of 1 + 1 fibres whose horizontal one has upright branches `apart_mm` apart."""
-    at = 1 + np.arange(legs + 1) * apart_mm / 11.25
-    up = np.resize([1.0, 1.5], legs + 2)
-    branches = [
-        (x + side, y) for x, low, high in zip(at, up, up[1:], strict=False) for side, y in ((0, low), (1e-6, high))
-    ]
-    fibre = np.array([(0, 1), *branches, (2, 1)])
-    return Morphology(np.stack([fibre, np.column_stack([np.ones(len(fibre)), fibre[:, 0]])]))
-
-
-def test_branches_of_one_fibre_too_close_are_found_with_their_gap():
-    found = check_rules(zigzag(0.5), only(min_gap_mm=0.8))
-    assert [(v.rule, v.fibres) for v in found] == [("min_gap_mm", (1,))]
-    assert found[0].measured == pytest.approx(0.5, abs=1e-3)
-    assert str(found[0]).startswith("min_gap_mm: fibre 1 at (")
-    assert check_rules(zigzag(0.5), only(min_gap_mm=0.48)) == []
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_folds_of_a_large_pad_with_a_large_gap_are_those_of_a_small_one(seed):
     """The same courses, a hundred times larger: what is found is too, to 2e-4 of the gap."""

@@ -14,6 +14,7 @@ from design.pad.knots import assemble
 from design.report.plan_drawing import draw_plan
 from design.settings import PadSettings, RulesSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 KINDS = ["random", "steps", "lattice", "border", "alike", "edge", "needles", "level", "no knots"]
 CONTACTS = [
     Contact(),

@@ -95,7 +95,7 @@ def test_settings_that_cannot_be_used_are_refused(asked, message):
 
 
 def test_more_networks_than_can_be_trained_are_refused():
-    with pytest.raises(InputError, match="that takes .* networks, allowed are"):
+    with pytest.raises(InputError, match=r"that takes \d+ networks, allowed are"):
         localisation_error(Morphology.straight(12), lost=(12,))
 
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from design import Contact, Morphology
-from design.common.computing import one_torch_thread
+from design.criteria.differentiable import arc_lengths, pchip_slopes
 from design.criteria.rules import check_rules
 from design.criteria.score import score
 from design.evaluation.expected_error import expected_errors
@@ -15,7 +16,8 @@ from design.optimisers.gradient_search import GradientSearch
 from design.optimisers.parametrization import OTHER_START, Fibres, border_of, first_course
 from design.optimisers.problem import SearchProblem
 from design.optimisers.search import search
-from design.pad.courses.curves import refine
+from design.pad.contact import fibre_axes
+from design.pad.courses.curves import lengths, refine
 from design.settings import (
     PUBLISHED_CONTACT,
     PUBLISHED_PAD,
@@ -25,6 +27,7 @@ from design.settings import (
     SearchSettings,
 )
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False)
 BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "lost": 1, "knots": 6})
 
@@ -33,7 +36,6 @@ def begun(search, rules, start=0, state=None, pad=PAD, contact=PUBLISHED_CONTACT
     return GradientSearch(SearchProblem(pad, (contact, *search.contacts), search, rules), start, state)
 
 
-@one_torch_thread()
 def finished(search, rules, start=0):
     """Fibres after all steps and repair."""
     run = begun(search, rules, start)
@@ -65,6 +67,12 @@ def test_more_knots_leave_the_old_ones_and_keep_to_the_curve(more, seed):
         assert new[:, 1 - axis] == pytest.approx(curve(new[:, axis]), abs=1e-12)
 
 
+def test_the_lengths_by_which_responses_are_divided_are_those_of_the_curves():
+    pad = Morphology.random((2, 3), 5, seed=1, pitch_mm=(8.0, 15.0))
+    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
+    assert arc_lengths(travel, cross, pchip_slopes(travel, cross)).numpy() == pytest.approx(lengths(pad), rel=1e-3)
+
+
 @pytest.mark.parametrize("knots", [1, 2, 6, 7, 20, 64])
 @pytest.mark.parametrize("rules", [RulesSettings(), FREE])
 def test_every_start_is_a_pad_of_as_many_knots_and_depends_on_its_generator(knots, rules):
@@ -72,7 +80,7 @@ def test_every_start_is_a_pad_of_as_many_knots_and_depends_on_its_generator(knot
         pad = PadSettings(grid=grid)
         courses = [first_course(pad, rules, knots, None, start, np.random.default_rng(seed)) for seed in (0, 1)]
         assert Morphology(courses[0], pad.pitch_mm).knots.shape == (2 * grid, knots + 2, 2)
-        assert not np.array_equal(*courses)
+        assert not np.array_equal(courses[0], courses[1])
 
 
 def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
@@ -102,7 +110,6 @@ def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
     assert "border_mm" in {violation.rule for violation in check_rules(Morphology(knots), rules)}
 
 
-@one_torch_thread()
 def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit():
     """Before the first step, amid the steps, before the repair and in it."""
     asked = SearchSettings(knots=3, steps=10, lost=1), RulesSettings(max_length_mm=34)
@@ -120,7 +127,6 @@ def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit():
             np.testing.assert_array_equal(first[name], second[name], strict=True)
 
 
-@one_torch_thread()
 def test_an_early_end_leaves_the_repair_alone():
     run = begun(SearchSettings(knots=3, steps=1000, lost=1), RulesSettings(max_length_mm=34))
     run.advance(3)
@@ -129,7 +135,7 @@ def test_an_early_end_leaves_the_repair_alone():
     assert not run.done
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def usual():
     """What is found within the rules that hold unless others are asked for, with flat crossings."""
     return finished(BRIEF, RulesSettings(max_common_track_mm=None))

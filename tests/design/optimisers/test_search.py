@@ -25,17 +25,14 @@ REPAIR = "design.optimisers.gradient_search.REPAIR_STEPS"
 @pytest.mark.parametrize("method", ["descent", "genetic"])
 def test_a_search_depends_on_the_seed_and_not_on_how_it_runs(method, monkeypatch):
     pad, settings = PadSettings(grid=1), SMALL.model_copy(update={"method": method})
-    first = search(pad, None, settings, FREE)
-    with ThreadPoolExecutor(1) as executor:
-        elsewhere = search(pad, None, settings, FREE, run=SearchRun(executor=executor))
-    reported = []
+    first, reported = search(pad, None, settings, FREE), []
     monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)  # a slice ends after its first step
-    sliced = search(pad, None, settings, FREE, run=SearchRun(lambda *progress: reported.append(progress)))
+    with ThreadPoolExecutor(1) as executor:
+        run = SearchRun(lambda *progress: reported.append(progress), executor=executor)
+        sliced = search(pad, None, settings, FREE, run=run)
     assert len(reported) == (2 * 25 if method == "descent" else 3)
     assert method == "genetic" or first.found_by.startswith("start")  # better than straight fibres
-    assert first.morphology == elsewhere.morphology == sliced.morphology
-    assert first.history == elsewhere.history == sliced.history
-    assert first.terms == elsewhere.terms == sliced.terms
+    assert (first.morphology, first.history, first.terms) == (sliced.morphology, sliced.history, sliced.terms)
     assert first.morphology != search(pad, None, settings.model_copy(update={"seed": 1}), FREE).morphology
 
 
@@ -107,16 +104,14 @@ def test_rules_that_cannot_hold_are_named_with_every_fibre(monkeypatch):
 @pytest.mark.parametrize(
     ("rules", "broken"),
     [
-        ({"min_gap_mm": 30.0}, "min_gap_mm"),
-        ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, "border_mm"),
-        ({"max_crossings": 3}, "max_crossings"),
-        ({"border_mm": 500.0}, "border_mm"),
+        ({"min_gap_mm": 30.0, "max_crossings": 3, "border_mm": 500.0}, {"min_gap_mm", "max_crossings", "border_mm"}),
+        ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, {"border_mm"}),
     ],
 )
 def test_rules_that_cannot_be_met_end_with_what_is_broken(rules, broken, monkeypatch):
     monkeypatch.setattr(REPAIR, 20)
     result = search(PAD, None, QUICK, RulesSettings(**rules))
-    assert broken in {violation.rule for violation in result.violations}
+    assert broken <= {violation.rule for violation in result.violations}
     assert all(np.isfinite(violation.measured) for violation in result.violations)
 
 
@@ -139,13 +134,7 @@ def test_settings_at_their_ends_give_a_pad_with_finite_terms(settings, rules, pi
 
 @pytest.mark.parametrize(
     ("method", "counts"),
-    [
-        ("descent", (3, 0)),
-        ("genetic", (0, 1)),
-        pytest.param("descent", (0, 2), marks=pytest.mark.slow),
-        pytest.param("genetic", (2, 0), marks=pytest.mark.slow),
-        pytest.param("descent", (1, 0), marks=pytest.mark.slow),
-    ],
+    [("descent", (3, 0)), ("genetic", (0, 1)), pytest.param("descent", (0, 1), marks=pytest.mark.slow)],
 )
 def test_pads_of_one_family_and_of_one_fibre_are_searched_scored_and_evaluated(method, counts, monkeypatch):
     monkeypatch.setattr(REPAIR, 20)
@@ -170,10 +159,10 @@ def test_a_search_around_a_hole_obeys_the_rules():
 
 
 def test_a_hole_that_leaves_no_room_is_a_broken_rule(monkeypatch):
-    """Seven verticals are to pass in 3 mm to either side, of which border and clearance leave nothing."""
+    """Three verticals are to pass in 3 mm to either side, of which border and clearance leave nothing."""
     monkeypatch.setattr(REPAIR, 20)
-    wide = ((-21.0, -3.0), (21.0, -3.0), (21.0, 3.0), (-21.0, 3.0))
-    pad = PadSettings(horizontals=2, verticals=7, pitch_mm=(6.0, 10.0), keep_out_mm=(wide,))
+    wide = ((-9.0, -3.0), (9.0, -3.0), (9.0, 3.0), (-9.0, 3.0))
+    pad = PadSettings(horizontals=2, verticals=3, pitch_mm=(6.0, 10.0), keep_out_mm=(wide,))
     result = search(pad, None, QUICK.model_copy(update={"knots": 9}), RulesSettings())
     assert {violation.rule for violation in result.violations} & {"keep_out_mm", "border_mm", "min_gap_mm"}
 
@@ -198,6 +187,11 @@ def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
         ({"contact": 0.6}, "contact"),
         ({"settings": {}}, "settings"),
         ({"run": 1}, "run"),
+        ({"run": {"report": 1}}, "report is 1, expected a function"),
+        ({"run": {"keep_in": 1}}, "keep_in"),
+        ({"run": {"resume": 1}}, "resume"),
+        ({"run": {"time_budget": -1}}, "time_budget"),
+        ({"run": {"executor": "here"}}, "executor"),
         ({"origin": [[0, 1]]}, "origin"),
         (
             {"origin": Morphology.straight(3)},
@@ -219,23 +213,12 @@ def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
     ],
 )
 def test_what_cannot_be_searched_is_refused(asked, message):
-    with pytest.raises(InputError, match=message):
-        search(**{"pad": PAD, "settings": SMALL} | asked)
+    def begin():
+        run = asked.get("run")
+        search(**{"pad": PAD, "settings": SMALL} | asked | {"run": SearchRun(**run) if isinstance(run, dict) else run})
 
-
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        ({"report": 1}, "report is 1, expected a function"),
-        ({"keep_in": 1}, "keep_in"),
-        ({"resume": 1}, "resume"),
-        ({"time_budget": -1}, "time_budget"),
-        ({"executor": "here"}, "executor"),
-    ],
-)
-def test_a_run_that_cannot_be_is_refused(asked, message):
     with pytest.raises(InputError, match=message):
-        SearchRun(**asked)
+        begin()
 
 
 def test_the_bench_has_every_way_budget_and_seed_and_judges_what_a_plain_search_finds(monkeypatch):
@@ -250,5 +233,6 @@ def test_the_bench_has_every_way_budget_and_seed_and_judges_what_a_plain_search_
     assert result.morphology == search(PadSettings(grid=1), settings=settings, rules=FREE).morphology
     errors = [level.mean for level in localisation_error(result.morphology, subsets=2)]
     judged = trials[1].judge(result)
-    assert judged["error"] == np.mean(errors) == np.mean([judged["lost_0"], judged["lost_1"]])
+    assert [judged["lost_0"], judged["lost_1"]] == errors
+    assert judged["error"] == np.mean(errors)
     assert judged["violations"] == len(check_rules(result.morphology, RulesSettings()))
