@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from design import InputError, Morphology
+from design import Contact, InputError, Morphology
 from design.criteria.published_objective import published_terms
 from design.criteria.score import score
 from design.settings import PUBLISHED_CONTACT, PadSettings
@@ -22,6 +22,10 @@ def test_a_pad_is_scored_where_it_is_pressed():
         same = name.startswith(("published", "information", "penalty"))
         assert (beyond[name] == between[name] == wide[name]) == same
     assert score(pad, lost=1) == beyond
+    disc = Contact(radius=0.9, sides=None)
+    terms = published_terms(pad, disc)[0]
+    assert score(pad, disc, lost=0)["published_objective"] == terms.objective != beyond["published_objective"]
+    assert beyond["published_objective"] == published_terms(pad)[0].objective  # a measured contact has none of its own
 
 
 @pytest.mark.slow

@@ -97,6 +97,11 @@ def test_the_rest_of_a_large_pad_is_looked_at_coarsely_and_of_a_small_one_there_
     rest = np.prod(np.diff(np.array(size.sensed), axis=0)) - np.prod(high - low)
     assert 0.5 * rest < len(presses.far) * module.COARSE**2 < rest
     assert not len(window_presses(PAD, PAD.sensed, SIDE, np.random.default_rng(2)).far)
+    corner = np.array([(-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0)])
+    holed = PadSettings(grid=9, keep_out_mm=(tuple(map(tuple, corner.tolist())),))
+    far = window_presses(holed, window, SIDE, np.random.default_rng(2)).far
+    assert 0 < len(far) < len(presses.far)
+    assert not (abs(Morphology.straight(9).to_mm(far) + 20) < 20).all(axis=1).any()
 
 
 def test_presses_in_a_keep_out_do_not_count():

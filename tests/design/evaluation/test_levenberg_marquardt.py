@@ -105,6 +105,15 @@ def test_a_curved_map_is_learned_on_samples_never_seen():
     assert rms(network(fresh) - waves(fresh)) < constant / 100
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_map_is_learned_from_fewer_samples_than_weights(seed):
+    """By the dual equations, whose steps are those of the others."""
+    rng = np.random.default_rng(seed)
+    samples, fresh = rng.uniform(-1, 1, (2, 60, 2))
+    network = fit(samples, waves(samples)[:, :1], rng, epochs=200, check=(fresh, waves(fresh)[:, :1]))
+    assert rms(network(fresh) - waves(fresh)[:, :1]) < 0.05
+
+
 def test_a_linear_map_in_any_units_is_learned_almost_exactly():
     rng = np.random.default_rng(1)
     inputs = rng.uniform([2000, -1e-6], [2001, 1e-6], (300, 2))

@@ -162,7 +162,7 @@ def test_several_contacts_serve_both_better_than_one_alone():
     one = BRIEF.model_copy(update={"steps": 30, "lost": 0, "knots": 4})
     for_one, for_both = (finished(each, FREE) for each in (one, one.model_copy(update={"contacts": (large,)})))
     alone, together = (expected_errors(pad, large, one, PadSettings(grid=2)) for pad in (for_one, for_both))
-    assert together < alone
+    assert together[0] < 0.9 * alone[0]
 
 
 @pytest.mark.slow

@@ -94,6 +94,14 @@ def test_sharpness_counts_in_the_choice_among_pads(weight, straight):
     assert (result.found_by == "straight fibres") == straight
 
 
+def test_a_pad_that_errs_less_but_breaks_a_rule_is_not_handed_back(monkeypatch):
+    monkeypatch.setattr(REPAIR, 1)
+    curved, rules = Morphology.random(2, 3, seed=1), RulesSettings(max_length_mm=34)
+    result = search(PAD, PUBLISHED_CONTACT, QUICK, rules, origin=curved)
+    assert (result.found_by, result.violations) == ("straight fibres", [])
+    assert expected_errors(curved, PUBLISHED_CONTACT, QUICK, PAD)[0] < result.terms["expected_error_lost_0"]
+
+
 def test_rules_that_cannot_hold_are_named_with_every_fibre(monkeypatch):
     monkeypatch.setattr(REPAIR, 20)
     result = search(PAD, None, QUICK, RulesSettings(max_length_mm=20))
