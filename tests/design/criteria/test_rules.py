@@ -219,13 +219,6 @@ def test_findings_come_rule_by_rule():
     ]
 
 
-def test_flat_crossings_are_told_in_the_order_of_the_fibres():
-    found = check_rules(Morphology.random(3, 8, seed=1), only(min_crossing_angle_deg=60))
-    pairs = [v.fibres for v in found]
-    assert pairs == sorted(pairs)
-    assert [v.measured for v in found] != sorted(v.measured for v in found)
-
-
 def slanting(rise=0.12):
     """A pad of 1 + 1 whose vertical crosses the straight horizontal flatly: it climbs twice `rise` in half the pad."""
     level = np.column_stack([[0, 0.5, 1.5, 2], np.ones(4)])

@@ -69,18 +69,13 @@ def test_a_wild_pad_has_a_finite_score_and_is_checked_and_drawn(kind, seed):
     terms = score(pad, contact, seed % 9, (1e-9, 0.1, 10.0)[seed % 3], rules)
     assert np.isfinite([*terms.values()]).all()
     assert 0 <= terms["published_entropy"] <= 2 * np.log2(49) + 1e-9
+    area, samples = disorder_area(pad), 200_001
+    sampled = disorder(pad.knots, samples) * (pad.grid + 1) / (samples - 1)
+    assert sampled == pytest.approx(area, abs=2e-3 * (1 + area))
     findings = check_rules(pad, rules)
     assert np.isfinite([[finding.measured, finding.limit] for finding in findings]).all()
     draw_plan(pad, contact, findings).draw_without_rendering()
     assert pad.tiled(2).grid == 2 * pad.grid
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_disorder_area_of_a_wild_pad_is_what_is_sampled(kind, seed):
-    pad = wild_pad(kind, seed)
-    area, samples = disorder_area(pad), 200_001
-    sampled = disorder(pad.knots, samples) * (pad.grid + 1) / (samples - 1)
-    assert sampled == pytest.approx(area, abs=2e-3 * (1 + area))
 
 
 @pytest.mark.parametrize("kind", KINDS[:-1])

@@ -117,6 +117,7 @@ def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
 
 PAD = Morphology.random(2, knots=2, seed=1)
 ASKED = PadSettings(grid=2), Scatter(0.02, 0.05, 0.36)
+"""What is pressed, and the scatter of responses."""
 
 
 def test_the_contact_believed_comes_first_and_none_twice():
@@ -145,6 +146,9 @@ def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press
     wide, narrow = found[1].errors, found[3].errors
     assert wide[0].mean < 0.5 * narrow[0].mean
     assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
+    two_fibres = {"pad": Morphology.straight(1)}
+    (small,) = errors_by_contact(two_fibres, {"as believed": Contact()}, PadSettings(grid=1), ASKED[1])
+    assert [error.lost for error in small.errors] == [0, 1]
 
 
 def test_responses_that_scatter_more_are_localised_worse_and_presses_lie_in_no_keep_out():
@@ -154,10 +158,3 @@ def test_responses_that_scatter_more_are_localised_worse_and_presses_lie_in_no_k
         for size, scatter in ((ASKED[0], Scatter(0.01)), (ASKED[0], Scatter(0.1)), (hole, Scatter(0.01)))
     ]
     assert means[1] > 1.5 * means[0] != means[2]
-
-
-def test_a_pad_of_two_fibres_loses_one_at_most():
-    (designed, _) = errors_by_contact(
-        beside_straight(Morphology.straight(1)), {"as believed": Contact()}, PadSettings(grid=1), ASKED[1]
-    )
-    assert [error.lost for error in designed.errors] == [0, 1]

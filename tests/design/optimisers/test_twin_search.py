@@ -19,7 +19,7 @@ PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0
     [
         ([0.9, 0.9, 1.0, 1.5], "twin"),  # better everywhere
         ([0.92, 1.02, 1.0, 1.0], "twin"),  # within what networks tell
-        ([1.2, 0.5, 0.5, 0.5], "usual"),  # far better with fibres failed, but a third worse with all alive
+        ([1.02, 0.5, 0.5, 0.5], "usual"),  # far better with fibres failed, but an eighth worse with all alive
         ([2.0, 2.0, 2.0, 3.5], "usual"),
     ],
 )
