@@ -145,7 +145,7 @@ def usual():
     "rules",
     [
         {"max_length_mm": 39.0},
-        {"min_gap_mm": 4.0},
+        pytest.param({"min_gap_mm": 4.0}, marks=pytest.mark.slow),
         pytest.param({"max_crossings": 4}, marks=pytest.mark.slow),
         pytest.param({"min_crossing_angle_deg": 50.0}, marks=pytest.mark.slow),
     ],

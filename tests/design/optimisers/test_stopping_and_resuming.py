@@ -104,7 +104,7 @@ def test_ctrl_c_keeps_the_best_so_far(method):
 
 
 def test_a_time_budget_ends_it_with_the_best_so_far():
-    result = search(PAD, None, SMALL.model_copy(update={"steps": 1_000_000}), run=SearchRun(time_budget=0.5))
+    result = search(PAD, None, SMALL.model_copy(update={"steps": 1_000_000}), run=SearchRun(time_budget=0.3))
     assert result.stopped == "out of time"
     assert result.violations == []
     assert result.seconds < 30
