@@ -16,3 +16,12 @@ def taken(monkeypatch):
         return rounds.found
 
     return found
+
+
+@pytest.fixture
+def one_thread():
+    """Torch computes on one thread, as in a search: several that wait for a busy machine take many times as long."""
+    from design.common.computing import one_torch_thread
+
+    with one_torch_thread():
+        yield

@@ -13,6 +13,7 @@ from design.pad.contact import fibre_axes
 from design.pad.courses.curves import crossings, lengths, refine
 from design.settings import PadSettings, RulesSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 NONE = RulesSettings(
     min_bend_radius_mm=0,
     min_gap_mm=0,
@@ -29,16 +30,14 @@ def axes(pad):
 
 
 def found(pad, rules, margin=1.0):
-    return {
-        rule: value.item() for rule, value in penalties(*axes(pad), PadSettings(grid=pad.grid), rules, margin).items()
-    }
+    terms = penalties(*axes(pad), PadSettings(grid=pad.grid), rules, margin)
+    return {rule: value.item() for rule, value in terms.items()}
 
 
-def bent(cross, travel=2.5, fibre=0, others=0.0):
-    """A 4 x 4 grid with one knot of one fibre moved, the others lifted by `others`."""
+def bent(cross, travel=2.5, fibre=0):
+    """A 4 x 4 grid with one knot of one fibre moved."""
     knots = Morphology.straight(4).knots
     middle = knots.mean(axis=1, keepdims=True)
-    middle[:4, :, 1] += others
     knots = np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1)
     knots[fibre, 1] = (travel, cross) if fibre < 4 else (cross, travel)
     return Morphology(knots)
@@ -52,41 +51,12 @@ def slanting(shift):
     return Morphology(np.concatenate([knots[:, :1], inner, knots[:, -1:]], axis=1))
 
 
-def test_the_straight_grid_has_no_penalty():
-    assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
-
-
-@pytest.mark.parametrize(
-    ("limits", "mild", "worse"),
-    [
-        ({"min_bend_radius_mm": 60.0}, bent(1.75), bent(1.9)),
-        ({"min_gap_mm": 5.0}, bent(1.7), bent(1.9)),
-        ({"same_family_crossings": 0}, bent(2.2), bent(2.8)),
-        ({"border_mm": 4.0}, bent(4.6, travel=0.3), bent(4.6, travel=0.2)),
-        ({"max_length_mm": 60.0}, bent(2.8), bent(3.8)),
-        ({"max_crossings": 10}, bent(1.1), bent(3.5, travel=4.5)),
-        ({"min_crossing_angle_deg": 85.0}, bent(1.3), bent(1.9)),
-        ({"max_common_track_mm": 1.0}, slanting(2.0), slanting(3.0)),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
-)
-def test_a_broken_rule_has_a_penalty_that_grows(limits, mild, worse):
-    rules = NONE.model_copy(update=limits)
-    (rule,) = limits
-    grid, little, much = (found(pad, rules)[rule] for pad in (Morphology.straight(4), mild, worse))
-    if rule != "max_crossings":
-        assert grid == pytest.approx(0, abs=1e-9)
-    assert 0 < little <= much
-
-
 def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
     """On random gentle pads; those with a penalty are only counted, so that the test is seen to look at both kinds."""
-    rng, rules, passed = (
-        np.random.default_rng(0),
-        RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70),
-        0,
-    )
-    for _ in range(30):
+    rng, rules = np.random.default_rng(0), RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70)
+    assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
+    passed = 0
+    for _ in range(16):
         knots = Morphology.straight(4).knots
         inner = np.linspace(knots[:, 0], knots[:, -1], 7).transpose(1, 0, 2)[:, 1:-1]
         scatter = rng.uniform(0.02, 0.3)
@@ -96,16 +66,7 @@ def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
         if sum(found(pad, rules, margin=1.05).values()) == 0:
             passed += 1
             assert check_rules(pad, rules) == []
-    assert 5 < passed < 25
-
-
-def test_folds_that_come_near_each_other_are_pushed_apart():
-    knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [1.1, 1.9], [1.2, 1.0], [2, 1.0]])
-    straight = np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=-1)
-    pad = Morphology(np.stack([knots, straight]))
-    rules = NONE.model_copy(update={"min_gap_mm": 4.0})
-    assert found(pad, rules)["folds"] > 0
-    assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}
+    assert 2 < passed < 14
 
 
 def test_the_soft_number_of_crossings_is_the_number_of_crossings():
@@ -135,18 +96,16 @@ def test_no_margin_asks_for_fewer_crossings_than_a_pad_must_have():
 )
 def test_the_gradient_is_that_of_finite_differences(rules):
     """Along random directions, since a search follows it; kinks (a nearest sample that changes) are rare."""
-    rng = np.random.default_rng(4)
-    pad = Morphology.random(2, 3, seed=5)
-    travel, cross = axes(pad)
-    total = torch.stack(list(penalties(travel, cross, PadSettings(grid=2), rules).values())).sum()
-    total.backward()
-    step = 1e-6 * torch.tensor(rng.standard_normal(cross.shape))
+    travel, cross = axes(Morphology.random(2, 3, seed=5))
+
+    def total(cross):
+        return torch.stack(list(penalties(travel, cross, PadSettings(grid=2), rules).values())).sum()
+
+    total(cross).backward()
+    step = 1e-6 * torch.tensor(np.random.default_rng(4).standard_normal(cross.shape))
     step[:, [0, -1]] = 0
     with torch.no_grad():
-        ahead, behind = (
-            torch.stack(list(penalties(travel, cross + sign * step, PadSettings(grid=2), rules).values())).sum()
-            for sign in (1, -1)
-        )
+        ahead, behind = total(cross + step), total(cross - step)
     assert cross.grad is not None
     assert (ahead - behind).item() / 2 == pytest.approx((cross.grad * step).sum().item(), rel=2e-2)
 
@@ -232,9 +191,9 @@ def test_a_fibre_steep_beside_its_wall_costs_by_how_steep_and_how_long(cross, tr
     arc, _, slope, at = dense(pad, fibre)
     beside = (at < zone_mm / pad.unit_mm) | (at > pad.grid + 1 - zone_mm / pad.unit_mm)
     expected = np.trapezoid(np.maximum(np.abs(slope) - 1, 0) * beside, arc) / 8 / (pad.grid + 1)
-    found_ = found(pad, NONE.model_copy(update={"border_mm": zone_mm}))["border_mm"]
     assert expected > 0
-    assert found_ == pytest.approx(expected, rel=0.05)
+    rules = NONE.model_copy(update={"border_mm": zone_mm})
+    assert found(pad, rules)["border_mm"] == pytest.approx(expected, rel=0.05)
 
 
 def test_a_slanting_crossing_costs_the_share_its_angle_falls_short():
@@ -242,11 +201,9 @@ def test_a_slanting_crossing_costs_the_share_its_angle_falls_short():
     swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
     pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
     rules = NONE.model_copy(update={"min_crossing_angle_deg": 50.0})
-    expected = 1 - np.degrees(np.arctan(1 / 1.5)) / 50
-    assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(expected, rel=0.1)
-    assert found(pad, rules, margin=1.2)["min_crossing_angle_deg"] == pytest.approx(
-        1 - np.degrees(np.arctan(1 / 1.5)) / 60, rel=0.1
-    )
+    for margin in (1.0, 1.2):
+        expected = 1 - np.degrees(np.arctan(1 / 1.5)) / 50 / margin
+        assert found(pad, rules, margin)["min_crossing_angle_deg"] == pytest.approx(expected, rel=0.1)
     rules = NONE.model_copy(update={"min_crossing_angle_deg": 30.0})
     assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(0, abs=0.01)
 
@@ -268,15 +225,14 @@ def test_the_gradient_of_a_stretch_too_long_is_that_of_finite_differences():
     travel, cross = axes(slanting(2.0))
     penalties(travel, cross, size, rules)["max_common_track_mm"].backward()
     assert cross.grad is not None
-    least = 0.02 * cross.grad.abs().max().item()  # the middle of a stretch moves a little as well
+    tolerance = 0.02 * cross.grad.abs().max().item()  # the middle of a stretch moves a little as well
     for fibre, knot in ((4, 1), (4, 2), (1, 1), (1, 2)):
         step = torch.zeros_like(cross)
         step[fibre, knot] = 1e-4
         with torch.no_grad():
-            ahead, behind = (
-                penalties(travel, cross + sign * step, size, rules)["max_common_track_mm"].item() for sign in (1, -1)
-            )
-        assert (ahead - behind) / 2e-4 == pytest.approx(cross.grad[fibre, knot].item(), rel=0.1, abs=least)
+            moved = (penalties(travel, cross + sign * step, size, rules) for sign in (1, -1))
+            ahead, behind = (terms["max_common_track_mm"].item() for terms in moved)
+        assert (ahead - behind) / 2e-4 == pytest.approx(cross.grad[fibre, knot].item(), rel=0.1, abs=tolerance)
 
 
 def test_crossings_of_a_family_beyond_those_allowed_are_counted():
@@ -323,3 +279,4 @@ def test_folds_cost_by_how_near_the_points_of_a_fibre_come_to_what_is_far_along_
         expected += (close + 10 * close**2) / place[..., 0].size
     rules = NONE.model_copy(update={"min_gap_mm": 4.0})
     assert found(pad, rules, margin)["folds"] == pytest.approx(expected, rel=0.2)
+    assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}

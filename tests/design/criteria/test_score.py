@@ -1,22 +1,15 @@
-"""Scores of pads, whatever their size."""
+"""Scores of pads: every term by name, whatever the size of the pad."""
 
 import math
 
 import pytest
-import torch
 
-from design import InputError, Morphology
-from design.criteria.ambiguity import ambiguity, full_scale
+from design import Contact, InputError, Morphology
 from design.criteria.published_objective import published_terms
-from design.criteria.score import ambiguities, free_presses, score
-from design.pad.contact import signals
+from design.criteria.score import score
 from design.settings import PUBLISHED_CONTACT, PadSettings
 
-
-def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
-    """Of 2M = 32 fibres taken 5 at a time there are two hundred thousand losses: a sample stands for them."""
-    terms = score(Morphology.straight(16), PUBLISHED_CONTACT, lost=5)
-    assert 0 < terms["ambiguity_lost_0"] <= terms["ambiguity_lost_5"]
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_a_pad_is_scored_where_it_is_pressed():
@@ -29,8 +22,17 @@ def test_a_pad_is_scored_where_it_is_pressed():
         same = name.startswith(("published", "information", "penalty"))
         assert (beyond[name] == between[name] == wide[name]) == same
     assert score(pad, lost=1) == beyond
-    with pytest.raises(InputError, match="the pad itself is 45 mm wide"):
-        score(pad, size=PadSettings(sensed_mm=(46, 20)))
+    disc = Contact(radius=0.9, sides=None)
+    terms = published_terms(pad, disc)[0]
+    assert score(pad, disc, lost=0)["published_objective"] == terms.objective != beyond["published_objective"]
+    assert beyond["published_objective"] == published_terms(pad)[0].objective  # a measured contact has none of its own
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
+def test_the_joint_entropy_of_the_published_pads_is_saturated(published, name):
+    terms = score(Morphology.load(published / f"{name}.mat"), lost=0)
+    assert terms["published_joint_entropy"] == pytest.approx(math.log2(49))
 
 
 def test_the_joint_entropy_of_all_fibres_saturates_where_those_of_the_families_do_not():
@@ -42,19 +44,27 @@ def test_the_joint_entropy_of_all_fibres_saturates_where_those_of_the_families_d
     assert one["published_joint_entropy"] == one["published_entropy"]
 
 
-@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
-def test_the_joint_entropy_of_the_published_pads_is_saturated(published, name):
-    terms = score(Morphology.load(published / f"{name}.mat"), lost=0)
-    assert terms["published_joint_entropy"] == pytest.approx(math.log2(49))
+def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
+    """Of 2M = 32 fibres taken 5 at a time there are two hundred thousand losses: a sample stands for them."""
+    terms = score(Morphology.straight(16), PUBLISHED_CONTACT, lost=5)
+    assert 0 < terms["ambiguity_lost_0"] <= terms["ambiguity_lost_5"]
 
 
-def test_fibres_that_no_press_touches_change_no_ambiguity():
-    """Of 64 x 64 fibres a lattice of presses misses most, which `ambiguities` leaves out."""
-    pad, contact, size = Morphology.straight(64), PUBLISHED_CONTACT, PadSettings(grid=64)
-    presses = free_presses(size)
-    found = torch.tensor(signals(pad, presses, contact).T, dtype=torch.float32)
-    assert not found.any(dim=1).all()
-    noise = 0.01 * full_scale(found)
-    places, one = torch.tensor(presses, dtype=torch.float32), torch.ones(1)
-    whole = ambiguity(found, places, torch.ones(1, len(found)), one, noise).item()
-    assert ambiguities(pad, contact, 0, 0.01, size) == pytest.approx([whole], rel=1e-6)
+@pytest.mark.parametrize(
+    ("pad", "asked", "message"),
+    [
+        (Morphology.straight(3), {"size": PadSettings(sensed_mm=(46, 20))}, "the pad itself is 45 mm wide"),
+        (Morphology.random(16, 3000, seed=0), {"lost": 0}, "too many"),
+        (Morphology.straight(2), {"lost": -1}, r"\[search\] lost"),
+        (Morphology.straight(2), {"lost": (0.0, 0.0)}, r"\[search\] lost"),
+        (Morphology.straight(2), {"noise": 0.0}, r"\[search\] noise"),
+        (Morphology.straight(2), {"contact": 0.6}, "contact"),
+        (Morphology.straight(2), {"rules": {}}, "rules"),
+        (Morphology.straight(2), {"size": 4}, "size"),
+        ([[0, 1]], {}, "pad"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused_in_one_line(pad, asked, message):
+    with pytest.raises(InputError, match=message) as refused:
+        score(pad, **asked)
+    assert len(str(refused.value).splitlines()) == 1

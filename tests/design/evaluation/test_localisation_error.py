@@ -1,5 +1,6 @@
-"""Evaluation by simulation: the published order of the pads, and that nothing is tested on what was learned."""
+"""Evaluation by simulation: the published order of the pads, fresh test presses, and errors by the contact believed."""
 
+import math
 import os
 
 import numpy as np
@@ -8,8 +9,9 @@ import torch
 
 from design import Contact, Morphology, signals
 from design.common.errors import InputError
+from design.evaluation.contacts_believed import beside_straight, contacts_in_question, errors_by_contact
 from design.evaluation.localisation_error import PressSets, fresh_presses, localisation_error, training_presses
-from design.settings import Layout, between_fibres
+from design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
 
 
 def means(pad, **settings):
@@ -73,11 +75,28 @@ def test_fibres_that_no_press_touches_do_no_harm():
 
 
 @pytest.mark.parametrize(
-    "settings", [{"presses": 1000}, {"presses": 1}, {"presses": -4}, {"test": 0}, {"lost": (-1,)}, {"subsets": 0}]
+    ("asked", "message"),
+    [
+        ({"presses": 1000}, "presses is 1000, allowed is a square number"),
+        ({"presses": 1}, "presses is 1, allowed is"),
+        ({"test": 0}, "test is 0, allowed is"),
+        ({"hidden": 0}, "hidden is 0, allowed is"),
+        ({"seed": -1}, "seed is -1, allowed is"),
+        ({"lost": (-1,)}, "lost is -1, allowed is"),
+        ({"lost": 3}, "lost is 3, expected numbers"),
+        ({"subsets": 0}, "subsets is 0, allowed is"),
+        ({"contact": 0.6}, "contact"),
+        ({"pad": None}, "pad"),
+    ],
 )
-def test_settings_that_cannot_be_used_are_refused(settings):
-    with pytest.raises(InputError, match="allowed is"):
-        localisation_error(Morphology.straight(4), **settings)
+def test_settings_that_cannot_be_used_are_refused(asked, message):
+    with pytest.raises(InputError, match=message):
+        localisation_error(**{"pad": Morphology.straight(4)} | asked)
+
+
+def test_more_networks_than_can_be_trained_are_refused():
+    with pytest.raises(InputError, match=r"that takes \d+ networks, allowed are"):
+        localisation_error(Morphology.straight(12), lost=(12,))
 
 
 def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
@@ -94,3 +113,48 @@ def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
     none, one = trial.loss_errors([[()], [(0,), (3,)]], hidden=10)
     assert (none.lost, none.subsets, one.lost, one.subsets) == (0, 1, 1, 2)
     assert 0.005 < none.mean < one.mean < 0.6
+
+
+PAD = Morphology.random(2, knots=2, seed=1)
+ASKED = PadSettings(grid=2), Scatter(0.02, 0.05, 0.36)
+"""What is pressed, and the scatter of responses."""
+
+
+def test_the_contact_believed_comes_first_and_none_twice():
+    for believed in (Contact(), PUBLISHED_CONTACT, Contact(radius=0.9)):
+        contacts = contacts_in_question(believed)
+        assert next(iter(contacts.items())) == ("as believed", believed)
+        assert len({contact.model_dump_json() for contact in contacts.values()}) == len(contacts)
+    assert list(contacts_in_question(Contact(radius=0.9)))[1:] == [
+        *("reach of 5 mm", "reach of 6.2 mm", "reach of 7.9 mm"),
+        "published disc, K = 0.6",
+    ]
+    assert "reach of 6.2 mm" not in contacts_in_question(Contact())
+    assert "published disc, K = 0.6" not in contacts_in_question(PUBLISHED_CONTACT)
+
+
+def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press():
+    contacts = {"wide": Contact(), "narrow": Contact(radius=0.2)}
+    found = errors_by_contact(beside_straight(PAD), contacts, *ASKED, seed=4)
+    assert [(each.contact, each.pad) for each in found] == [
+        (contact, pad) for contact in contacts for pad in ("designed", "straight")
+    ]
+    for each in found:
+        assert [error.lost for error in each.errors] == [0, 1, 2, 3]
+        assert all(math.isfinite(error.mean) and 0 < error.mean < 2 for error in each.errors)
+        assert each.errors[0].mean < each.errors[3].mean
+    wide, narrow = found[1].errors, found[3].errors
+    assert wide[0].mean < 0.5 * narrow[0].mean
+    assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
+    two_fibres = {"pad": Morphology.straight(1)}
+    (small,) = errors_by_contact(two_fibres, {"as believed": Contact()}, PadSettings(grid=1), ASKED[1])
+    assert [error.lost for error in small.errors] == [0, 1]
+
+
+def test_responses_that_scatter_more_are_localised_worse_and_presses_lie_in_no_keep_out():
+    hole = PadSettings(grid=2, keep_out_mm=(((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0)),))
+    means = [
+        errors_by_contact({"pad": PAD}, {"contact": Contact()}, size, scatter, subsets=1)[0].errors[0].mean
+        for size, scatter in ((ASKED[0], Scatter(0.01)), (ASKED[0], Scatter(0.1)), (hole, Scatter(0.01)))
+    ]
+    assert means[1] > 1.5 * means[0] != means[2]

@@ -1,4 +1,4 @@
-"""The genetic search: it depends on the seed alone, goes on where it was broken off, and starts from a given pad."""
+"""The genetic search: what it breeds for, that it goes on where it was broken off, and starts from a given pad."""
 
 import numpy as np
 import pytest
@@ -12,26 +12,14 @@ PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
 
 
-def bred(generations, search=SMALL, origin=None, state=None):
-    breeding = GeneticSearch(SearchProblem(PAD, (CONTACT,), search, RulesSettings(), origin), state)
+def bred(generations, search=SMALL, origin=None, state=None, pad=PAD):
+    """A search after so many generations, and its best objective after each."""
+    breeding = GeneticSearch(SearchProblem(pad, (CONTACT,), search, RulesSettings(), origin), state)
     objectives = []
     for _ in range(generations):
         breeding.advance(1)
         objectives.append(breeding.objective)
     return breeding, objectives
-
-
-def assert_equal_states(first, second):
-    assert first.keys() == second.keys()
-    for name in first:
-        np.testing.assert_array_equal(first[name], second[name], strict=True)
-
-
-def test_the_same_seed_gives_the_same_pads_and_another_seed_others():
-    first, second = bred(3)[0], bred(3)[0]
-    other = bred(3, SMALL.model_copy(update={"seed": 1}))[0]
-    assert_equal_states(first.state(), second.state())
-    assert first.morphology() != other.morphology()
 
 
 def test_the_best_objective_never_rises_and_is_that_of_the_best_pad():
@@ -48,57 +36,48 @@ def test_the_best_objective_never_rises_and_is_that_of_the_best_pad():
 def test_what_is_bred_for_are_the_weights_the_presses_and_the_levels_of_the_settings(asked):
     breeding, objectives = bred(2, SMALL.model_copy(update=asked))
     presses = published_presses(PAD.layout, asked.get("presses", 7))
-    rest = {name: asked[name] for name in asked if name != "presses"}
-    assert published_terms(breeding.morphology(), CONTACT, presses, **rest)[0].objective == objectives[-1]
+    others = {name: asked[name] for name in asked if name != "presses"}
+    assert published_terms(breeding.morphology(), CONTACT, presses, **others)[0].objective == objectives[-1]
     assert published_objective(breeding.morphology(), CONTACT) != objectives[-1]
 
 
-@pytest.mark.parametrize("broken_at", [0, 1, 2, 5, 6])
+@pytest.mark.parametrize("broken_at", [0, 1, 4])
 def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit(broken_at, tmp_path):
-    whole, objectives = bred(6)
-    np.savez(tmp_path / "state.npz", allow_pickle=False, **bred(broken_at)[0].state())
-    with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
-        resumed, rest = bred(6 - broken_at, state=state)
-    assert resumed.step == 6
-    assert rest == objectives[broken_at:]
-    assert resumed.morphology() == whole.morphology()
-    assert_equal_states(resumed.state(), whole.state())
-
-
-def test_a_state_is_not_touched_by_what_follows():
-    breeding = bred(2)[0]
-    state = breeding.state()
-    before = {name: array.copy() for name, array in state.items()}
-    resumed = bred(2, state=state)[0]
-    breeding.advance(1)
-    assert_equal_states(state, before)
-    assert resumed.step == 4
+    unbroken, objectives = bred(4)
+    broken = bred(broken_at)[0]
+    state = broken.state()
+    np.savez(tmp_path / "state.npz", allow_pickle=False, **state)
+    broken.advance(1)
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as saved:
+        assert all(np.array_equal(saved[name], state[name]) for name in state)  # what follows does not touch it
+        resumed, further = bred(4 - broken_at, state=saved)
+    assert (resumed.step, further) == (4, objectives[broken_at:])
+    assert resumed.morphology() == unbroken.morphology()
+    first, second = unbroken.state(), resumed.state()
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], strict=True)
 
 
 def test_a_given_origin_is_never_lost():
     """One far better than what so short a search finds: it is kept to the last bit, or improved on."""
-    origin = bred(30, SMALL.model_copy(update={"population": 40}))[0].morphology()
+    origin = bred(30)[0].morphology()
     value = published_objective(origin, CONTACT)
-    breeding, objectives = bred(3, origin=origin)
-    assert objectives[0] <= value < bred(3)[1][-1]
+    breeding, objectives = bred(2, origin=origin)
+    assert objectives[0] <= value < bred(2)[1][-1]
     assert published_objective(breeding.morphology(), CONTACT) <= value
 
 
 @pytest.mark.parametrize("grid", [1, 2])
 def test_the_smallest_pads_with_the_smallest_populations_are_bred_too(grid):
     search = SearchSettings(method="genetic", knots=1, population=4, generations=4)
-    breeding = GeneticSearch(SearchProblem(PadSettings(grid=grid, pitch_mm=20), (CONTACT,), search, RulesSettings()))
-    breeding.advance(4)
-    found = breeding.morphology()
-    assert found.grid == grid
-    assert found.pitch_mm == 20
+    breeding, _ = bred(4, search, pad=PadSettings(grid=grid, pitch_mm=20))
+    assert breeding.done
+    assert (breeding.morphology().grid, breeding.morphology().pitch_mm) == (grid, 20)
 
 
 @pytest.mark.parametrize(("knots", "bar"), [(5, 0.0935), pytest.param(20, 0.1040, marks=pytest.mark.slow)])
 def test_a_whole_search_reaches_the_published_objective(knots, bar):
-    breeding = GeneticSearch(
-        SearchProblem(PadSettings(), (CONTACT,), SearchSettings(method="genetic", knots=knots), RulesSettings())
-    )
-    breeding.advance(50)
+    breeding, objectives = bred(50, SearchSettings(method="genetic", knots=knots), pad=PadSettings())
     assert breeding.done
-    assert published_objective(breeding.morphology(), CONTACT) <= bar
+    assert objectives[-1] <= bar

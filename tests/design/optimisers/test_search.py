@@ -1,281 +1,246 @@
-"""Both searches through their one face: they improve, obey the rules, stop, resume, and depend on the seed alone."""
+"""Both searches through their one face: what they find, judge and refuse, and that they depend on the seed alone."""
 
-import signal
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 
 from design import Contact, InputError, Morphology
-from design.common.checkpoints import Checkpoints
+from design.criteria.rules import check_rules
 from design.criteria.score import AMBIGUITY_NOISE, ambiguities, ambiguity_terms, score
 from design.evaluation.expected_error import error_terms, expected_errors
-from design.optimisers.problem import SearchProblem
+from design.evaluation.localisation_error import localisation_error
+from design.optimisers import benchmark
 from design.optimisers.search import SearchRun, search
-from design.optimisers.start import advance_start
+from design.pad.courses.curves import refine
 from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
-SMALL = SearchSettings(knots=3, starts=2, steps=30, population=20, generations=6, lost=1)
-QUICK = RulesSettings(min_bend_radius_mm=0.5)
-SEARCH = sys.modules["design.optimisers.search"]
-
-
-@pytest.fixture(scope="module")
-def small():
-    """What a small search finds."""
-    return search(contact=PUBLISHED_CONTACT, settings=SMALL)
+PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)
+SMALL = SearchSettings(knots=3, starts=2, steps=25, population=10, generations=3, lost=1)
+QUICK = SMALL.model_copy(update={"starts": 1, "steps": 1, "generations": 1})
+REPAIR = "design.optimisers.gradient_search.REPAIR_STEPS"
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_the_same_seed_gives_the_same_fibres_and_another_seed_others(method, small):
-    settings = SMALL.model_copy(update={"method": method})
-    first = small if method == "descent" else search(contact=PUBLISHED_CONTACT, settings=settings)
-    second = search(contact=PUBLISHED_CONTACT, settings=settings)
-    other = search(contact=PUBLISHED_CONTACT, settings=settings.model_copy(update={"seed": 1}))
-    assert first.morphology == second.morphology
-    assert first.history == second.history
-    assert first.morphology != other.morphology
+def test_a_search_depends_on_the_seed_and_not_on_how_it_runs(method, monkeypatch):
+    pad, settings = PadSettings(grid=1), SMALL.model_copy(update={"method": method})
+    first, reported = search(pad, None, settings, FREE), []
+    monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)  # a slice ends after its first step
+    with ThreadPoolExecutor(1) as executor:
+        run = SearchRun(lambda *progress: reported.append(progress), executor=executor)
+        sliced = search(pad, None, settings, FREE, run=run)
+    assert len(reported) == (2 * 25 if method == "descent" else 3)
+    assert method == "genetic" or first.found_by.startswith("start")  # better than straight fibres
+    assert (first.morphology, first.history, first.terms) == (sliced.morphology, sliced.history, sliced.terms)
+    assert first.morphology != search(pad, None, settings.model_copy(update={"seed": 1}), FREE).morphology
 
 
-def test_genetic_search_improves_generation_by_generation():
-    found = search(settings=SMALL.model_copy(update={"method": "genetic"}), rules=RulesSettings(enforce=False))
-    best = [entry["objective"] for entry in found.history]
-    assert best == sorted(best, reverse=True)
-    assert found.terms["published_objective"] == pytest.approx(best[-1])
-    assert found.violations == []
-
-
-@pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_ctrl_c_keeps_the_best_so_far(method):
-    """The signal comes from the first report; what was found by then is returned, and says so."""
-    settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
-    found = search(
-        contact=PUBLISHED_CONTACT, settings=settings, run=SearchRun(lambda *step: signal.raise_signal(signal.SIGINT))
-    )
-    assert found.stopped == "interrupted"
-    assert found.morphology.grid == 4
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-class KilledError(Exception):
-    """Stands for a kill in mid-search."""
-
-
-@pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
-    """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
-    pad = PadSettings(grid=2)
-    settings = SMALL.model_copy(update={"method": method})
-    whole, kills = search(pad, PUBLISHED_CONTACT, settings=settings), 0
-
-    def attempt():
-        heard = []
-
-        def report(*step):
-            heard.append(step)
-            if len(heard) == 2:
-                raise KilledError
-
-        return search(
-            pad, PUBLISHED_CONTACT, settings=settings, run=SearchRun(report, tmp_path / "search", resume=True)
-        )
-
-    while kills < 100:
-        try:
-            broken = attempt()
-            break
-        except KilledError:
-            kills += 1
-    else:
-        pytest.fail("it does not get on")
-    assert kills > 0
-    assert broken.morphology == whole.morphology
-    assert broken.history == whole.history
-    assert broken.violations == whole.violations
-
-
-def test_resuming_with_other_settings_is_refused_and_names_what_differs(tmp_path):
-    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
-    other = SMALL.model_copy(update={"seed": 5})
-    with pytest.raises(InputError, match="begun with search seed 0, now 5"):
-        search(
-            contact=PUBLISHED_CONTACT,
-            settings=other,
-            rules=QUICK,
-            run=SearchRun(keep_in=tmp_path / "search", resume=True),
-        )
-
-
-def test_a_damaged_state_is_named(tmp_path):
-    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
-    path = tmp_path / "search" / "start_0000.npz"
-    path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read"):
-        search(
-            contact=PUBLISHED_CONTACT,
-            settings=SMALL,
-            rules=QUICK,
-            run=SearchRun(keep_in=tmp_path / "search", resume=True),
-        )
-
-
-def test_a_state_that_is_not_as_it_was_written_is_refused(tmp_path):
-    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
-    path = tmp_path / "search" / "start_0000.npz"
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
-    with np.load(path) as arrays:
-        state = {name: arrays[name] for name in arrays.files}
-    np.savez(path, allow_pickle=False, **state | {"done": np.array([1, 2])})
-    with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read \(it is not as it was written\)"):
-        search(
-            contact=PUBLISHED_CONTACT,
-            settings=SMALL,
-            rules=QUICK,
-            run=SearchRun(keep_in=tmp_path / "search", resume=True),
-        )
-
-
-def test_a_state_of_another_start_is_refused(tmp_path):
-    problem = SearchProblem(PadSettings(), (PUBLISHED_CONTACT,), SMALL, QUICK)
-    Checkpoints(tmp_path / "search", problem.settings()).save(0, advance_start(problem, 0, None).state)
-    (tmp_path / "search" / "start_0000.npz").rename(tmp_path / "search" / "start_0001.npz")
-    with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
-        search(
-            contact=PUBLISHED_CONTACT,
-            settings=SMALL,
-            rules=QUICK,
-            run=SearchRun(keep_in=tmp_path / "search", resume=True),
-        )
-
-
-def test_a_generation_that_fits_no_memory_is_refused():
-    settings = SearchSettings(method="genetic", population=100_000)
-    with pytest.raises(InputError, match="population is 100000: that takes"):
-        search(contact=PUBLISHED_CONTACT, settings=settings)
-
-
-def test_the_executor_does_not_matter(small):
-    with ThreadPoolExecutor(1) as one:
-        assert (
-            search(contact=PUBLISHED_CONTACT, settings=SMALL, run=SearchRun(executor=one)).morphology
-            == small.morphology
-        )
-
-
-def test_a_time_budget_ends_it_with_the_best_so_far():
-    settings = SMALL.model_copy(update={"steps": 1_000_000})
-    found = search(contact=PUBLISHED_CONTACT, settings=settings, run=SearchRun(time_budget=1.0))
-    assert found.stopped == "out of time"
-    assert found.violations == []
-    assert found.seconds < 30
-
-
-def test_a_search_stopped_before_anything_is_noted_gives_its_fibres(monkeypatch):
-    monkeypatch.setattr("design.optimisers.start.SLICE_S", -1.0)
-    found = search(contact=PUBLISHED_CONTACT, settings=SMALL, run=SearchRun(time_budget=1e-6))
-    assert found.stopped == "out of time"
-    assert found.morphology.knots.shape == (8, 5, 2)
-    assert search(contact=PUBLISHED_CONTACT, settings=SMALL, run=SearchRun(time_budget=0.5)).stopped == "out of time"
-
-
-def test_a_search_from_a_pad_improves_on_it():
-    """Under the published contact and by no rules, where straight fibres are no match for curved ones."""
-    pad, free = PadSettings(grid=2), RulesSettings(enforce=False)
-    origin = search(pad, PUBLISHED_CONTACT, SMALL.model_copy(update={"steps": 10, "seed": 3}), free).morphology
-    settings = SearchSettings(knots=5, starts=1, steps=80, lost=1)
-    before = expected_errors(origin, PUBLISHED_CONTACT, settings, pad)
-    after = search(pad, PUBLISHED_CONTACT, settings, free, origin=origin)
-    assert after.morphology.knots.shape == (4, 7, 2)
-    assert after.found_by == "start 1"
-    # what is minimised: the geometric mean over the numbers of failed fibres
-    assert after.terms["expected_error_lost_0"] * after.terms["expected_error_lost_1"] < 0.95 * np.prod(before)
-
-
-def test_an_origin_that_nothing_found_surpasses_comes_back(monkeypatch):
-    free, quick = RulesSettings(enforce=False), SMALL.model_copy(update={"steps": 10, "starts": 1})
-    pad = PadSettings(sensed_mm="fibres")
-    origin = search(pad, PUBLISHED_CONTACT, settings=quick, rules=free).morphology
-    monkeypatch.setattr(SEARCH, "_found", lambda *_: [("start 1", Morphology.straight(4))])
-    found = search(pad, PUBLISHED_CONTACT, settings=quick, rules=free, origin=origin)
-    assert (found.morphology, found.found_by) == (origin, "origin")
-    found = search(pad, PUBLISHED_CONTACT, settings=quick, rules=free).morphology
-    assert np.ptp(found.knots[:4, :, 1], axis=1).tolist() == [0, 0, 0, 0]
-
-
-def test_a_search_never_ends_worse_than_straight_fibres(monkeypatch):
-    """But by the published method, which is left as it is."""
-    worse, straight = Morphology.random(4, 3, seed=2), Morphology.straight(4)
-    free, quick = (
-        RulesSettings(enforce=False),
-        SMALL.model_copy(update={"steps": 1, "starts": 1, "generations": 1, "noise": 0.11}),
-    )
-    monkeypatch.setattr(SEARCH, "_found", lambda *_: [("start 1", worse)])
-    contact = Contact(reach=((0, 1), (5.6, 0.7), (11.2, 0.2), (18, 0)), length="manhattan")
-    plain = expected_errors(straight, contact, quick, PadSettings())
-    assert np.all(np.array(plain) < expected_errors(worse, contact, quick, PadSettings()))
-    found = search(contact=contact, settings=quick, rules=free)
-    assert found.found_by == "straight fibres"
-    assert found.morphology.knots.shape == worse.knots.shape
-    np.testing.assert_array_equal(found.morphology.knots[:4, :, 1], straight.knots[:4, :1, 1] + np.zeros(5))
-    confused = ambiguities(straight, contact, quick.lost, AMBIGUITY_NOISE, PadSettings())
-    assert found.straight == pytest.approx(error_terms(plain) | ambiguity_terms(confused), rel=1e-6)
-    assert found.straight.items() <= found.terms.items()
-    genetic = search(contact=contact, settings=quick.model_copy(update={"method": "genetic"}), rules=free)
-    assert genetic.morphology == worse
-    assert genetic.straight == found.straight
-
-
-@pytest.mark.parametrize(("weight", "chosen"), [(0.0, "less error"), (1.5, "less sharp"), (10.0, "straight fibres")])
-def test_sharpness_counts_in_the_choice_among_starts(weight, chosen, monkeypatch):
-    """Straight fibres err most and are the least sharp here; the other two pads lie between them both ways."""
-    pads = [("less error", Morphology.random(2, 3, seed=2)), ("less sharp", Morphology.random(2, 3, seed=5))]
-    monkeypatch.setattr(SEARCH, "_found", lambda *_: pads)
-    settings = SMALL.model_copy(update={"steps": 1, "starts": 1, "sharpness": weight})
-    found = search(PadSettings(grid=2), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
-    assert found.found_by == chosen
-
-
-def test_the_terms_of_what_is_found_are_its_scores():
+def test_the_terms_of_a_pad_are_its_scores_beside_those_of_straight_fibres():
     pad, contact = PadSettings(grid=2, sensed_mm=(20, 30)), Contact(radius=0.9)
-    settings = SearchSettings(knots=3, starts=1, steps=5, lost=1, noise=0.03)
-    found = search(pad, contact, settings, QUICK)
-    expected, plain = (
+    settings = QUICK.model_copy(update={"noise": 0.03, "steps": 5})
+    result = search(pad, contact, settings, FREE)
+    expected, straight = (
         error_terms(expected_errors(each, contact, settings, pad))
-        for each in (found.morphology, Morphology.straight(2))
+        for each in (result.morphology, Morphology.straight(2))
     )
-    assert found.terms == score(found.morphology, contact, 1, 0.05, QUICK, pad) | expected
-    confused = ambiguity_terms(ambiguities(Morphology.straight(2), contact, 1, 0.05, pad))
-    assert found.straight == pytest.approx(plain | confused, rel=1e-6)
+    assert result.terms == score(result.morphology, contact, 1, 0.05, FREE, pad) | expected
+    confused = ambiguity_terms(ambiguities(Morphology.straight(2), contact, 1, AMBIGUITY_NOISE, pad))
+    assert result.straight == pytest.approx(straight | confused, rel=1e-6)
+    assert result.violations == []
+    assert not result.enforced
 
 
-def test_a_search_for_the_least_expected_error_finds_less_than_straight_fibres_have():
-    """The wide reach is that of a built pad; what is found is judged by what is searched for."""
-    settings = SearchSettings(knots=5, starts=1, steps=50, lost=(0, 0, 1))
-    found = search(PadSettings(grid=3), None, settings, RulesSettings(enforce=False))
-    errors = expected_errors(found.morphology, Contact(), settings, PadSettings(grid=3))
-    assert [found.terms[f"expected_error_lost_{lost}"] for lost in range(3)] == errors
-    assert errors[2] < 0.97 * found.straight["expected_error_lost_2"]
+def test_a_search_from_a_pad_improves_on_it_and_on_straight_fibres():
+    origin = Morphology.random(2, 3, seed=1)
+    settings = QUICK.model_copy(update={"knots": 5, "steps": 30})
+    before = expected_errors(origin, PUBLISHED_CONTACT, settings, PAD)
+    result = search(PAD, PUBLISHED_CONTACT, settings, FREE, origin=origin)
+    assert result.morphology.knots.shape == (4, 7, 2)
+    assert result.found_by == "start 1"
+    # what is minimised: the geometric mean over the numbers of failed fibres
+    errors, straight = (
+        [terms[f"expected_error_lost_{k}"] for k in (0, 1)] for terms in (result.terms, result.straight)
+    )
+    assert np.prod(errors) < 0.7 * np.prod(before)
+    assert np.prod(errors) < 0.5 * np.prod(straight)
 
 
-def test_an_origin_that_does_not_fit_is_refused():
-    with pytest.raises(InputError, match=r"to start from has 3 \+ 3 fibres, .*, allowed is the pad.s, 4 \+ 4 fibres"):
-        search(contact=PUBLISHED_CONTACT, settings=SMALL, origin=Morphology.straight(3))
-    with pytest.raises(InputError, match="knots is 3, allowed is at least the 7"):
-        search(contact=PUBLISHED_CONTACT, settings=SMALL, origin=Morphology.random(4, 7))
+def test_an_origin_that_nothing_surpasses_comes_back():
+    settings = SMALL.model_copy(update={"steps": 60, "starts": 1})
+    origin = search(PAD, PUBLISHED_CONTACT, settings, FREE).morphology
+    result = search(PAD, PUBLISHED_CONTACT, QUICK, FREE, origin=origin)
+    assert (result.morphology, result.found_by) == (origin, "origin")
 
 
-def test_a_device_that_is_not_there_is_refused():
-    import torch
+def test_a_search_never_ends_worse_than_straight_fibres_but_by_the_published_method():
+    worse = Morphology.random(2, 3, seed=0)
+    result = search(PAD, None, QUICK, FREE, origin=worse)
+    assert result.found_by == "straight fibres"
+    assert result.morphology.knots.shape == worse.knots.shape
+    assert np.ptp(result.morphology.knots[:2, :, 1], axis=1).tolist() == [0, 0]
+    assert result.straight.items() <= result.terms.items()
+    genetic = search(PAD, Contact(), QUICK.model_copy(update={"method": "genetic"}), FREE, origin=worse)
+    assert genetic.found_by in ("genetic", "origin")
+    assert genetic.straight == result.straight
+    assert genetic.terms["expected_error_lost_0"] > genetic.straight["expected_error_lost_0"]
 
-    if torch.cuda.is_available():
-        pytest.skip("there is one here")
-    with pytest.raises(InputError, match="device is 'cuda'"):
-        search(contact=PUBLISHED_CONTACT, settings=SMALL.model_copy(update={"device": "cuda"}))
+
+@pytest.mark.parametrize(("weight", "straight"), [(0.0, False), (10.0, True)])
+def test_sharpness_counts_in_the_choice_among_pads(weight, straight):
+    """Under the published contact straight fibres err most, and are the least sharp."""
+    settings = QUICK.model_copy(update={"sharpness": weight})
+    result = search(PAD, PUBLISHED_CONTACT, settings, FREE, origin=Morphology.random(2, 3, seed=2))
+    assert (result.found_by == "straight fibres") == straight
 
 
-def test_a_loss_of_every_fibre_is_refused():
-    with pytest.raises(InputError, match="leaves some of the 2 fibres"):
-        search(PadSettings(grid=1), settings=SearchSettings(lost=(0.0, 0.0, 1.0)))
+def test_a_pad_that_errs_less_but_breaks_a_rule_is_not_handed_back(monkeypatch):
+    monkeypatch.setattr(REPAIR, 1)
+    curved, rules = Morphology.random(2, 3, seed=1), RulesSettings(max_length_mm=34)
+    result = search(PAD, PUBLISHED_CONTACT, QUICK, rules, origin=curved)
+    assert (result.found_by, result.violations) == ("straight fibres", [])
+    assert expected_errors(curved, PUBLISHED_CONTACT, QUICK, PAD)[0] < result.terms["expected_error_lost_0"]
+
+
+def test_rules_that_cannot_hold_are_named_with_every_fibre(monkeypatch):
+    monkeypatch.setattr(REPAIR, 20)
+    result = search(PAD, None, QUICK, RulesSettings(max_length_mm=20))
+    assert [(v.rule, v.fibres) for v in result.violations] == [("max_length_mm", (f,)) for f in (1, 2, 3, 4)]
+    assert result.enforced
+
+
+@pytest.mark.parametrize(
+    ("rules", "broken"),
+    [
+        ({"min_gap_mm": 30.0, "max_crossings": 3, "border_mm": 500.0}, {"min_gap_mm", "max_crossings", "border_mm"}),
+        ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, {"border_mm"}),
+    ],
+)
+def test_rules_that_cannot_be_met_end_with_what_is_broken(rules, broken, monkeypatch):
+    monkeypatch.setattr(REPAIR, 20)
+    result = search(PAD, None, QUICK, RulesSettings(**rules))
+    assert broken <= {violation.rule for violation in result.violations}
+    assert all(np.isfinite(violation.measured) for violation in result.violations)
+
+
+@pytest.mark.parametrize(
+    ("settings", "rules", "pitch_mm"),
+    [
+        ({"knots": 1, "lost": 8, "noise": 1e-9, "sharpness": 1e6}, {"min_gap_mm": 1000.0}, 0.1),
+        ({"knots": 64, "lost": (1e-300, 1e6), "noise": 10.0}, {"min_bend_radius_mm": 1000.0}, 1000.0),
+        ({"method": "genetic", "population": 4, "lost": (5e-324,), "seed": 2**32 - 1}, {"border_mm": 1000.0}, 5.0),
+        ({"knots": 2, "lost": (0.0, 1.0), "starts": 3}, {"max_length_mm": 1e-300}, 11.25),
+    ],
+)
+def test_settings_at_their_ends_give_a_pad_with_finite_terms(settings, rules, pitch_mm, monkeypatch):
+    monkeypatch.setattr(REPAIR, 20)
+    pad = PadSettings(grid=1, pitch_mm=pitch_mm)
+    result = search(pad, None, QUICK.model_copy(update=settings), RulesSettings(**rules))
+    assert result.morphology.pitch_mm == pitch_mm
+    assert np.isfinite([*result.terms.values()]).all()
+
+
+@pytest.mark.parametrize(
+    ("method", "counts"),
+    [("descent", (3, 0)), ("genetic", (0, 1)), pytest.param("descent", (0, 1), marks=pytest.mark.slow)],
+)
+def test_pads_of_one_family_and_of_one_fibre_are_searched_scored_and_evaluated(method, counts, monkeypatch):
+    monkeypatch.setattr(REPAIR, 20)
+    pad = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 15.0))
+    pads = search(pad, None, SMALL.model_copy(update={"method": method, "starts": 1, "steps": 3})).morphology
+    assert pads.layout.counts == counts
+    assert np.isfinite([*score(pads, Contact(), 1, 0.05, None, pad).values()]).all()
+    errors = localisation_error(pads, lost=(0,), presses=64, test=50, hidden=4, subsets=1)
+    assert errors[0].mean > 0
+
+
+HOLE = ((-4.0, 2.0), (4.0, 2.0), (4.0, 10.0), (-4.0, 10.0))
+
+
+def test_a_search_around_a_hole_obeys_the_rules():
+    pad = PadSettings(horizontals=2, verticals=3, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+    rules = RulesSettings()
+    result = search(pad, None, QUICK.model_copy(update={"knots": 6, "steps": 5}), rules)
+    assert result.violations == check_rules(result.morphology, rules, pad) == []
+    assert result.morphology.layout == pad.layout
+    assert result.terms["penalty_keep_out_mm"] < 0.01
+
+
+def test_a_hole_that_leaves_no_room_is_a_broken_rule(monkeypatch):
+    """Three verticals are to pass in 3 mm to either side, of which border and clearance leave nothing."""
+    monkeypatch.setattr(REPAIR, 20)
+    wide = ((-9.0, -3.0), (9.0, -3.0), (9.0, 3.0), (-9.0, 3.0))
+    pad = PadSettings(horizontals=2, verticals=3, pitch_mm=(6.0, 10.0), keep_out_mm=(wide,))
+    result = search(pad, None, QUICK.model_copy(update={"knots": 9}), RulesSettings())
+    assert {violation.rule for violation in result.violations} & {"keep_out_mm", "border_mm", "min_gap_mm"}
+
+
+def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
+    """One fibre rises and falls within the rules as long as the pad is flat."""
+    monkeypatch.setattr(REPAIR, 20)
+    pad, rules = PadSettings(horizontals=2, verticals=1, bent_radius_mm=6.0), RulesSettings(min_bend_radius_mm=4.0)
+    knots = refine(Morphology.straight(pad.layout).knots, 3, pad.layout)
+    knots[0, 2, 1] += 0.13
+    origin = Morphology.of_layout(knots, pad.layout)
+    assert check_rules(origin, rules) == []
+    assert check_rules(origin, rules, pad) != []
+    result = search(pad, None, QUICK, rules, origin=origin)
+    assert check_rules(result.morphology, rules, pad) == result.violations == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"pad": 4}, "pad"),
+        ({"contact": 0.6}, "contact"),
+        ({"settings": {}}, "settings"),
+        ({"run": 1}, "run"),
+        ({"run": {"report": 1}}, "report is 1, expected a function"),
+        ({"run": {"keep_in": 1}}, "keep_in"),
+        ({"run": {"resume": 1}}, "resume"),
+        ({"run": {"time_budget": -1}}, "time_budget"),
+        ({"run": {"executor": "here"}}, "executor"),
+        ({"origin": [[0, 1]]}, "origin"),
+        (
+            {"origin": Morphology.straight(3)},
+            r"to start from has 3 \+ 3 fibres, .*, allowed is the pad.s, 2 \+ 2 fibres",
+        ),
+        ({"origin": Morphology.straight((2, 2), (5.0, 10.0))}, "to start from has"),
+        ({"origin": Morphology.random(2, 7)}, "knots is 3, allowed is at least the 7"),
+        ({"settings": SearchSettings(method="genetic", population=100_000)}, "population is 100000: that takes"),
+        ({"settings": SearchSettings(lost=(0.0,) * 4 + (1.0,))}, "leaves some of the 4 fibres"),
+        (
+            {"pad": PadSettings(bent_radius_mm=1.5), "rules": RulesSettings(min_bend_radius_mm=2)},
+            r"bent_radius_mm is 1.5, allowed is at least 2, .*min_bend_radius_mm",
+        ),
+        pytest.param(
+            {"settings": SearchSettings(device="cuda")},
+            "device is 'cuda'",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one here"),
+        ),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(asked, message):
+    def begin():
+        run = asked.get("run")
+        search(**{"pad": PAD, "settings": SMALL} | asked | {"run": SearchRun(**run) if isinstance(run, dict) else run})
+
+    with pytest.raises(InputError, match=message):
+        begin()
+
+
+def test_the_bench_has_every_way_budget_and_seed_and_judges_what_a_plain_search_finds(monkeypatch):
+    small = {"KNOTS": (3,), "SEEDS": (0, 1), "GENERATIONS": (1,), "STEPS": (1, 2), "PUBLISHED_PAD": PadSettings(grid=1)}
+    for name, value in small.items():
+        monkeypatch.setattr(benchmark, name, value)
+    trials = list(benchmark.trials())
+    ways = [("genetic", 1), ("descent", 1), ("with rules", 1), ("descent", 2), ("with rules", 2)]
+    assert [trial.key for trial in trials] == [("N=3", *way, seed) for way in ways for seed in (0, 1)]
+    settings = SearchSettings(method="genetic", generations=1, knots=3, seed=1)
+    result = trials[1].work()
+    assert result.morphology == search(PadSettings(grid=1), settings=settings, rules=FREE).morphology
+    errors = [level.mean for level in localisation_error(result.morphology, subsets=2)]
+    judged = trials[1].judge(result)
+    assert [judged["lost_0"], judged["lost_1"]] == errors
+    assert judged["error"] == np.mean(errors)
+    assert judged["violations"] == len(check_rules(result.morphology, RulesSettings()))

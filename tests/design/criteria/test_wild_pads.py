@@ -1,0 +1,92 @@
+"""Scores, rules, penalties and plans of pads as wild as the class allows: steps, needles, fibres on each other."""
+
+import numpy as np
+import pytest
+import torch
+
+from design import Contact, Morphology
+from design.criteria.information import disorder, disorder_area
+from design.criteria.penalties import penalties
+from design.criteria.rules import check_rules
+from design.criteria.score import score
+from design.optimisers.parametrization import Fibres
+from design.pad.knots import assemble
+from design.report.plan_drawing import draw_plan
+from design.settings import PadSettings, RulesSettings
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+KINDS = ["random", "steps", "lattice", "border", "alike", "edge", "needles", "level", "no knots"]
+CONTACTS = [
+    Contact(),
+    Contact(radius=1e-9, sides=None),
+    Contact(radius=0.1, sides=3, weight="inverse", length="euclidean"),
+    Contact(radius=7.0, sides=30, weight="inverse_square"),
+    Contact(radius=1e4, sides=4),
+]
+RULES = [
+    RulesSettings(max_crossings=3, min_crossing_angle_deg=45.0, min_gap_mm=5.0),
+    RulesSettings(
+        min_bend_radius_mm=0, min_gap_mm=1e-9, same_family_crossings=2, border_mm=0, min_crossing_angle_deg=1e-9
+    ),
+    RulesSettings(
+        min_bend_radius_mm=1000, min_gap_mm=1000, border_mm=1000, max_length_mm=1e-3, min_crossing_angle_deg=90
+    ),
+]
+
+
+def wild_pad(kind, seed):
+    rng = np.random.default_rng(seed)
+    grid, count = 1 + seed % 2, 0 if kind == "no knots" else rng.integers(1, 7)
+    size = grid + 1.0
+    inner = rng.uniform(0, size, (2 * grid, count, 2))
+    levels = np.arange(1, grid + 1)[:, None]
+    if kind == "steps":  # all knots of a fibre at one place along it, which the constructor moves next to each other
+        inner[:grid, :, 0], inner[grid:, :, 1] = rng.uniform(0, size, 2)
+    elif kind == "lattice":
+        inner = np.round(2 * inner) / 2
+    elif kind == "border":
+        inner[:grid, :, 1], inner[grid:, :, 0] = rng.choice([0, size], (2, grid, count))
+    elif kind == "alike":
+        inner[:grid], inner[grid:] = inner[0], inner[grid]
+    elif kind == "edge":
+        inner = rng.choice([0.0, 1e-9, size], inner.shape)
+    elif kind == "needles":
+        inner[:grid, :, 0] = inner[grid:, :, 1] = rng.uniform(0, grid) + 1e-9 * np.arange(count)
+    elif kind == "level":
+        inner[:grid, :, 1], inner[grid:, :, 0] = levels + rng.normal(0, 1e-12, (grid, count)), levels
+    return Morphology(assemble(inner), rng.choice([0.1, 11.25, 1000.0]))
+
+
+@pytest.fixture(params=[0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
+def seed(request):
+    return request.param
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wild_pad_has_a_finite_score_and_is_checked_and_drawn(kind, seed):
+    seed = 10 * seed + KINDS.index(kind)
+    pad, contact, rules = wild_pad(kind, seed), CONTACTS[seed % 5], RULES[seed % 3]
+    terms = score(pad, contact, seed % 9, (1e-9, 0.1, 10.0)[seed % 3], rules)
+    assert np.isfinite([*terms.values()]).all()
+    assert 0 <= terms["published_entropy"] <= 2 * np.log2(49) + 1e-9
+    area, samples = disorder_area(pad), 200_001
+    sampled = disorder(pad.knots, samples) * (pad.grid + 1) / (samples - 1)
+    assert sampled == pytest.approx(area, abs=2e-3 * (1 + area))
+    findings = check_rules(pad, rules)
+    assert np.isfinite([[finding.measured, finding.limit] for finding in findings]).all()
+    draw_plan(pad, contact, findings).draw_without_rendering()
+    assert pad.tiled(2).grid == 2 * pad.grid
+
+
+@pytest.mark.parametrize("kind", KINDS[:-1])
+def test_penalties_of_a_wild_pad_and_their_gradients_are_finite(kind, seed):
+    pad = wild_pad(kind, seed)
+    for rules in RULES:
+        fibres = Fibres.through(pad.knots, pad.layout, 0.01)
+        assert np.isfinite(fibres.knots()).all()
+        terms = penalties(*fibres.axes(), PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
+        torch.stack(list(terms.values())).sum().backward()
+        assert all(value.isfinite() and value >= 0 for value in terms.values())
+        for variable in (fibres.spans, fibres.cross):
+            assert variable.grad is not None
+            assert variable.grad.isfinite().all()

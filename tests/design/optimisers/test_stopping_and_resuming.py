@@ -1,0 +1,260 @@
+"""Searches that end before they are done, and that go on where they were broken off: here, by process, on a cluster."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Executor, Future
+from typing import cast
+
+import click
+import numpy as np
+import pytest
+
+from design import InputError, PadSettings, RulesSettings, SearchRun, SearchSettings, search
+from design.common import computing
+from design.common.checkpoints import Checkpoints
+from design.common.command_line import run_to_end
+from design.optimisers import stopping
+from padforge import cli
+
+PAD = PadSettings(grid=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, lost=1)
+FREE = RulesSettings(enforce=False)
+POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+
+
+class KilledError(Exception):
+    """Stands for a kill in mid-search."""
+
+
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
+    """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
+    settings = SMALL.model_copy(update={"method": method})
+    unbroken, kills = search(PAD, None, settings, FREE), 0
+
+    def attempt():
+        reported = []
+
+        def report(*progress):
+            reported.append(progress)
+            if len(reported) == 2:
+                raise KilledError
+
+        return search(PAD, None, settings, FREE, run=SearchRun(report, tmp_path / "search", resume=True))
+
+    while kills < 20:
+        try:
+            resumed = attempt()
+            break
+        except KilledError:
+            kills += 1
+    else:
+        pytest.fail("it does not get on")
+    assert kills > 0
+    assert (resumed.morphology, resumed.history) == (unbroken.morphology, unbroken.history)
+
+
+def test_states_stay_until_they_are_cleared_and_only_those_of_this_search_are_taken(tmp_path):
+    folder, quick = tmp_path / "search", SMALL.model_copy(update={"starts": 1, "steps": 2})
+    run, path = SearchRun(keep_in=folder, resume=True), folder / "start_0000.npz"
+    first = search(PAD, None, quick, FREE, run=run)
+    assert search(PAD, None, quick, FREE, run=run).morphology == first.morphology
+    with pytest.raises(InputError, match="begun with search seed 0, now 5"):
+        search(PAD, None, quick.model_copy(update={"seed": 5}), FREE, run=run)
+    path.rename(folder / "start_0001.npz")
+    with pytest.raises(InputError, match=r"start_0001\.npz: cannot be read \(it is not as it was written\)"):
+        search(PAD, None, quick, FREE, run=run)
+    (folder / "start_0001.npz").rename(path)
+    with np.load(path) as arrays:
+        state = {name: arrays[name] for name in arrays.files}
+    np.savez(path, allow_pickle=False, **state | {"done": np.array([1, 2])})
+    with pytest.raises(InputError, match=r"start_0000\.npz: cannot be read \(it is not as it was written\)"):
+        search(PAD, None, quick, FREE, run=run)
+    Checkpoints(folder, {}).clear()
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_files_of_others_are_removed(tmp_path):
+    about = '{"format": "somebody/1"}'
+    names = ["search.json", "start_0.npz", "start_0000.npz", "start_0_notes.npz", "other"]
+    for name in names:
+        (tmp_path / name).write_text(about)
+    with pytest.raises(InputError, match=r"search\.json: "):
+        Checkpoints(tmp_path, {}).begin(resume=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    Checkpoints(tmp_path / "own", {}).save(0, {"done": np.array(True)})
+    (tmp_path / "own" / "start_0_notes.npz").write_text("notes")
+    Checkpoints(tmp_path / "own", {}).begin(resume=False)
+    assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
+
+
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_ctrl_c_keeps_the_best_so_far(method):
+    """The signal comes from the first report; what was found by then is returned, and says so."""
+    settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
+    result = search(PAD, None, settings, run=SearchRun(lambda *progress: signal.raise_signal(signal.SIGINT)))
+    assert result.stopped == "interrupted"
+    assert len(result.morphology.knots) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_time_budget_ends_it_with_the_best_so_far():
+    result = search(PAD, None, SMALL.model_copy(update={"steps": 1_000_000}), run=SearchRun(time_budget=0.3))
+    assert result.stopped == "out of time"
+    assert result.violations == []
+    assert result.seconds < 30
+
+
+def test_a_search_out_of_time_before_its_first_step_gives_its_fibres():
+    result = search(PAD, None, SMALL, run=SearchRun(time_budget=1e-6))
+    assert result.stopped == "out of time"
+    assert result.morphology.knots.shape == (2, 5, 2)
+
+
+class Hung(Executor):
+    """Takes work and never does it."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        future.set_running_or_notify_cancel()
+        return future
+
+
+def test_the_deadline_holds_on_an_executor_that_hangs(monkeypatch):
+    monkeypatch.setattr(stopping, "LATEST_S", 0.1)
+    result = search(PAD, None, SMALL, run=SearchRun(time_budget=0.1, executor=Hung()))
+    assert result.stopped == "out of time"
+    assert len(result.morphology.knots) == 2
+
+
+@POSIX
+def test_the_second_ctrl_c_leaves_an_executor_that_hangs_behind():
+    timers = [threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)) for after in (0.2, 0.4)]
+    for timer in timers:
+        timer.start()
+    assert search(PAD, None, SMALL, run=SearchRun(executor=Hung())).stopped == "interrupted"
+
+
+@POSIX
+def test_a_hangup_that_is_ignored_as_under_nohup_ends_nothing(monkeypatch):
+    @click.command()
+    def work():
+        signal.raise_signal(signal.SIGHUP)
+
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGTERM)}
+    monkeypatch.setattr(sys, "argv", ["padforge"])
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        assert run_to_end(work, "padforge", {}) == 0
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        assert run_to_end(work, "padforge", {}) == 130
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+SETTINGS = """
+[pad]
+grid = 2
+[search]
+knots = 3
+starts = 2
+steps = 75
+lost = 1
+[rules]
+enforce = false
+"""
+
+
+def design(folder, *arguments):
+    """The command in a process of its own."""
+    (folder / "pad.toml").write_text(SETTINGS)
+    command = [sys.executable, "-m", "padforge", "design", "--out", "pad", *arguments]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def design_here(folder, monkeypatch, *arguments):
+    """The exit code of the command in this process."""
+    (folder / "pad.toml").write_text(SETTINGS)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["padforge", "design", "--out", "pad", *arguments])
+    return run_to_end(cli, "padforge", {})
+
+
+def wait_for_state(folder, process, later_than=0):
+    """When a state of the search was last kept, waited for until it is later."""
+    while True:
+        times = [path.stat().st_mtime_ns for path in folder.glob("start_*.npz")]
+        if times and max(times) > later_than:
+            return max(times)
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+@POSIX
+def test_a_search_killed_and_then_interrupted_resumes_to_the_same_file(tmp_path, monkeypatch):
+    """A kill leaves states alone, Ctrl-C the best so far as well; what goes on from both ends as if unbroken."""
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    unbroken.mkdir()
+    broken.mkdir()
+    assert design_here(unbroken, monkeypatch) == 0
+    pad, process = broken / "pad", design(broken)
+    killed_at = wait_for_state(pad / "search", process)
+    process.kill()
+    process.communicate(timeout=300)
+    assert not (pad / "morphology.json").exists()
+    process = design(broken, "--resume")
+    wait_for_state(pad / "search", process, killed_at)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 130, err
+    assert "interrupted: the best so far" in out
+    assert json.loads((pad / "design.json").read_text())["stopped"] == "interrupted"
+    assert (pad / "search" / "start_0000.npz").exists()
+    assert design_here(broken, monkeypatch, "--resume") == 0
+    for name in ("morphology.json", "design.svg"):
+        assert (pad / name).read_bytes() == (unbroken / "pad" / name).read_bytes()
+    assert not (pad / "search").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(computing, "SCHEDULER_S", 0.2)
+    assert design_here(tmp_path, monkeypatch, "--scheduler", "tcp://127.0.0.1:9") == 2
+    err = capsys.readouterr().err
+    assert "--scheduler is tcp://127.0.0.1:9: no Dask scheduler answers there" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
+    """Its only one: another is started in its place, and goes on."""
+    distributed = pytest.importorskip("distributed")
+    here = search(PAD, None, SMALL, FREE)
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        victim = next(iter(client.run(os.getpid).values()))
+        slices = []
+
+        def report(*progress):
+            slices.append(progress)
+            if len(slices) == 2:
+                threading.Thread(target=os.kill, args=(victim, signal.SIGKILL)).start()
+
+        executor = cast(Executor, client.get_executor(pure=False, retries=10))
+        there = search(PAD, None, SMALL, FREE, run=SearchRun(report, executor=executor))
+        assert len(slices) > 2
+        with pytest.raises(ProcessLookupError):
+            os.kill(victim, 0)
+    assert there.morphology == here.morphology
+    assert there.history == here.history
