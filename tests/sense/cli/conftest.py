@@ -47,24 +47,24 @@ def made(folder: Path, presses: int) -> Path:
 
 
 @pytest.fixture(scope="session")
-def _few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def few_made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made(tmp_path_factory.mktemp("few"), 60)
 
 
 @pytest.fixture(scope="session")
-def _enough(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def enough_made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made(tmp_path_factory.mktemp("enough"), 360)
 
 
 @pytest.fixture
-def few(padforge_sense: Run, _few: Path) -> Run:
+def few(padforge_sense: Run, few_made: Path) -> Run:
     """As `padforge_sense`, in a folder with `rec` of 60 presses and `model`."""
-    shutil.copytree(_few, Path(), dirs_exist_ok=True)
+    shutil.copytree(few_made, Path(), dirs_exist_ok=True)
     return padforge_sense
 
 
 @pytest.fixture
-def enough(padforge_sense: Run, _enough: Path) -> Run:
+def enough(padforge_sense: Run, enough_made: Path) -> Run:
     """As `few`, with presses enough for health to be learnt."""
-    shutil.copytree(_enough, Path(), dirs_exist_ok=True)
+    shutil.copytree(enough_made, Path(), dirs_exist_ok=True)
     return padforge_sense

@@ -15,11 +15,12 @@ from design.common.errors import InputError
 from sense import Localizer, Recording, locate
 from sense.health.monitor import FibreFault
 from sense.live.pipeline import Estimate, Live
-from sense.live.press_buffer import HISTORY, SLACK, Press, Ring
+from sense.live.press_buffer import HISTORY, SLACK
 from sense.localizer.features import press_inputs
 from sense.localizer.network import OUTPUTS
 from sense.localizer.normalization import Normalization
 from sense.recordings.processing.press_detection import Event
+from tests.sense.live.conftest import first_presses
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -116,7 +117,7 @@ def places(estimates: Sequence[Estimate]) -> np.ndarray:
 def test_live_places_are_those_of_the_whole_recording(
     monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained, features: str, lags: tuple[int, int]
 ) -> None:
-    part = cut(recording, 60)
+    part = first_presses(recording, 60)
     localizer = untrained(part, features)
     _, events = follow(monkeypatch, part, [localizer], lags=lags)
     expected = locate(localizer, part)
@@ -128,17 +129,10 @@ def test_live_places_are_those_of_the_whole_recording(
     np.testing.assert_allclose([each.time_s for each in events], part.times_s[part.begun[: len(events)]])
 
 
-def cut(recording: Recording, presses: int) -> Recording:
-    """Its first presses."""
-    end = int(recording.begun[presses]) - 3
-    edges = recording.begun[:presses], recording.lifted[:presses]
-    return Recording(recording.readings[:end], recording.times_s[:end], recording.presses_mm[:presses], *edges)
-
-
 @pytest.fixture(scope="module")
 def blocks(recording: Recording, untrained) -> Callable[..., list[Any]]:
     """What comes of the first presses when their readings are cut there."""
-    part = cut(recording, 8)
+    part = first_presses(recording, 8)
     localizers = [untrained(part, features) for features in ("full", "early", "causal")]
 
     @cache
@@ -159,7 +153,7 @@ def test_how_readings_are_cut_into_blocks_is_all_the_same(blocks: Callable[..., 
 @given(st.data())
 def test_presses_of_any_length_and_distance(recording: Recording, untrained, data: st.DataObject) -> None:
     """Single ones, such as are held for one reading, and such as follow at once."""
-    part = cut(recording, 12)
+    part = first_presses(recording, 12)
     lengths = data.draw(st.lists(st.integers(1, 45), min_size=14, max_size=14))
     edges = 12 + np.cumsum(lengths)
     edges = edges[edges < len(part.readings) - 30][: len(lengths) // 2 * 2]
@@ -177,7 +171,7 @@ def test_presses_of_any_length_and_distance(recording: Recording, untrained, dat
 def test_the_earliest_answers_first_and_others_refine_it(
     monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained
 ) -> None:
-    part = cut(recording, 6)
+    part = first_presses(recording, 6)
     live, events = follow(monkeypatch, part, [untrained(part, name) for name in ("full", "early", "causal")])
     told = [(each.press, each.features, each.final) for each in events]
     assert told[:6] == [(press, name, name == "full") for press in (0, 1) for name in ("early", "causal", "full")]
@@ -186,7 +180,7 @@ def test_the_earliest_answers_first_and_others_refine_it(
 
 
 def test_a_press_may_be_held_for_hours(monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained) -> None:
-    part = cut(recording, 110)
+    part = first_presses(recording, 110)
     held, extra = 105, 2 * (HISTORY + SLACK) + 1000
     at = int(part.lifted[held]) - 2
     readings = np.insert(part.readings, at, np.repeat(part.readings[at : at + 1], extra, axis=0), axis=0)
@@ -203,30 +197,11 @@ def test_a_press_may_be_held_for_hours(monkeypatch: pytest.MonkeyPatch, recordin
     np.testing.assert_allclose(places(events)[held], locate(localizer, long).places_mm[held], atol=1e-3)
 
 
-def test_the_ring_keeps_the_latest_rows() -> None:
-    ring = Ring(1)
-    capacity = 2 * (HISTORY + SLACK)
-    for index in range(capacity + 10):
-        ring.append(np.array([float(index)]))
-        assert ring.rows(index, index + 1).tolist() == [[index]]
-    assert ring.end == capacity + 10
-    kept = ring.rows(0, ring.end)[:, 0]
-    assert len(kept) >= HISTORY + SLACK
-    assert kept.tolist() == list(range(ring.end - len(kept), ring.end))
-    assert ring.rows(ring.end, ring.end + 5).shape == (0, 1)
-
-
-def test_a_press_that_is_let_go_before_it_began_lasts_a_reading() -> None:
-    press = Press(0, 0.0, 12, 10, 0, np.zeros(1))
-    press.let_go(4)
-    assert press.lifted == 11
-
-
 @pytest.fixture
 def watched(
     monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained
 ) -> tuple[Recording, Live, list[Any], Watching]:
-    part = cut(recording, 12)
+    part = first_presses(recording, 12)
     watching = Watching(None)
     monkeypatch.setattr(sense.live.pipeline, "Monitor", lambda model: watching)
     monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
@@ -259,7 +234,7 @@ def test_health_is_told_the_readings_of_each_press_alone(watched) -> None:
 def test_without_any_fibre_a_press_may_be_anywhere(
     monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained
 ) -> None:
-    part = cut(recording, 3)
+    part = first_presses(recording, 3)
     readings = part.readings.copy()
     readings[int(part.begun[1]) - 12 :] = np.nan
     blind = Recording(readings, part.times_s, part.presses_mm, part.begun, part.lifted)
@@ -272,7 +247,7 @@ def test_without_any_fibre_a_press_may_be_anywhere(
 
 
 def test_the_view_follows_the_pad(monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained) -> None:
-    part = cut(recording, 3)
+    part = first_presses(recording, 3)
     monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
     live = Live([untrained(part, "full")], None, part.fibres, part.rate_hz)
     assert live.view() == {
@@ -292,7 +267,7 @@ def test_the_view_follows_the_pad(monkeypatch: pytest.MonkeyPatch, recording: Re
 
 
 def test_what_does_not_fit_together_is_refused(recording: Recording, untrained) -> None:
-    localizer = untrained(cut(recording, 20), "full")
+    localizer = untrained(first_presses(recording, 20), "full")
     with pytest.raises(InputError, match="readings are of 6 fibres, the localizer was learnt from 4"):
         Live([localizer], None, 6, localizer.rate_hz)
     with pytest.raises(InputError, match=r"there are 20 readings a second, allowed is 13\.\d, .* within 25%"):
