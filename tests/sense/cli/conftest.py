@@ -14,6 +14,7 @@ from design.common.settings import Spec
 from sense.cli.calibration import run_calibration
 from sense.health import fibre_prediction
 from sense.rig.operation import record_simulated
+from tests.helpers.once import Once
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
 
@@ -47,13 +48,13 @@ def made(folder: Path, presses: int) -> Path:
 
 
 @pytest.fixture(scope="session")
-def few_made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("few"), 60)
+def few_made(once: Once) -> Path:
+    return once("few presses and their model", lambda folder: made(folder, 60))
 
 
 @pytest.fixture(scope="session")
-def enough_made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("enough"), 360)
+def enough_made(once: Once) -> Path:
+    return once("enough presses and their model", lambda folder: made(folder, 360))
 
 
 @pytest.fixture

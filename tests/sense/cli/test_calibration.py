@@ -7,7 +7,6 @@ import pytest
 
 import sense.cli.calibration
 import sense.report.calibration_figures
-from sense import Localizer, Recording
 from sense.localizer.calibration import fine_tuning
 
 
@@ -84,18 +83,15 @@ def test_a_torn_recording_is_said_to_be_one(few) -> None:
     assert "last 1 presses are left out" in err
 
 
-def test_errors_of_depth_and_force_are_listed_where_they_were_learnt(
-    padforge_sense, deep_localizer: Localizer, deep_recording: Recording
-) -> None:
+def test_errors_of_depth_and_force_are_listed(padforge_sense, deep_localizer, deep_recording) -> None:
     deep_localizer.save("model")
     deep_recording.save("rec", {})
     words = ("evaluate", "--model", "model", "rec", "--lost", "1")
     lines = padforge_sense(*words)[1].splitlines()
     rows = json.loads(padforge_sense(*words, "--json")[1])["errors"]
     depth = lines.index("error of depth in mm")
-    assert [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]] == [
-        round(row["depth_mean_mm"], 2) for row in rows
-    ]
+    shown = [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]]
+    assert shown == [round(row["depth_mean_mm"], 2) for row in rows]
     assert lines.index("error of force in N") == depth + 4 == len(lines) - 4
 
 

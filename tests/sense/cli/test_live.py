@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -12,9 +13,8 @@ from sense import Localizer, Recording
 from sense.cli.live import view_lines
 from sense.live.page_server import LivePage
 from sense.live.streams import messages
-from sense.rig.devices.protocols import ConverterSamples, RigFault
+from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators import live_pad
-from sense.rig.emulators.live_pad import SimulatedConverter
 from tests.sense.live.conftest import first_presses
 
 
@@ -64,45 +64,29 @@ def test_other_programs_are_told_what_they_ask_for(replay) -> None:
     assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)
 
 
+LOST = RigFault("stale", "the board does not send", "reset it")
+
+
 @pytest.mark.parametrize(
     ("error", "code", "said"),
-    [
-        (KeyboardInterrupt(), 130, "interrupted"),
-        (RigFault("stale", "the board does not send", "reset it"), 1, "padforge: the board does not send; reset it"),
-    ],
+    [(KeyboardInterrupt(), 130, "interrupted"), (LOST, 1, "padforge: the board does not send; reset it")],
 )
-def test_a_rig_is_shown_until_it_ends(
-    padforge_sense,
-    model: Path,
-    views: list[dict],
-    monkeypatch: pytest.MonkeyPatch,
-    error: BaseException,
-    code: int,
-    said: str,
-) -> None:
+def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch, error, code: int, said: str) -> None:
     """As the pad lay when the model was learnt: a holder had said how, so that `[rig]` leaves it open."""
-    told, closed = [], []
-
-    class Ending(SimulatedConverter):
-        def read(self) -> ConverterSamples:
-            raise error
-
-        def close(self) -> None:
-            closed.append(True)
-
+    board, told = Mock(read=Mock(side_effect=error)), Mock()
+    board.connect.return_value = {"channels": 4, "rate_hz": 13.3}
     Localizer.load(model).save("mine")
-    Recording.open(model / "recording").save("mine/recording", {})
-    path = Path("mine/recording/start.json")
-    start = json.loads(path.read_text())
-    start["source"]["rig"]["mirrored"] = True
-    path.write_text(json.dumps(start))
-    monkeypatch.setattr(live_pad, "SimulatedConverter", Ending)
-    monkeypatch.setattr(messages, "Messages", lambda pipeline, mirrored: told.append(mirrored))
+    recording = Recording.open(model / "recording")
+    source = recording.source | {"rig": recording.source["rig"] | {"mirrored": True}}
+    replace(recording, source=source).save("mine/recording", {})
+    monkeypatch.setattr(live_pad, "SimulatedConverter", lambda *pad, **size: board)
+    monkeypatch.setattr(messages, "Messages", told)
     ended, out, err = padforge_sense("live", "--port", "0", "--model", "mine", "--json")
     assert (ended, out) == (code, "")
     assert said in err.splitlines()[-1]
-    assert closed == [True]
-    assert {view["mirrored"] for view in views} == set(told) == {True}
+    board.close.assert_called_once()
+    assert told.call_args[0][1] is True
+    assert {view["mirrored"] for view in views} == {True}
 
 
 def test_a_terminal_shows_fibres_by_their_numbers() -> None:
@@ -114,9 +98,7 @@ def test_a_terminal_shows_fibres_by_their_numbers() -> None:
     assert lines[4] == "fibre 2 was dead"
 
 
-def test_depth_and_force_are_told_where_they_were_learnt(
-    padforge_sense, deep_localizer: Localizer, deep_recording: Recording, views: list[dict]
-) -> None:
+def test_depth_and_force_are_told_where_they_were_learnt(padforge_sense, deep_localizer, deep_recording, views) -> None:
     deep_localizer.save("deep")
     first_presses(deep_recording, 40).save("rec", {})
     words = ("live", "--replay", "rec", "--speed", "1e6", "--port", "0", "--model", "deep")

@@ -25,11 +25,13 @@ import noise.txt --out r                        | noise.txt
 import absent.mat --out r                       | absent.mat
 import absent.csv --out r                       | absent.csv
 import empty                                    | or a rosbag2 folder
+import noise.csv --out pad.toml/r               | pad.toml
 import rec --out r                              | rec: ends in '', allowed are .mat
 import noise.csv --map time=t,fibres=b --out r  | noise.csv: time is 't', expected one of 'a', 'b'
 export rec set --model model                    | allowed are .csv, .h5, .mcap, or --format lerobot
 export rec r.bag --model model                  | allowed are .csv, .h5, .mcap, or --format lerobot
 export rec r.h5 --model model                   | r.h5: what a model says can be written as .mcap or lerobot only
+export rec pad.toml/r.csv                       | pad.toml
 export rec model --format lerobot               | model: exists and is not empty
 calibrate . --out m                             | .: no recording, expected a folder with start.json
 calibrate absent --out m                        | absent: no recording, expected a folder with start.json
@@ -101,12 +103,22 @@ doctor --rig crane                              | arms: got 'crane', allowed are
 {live} --model model --rig ur5 --spec 3.toml    | [rig] channels: got 3 inputs, the pad has 4 fibres
 {live} --model model --speed 0                  | --speed
 {live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines reach
-{live} --model model --osc here                 | --osc is 'here', expected HOST:PORT
+{live} --model model --replay rec --osc here    | --osc is 'here', expected HOST:PORT
+{live} --model model --replay rec --osc :9      | --osc is ':9', expected HOST:PORT
+{live} --model model --replay rec --osc a:0     | --osc is 'a:0', expected HOST:PORT
+{live} --model model --replay rec --osc a:x     | --osc is 'a:x', expected HOST:PORT
+{live} --model model --replay rec --osc a:65536 | --osc is 'a:65536', expected HOST:PORT
+{live} --model model --replay rec --osc a..b:9  | --osc is 'a..b:9': no such host
+{live} --model model --osc 255.255.255.255:9    | nothing can be sent there
+{live} --model model --host 203.0.113.1 {token} | expected an address of this machine
+{live} --model model --host no.invalid {token}  | expected an address of this machine
+{live} --model model --token ééééééééééééééééé  | token has 17 characters, allowed are 16 to 256, those of plain text
 {live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 to 256
 """
 SHORT = {
     "huge": "9" * 20,
     "live": "live --port 0",
+    "token": "--token 'a word of sixteen'",
     **{name: f"--morphology {name}.json" for name in ("straight", "five", "seven")},
     "unread": "--morphology straight.json --spec none.toml",
 }

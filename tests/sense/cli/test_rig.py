@@ -2,9 +2,9 @@
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +15,6 @@ from design.common.settings import commented_toml
 from design.settings import PadSettings
 from sense import Recording
 from sense.rig import operation
-from sense.rig.planning.setup import Setup
 from sense.settings import RigSettings
 from sense.twin.benchmark import printed_pad
 from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
@@ -46,16 +45,9 @@ def test_a_twin_is_recorded_as_it_was_wired_and_another_pad_as_planned(padforge_
     assert Recording.open("other").fibres == 6
 
 
-PRINTER = """
-[pad]
-grid = 2
-[rig]
-rate_hz = 50.0
-readings_per_press = 30
-clearance_mm = 1.0
-depth_mm = 1.0
-travel_mm_s = 400.0
-"""
+PRINTER = (
+    "[pad]\ngrid = 2\n[rig]\nrate_hz = 50\nreadings_per_press = 30\nclearance_mm = 1\ndepth_mm = 1\ntravel_mm_s = 400\n"
+)
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
@@ -69,29 +61,6 @@ def test_a_printer_is_practised_on_through_its_drivers(padforge_sense) -> None:
     assert Recording.open("recording").source["rig"]["tcp_mm"] == [30.0, 0.0, -20.0]
 
 
-@pytest.fixture
-def an_arm(monkeypatch: pytest.MonkeyPatch) -> FakeArm:
-    """Any rig is this arm, whose controller has the tip 150 mm from the flange, and a board; neither acts."""
-    arm = FakeArm(Time())
-
-    @contextmanager
-    def opened(kind: str, setup: Setup, *more: object) -> Iterator[tuple[FakeArm, FakeConverter, RigSettings]]:
-        yield arm, FakeConverter(arm), setup.rig
-
-    class Idle:
-        def __init__(self, *devices: object, **more: object) -> None:
-            pass
-
-        def run(self, *plan: object) -> None:
-            pass
-
-    monkeypatch.setattr(arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
-    monkeypatch.setattr(operation, "opened_rig", opened)
-    monkeypatch.setattr(operation, "Session", Idle)
-    return arm
-
-
-@pytest.mark.usefixtures("an_arm")
 @pytest.mark.parametrize(
     ("tcp_mm", "max_force_n", "code", "said"),
     [
@@ -101,17 +70,23 @@ def an_arm(monkeypatch: pytest.MonkeyPatch) -> FakeArm:
         ((0.0, 0.05, 150.0), None, 0, "no force stops the arm"),
     ],
 )
-def test_nothing_moves_before_the_tool_is_known_and_nobody_is_left_unwarned(
-    padforge_sense, tcp_mm: object, max_force_n: object, code: int, said: str
+def test_nothing_moves_before_the_tool_is_known(
+    padforge_sense, monkeypatch: pytest.MonkeyPatch, tcp_mm: object, max_force_n: object, code: int, said: str
 ) -> None:
-    """Of a dry run; an arm whose force nobody watches is told."""
+    """The controller has the tip 150 mm from the flange; an arm whose force nobody watches is told."""
+    arm, session = FakeArm(Time()), Mock()
+    monkeypatch.setattr(arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
+    monkeypatch.setattr(
+        operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeConverter(arm), setup.rig))
+    )
+    monkeypatch.setattr(operation, "Session", session)
     rig = RIG.model_copy(update={"tcp_mm": tcp_mm, "max_force_n": max_force_n})
     tables = {"pad": PadSettings(grid=PAD.grid), "rig": rig}
     Path("rig.toml").write_text(commented_toml({"pad": PadSettings, "rig": RigSettings}, tables))
     PAD.save("pad.json")
     words = ("record", "--rig", "ur5", "--dry-run", "--spec", "rig.toml", "--morphology", "pad.json")
     ended, _, err = padforge_sense(*words)
-    assert (ended, err.count("\n")) == (code, bool(said))
+    assert (ended, err.count("\n"), session.called) == (code, bool(said), code == 0)
     assert said in err
     assert not Path("out").exists()
 

@@ -148,6 +148,8 @@ def test_the_client_of_the_docs_prints_places(tmp_path: Path) -> None:
 
 
 def test_without_the_token_nothing_is_heard() -> None:
+    with pytest.raises(InputError, match="whoever knows a token may listen"):
+        Lines("0.0.0.0", 0)
     with Lines("127.0.0.1", 0, TOKEN) as lines:
         lines.tell(STATES)
         for said in (b"\n", TOKEN[:-1].encode() + b"\n", TOKEN.encode() + b"x\n", b"\xff" * 4000):
@@ -213,21 +215,6 @@ def test_a_stranger_has_a_moment_to_say_the_token_however_slowly(monkeypatch: py
         assert [json.loads(told.readline())["topic"] for _ in range(2)] == [HEALTH, TOUCHES]
 
 
-@pytest.mark.parametrize(
-    ("host", "token", "said"),
-    [
-        ("0.0.0.0", "", "whoever knows a token may listen"),
-        ("127.0.0.1", "short", "token has 5 characters, allowed are 16 to 256"),
-        ("127.0.0.1", "é" * 20, "those of plain text"),
-        ("203.0.113.1", TOKEN, "expected an address of this machine"),
-        ("no.such.host.invalid", TOKEN, "expected an address of this machine"),
-    ],
-)
-def test_others_may_listen_only_with_a_token(host: str, token: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        Lines(host, 0, token)
-
-
 def test_osc_tells_numbers() -> None:
     from pythonosc.osc_message import OscMessage
 
@@ -245,34 +232,17 @@ def test_osc_tells_numbers() -> None:
 
 def test_osc_goes_on_while_its_network_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
     """And looks no name up again, which may take long then."""
+    from pythonosc.udp_client import UDPClient
+
+    def away(client: UDPClient, content: object) -> None:
+        sent_to.append(client._address)  # pyright: ignore[reportPrivateUsage]
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    sent_to: list[str] = []
+    monkeypatch.setattr(UDPClient, "send", away)
     with Osc("localhost:9") as osc:
-        looked_up, gone = [], OSError(errno.ENETUNREACH, "Network is unreachable")
-        monkeypatch.setattr(socket, "getaddrinfo", lambda *asked, **more: looked_up.append(asked))
-
-        class Away:
-            def sendto(self, data: bytes, address: tuple[str, int]) -> None:
-                looked_up.extend([address] if address[0] == "localhost" else [])
-                raise gone
-
-            def close(self) -> None: ...
-
-        osc._client._sock.close()  # pyright: ignore[reportPrivateUsage]
-        osc._client._sock = Away()  # pyright: ignore[reportPrivateUsage, reportAttributeAccessIssue]
         osc.tell(TOUCH)
-    assert looked_up == []
-
-
-@pytest.mark.parametrize(
-    ("address", "said"),
-    [
-        *((each, "expected HOST:PORT") for each in ("", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x", ":9", "a:99999")),
-        ("255.255.255.255:9", "nothing can be sent there"),
-        ("a..b:9", "no such host"),
-    ],
-)
-def test_an_address_of_osc_is_a_host_and_a_port_that_can_be_sent_to(address: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        Osc(address)
+    assert sent_to[0] in ("127.0.0.1", "::1")
 
 
 def test_lsl_tells_readings_and_touches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """Where a person is asked to press, how that is shown, and what of it a run directory keeps."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -26,12 +25,11 @@ VIEW = {
     "told": "counted: x 0, y 0 mm",
     "phase": "press",
     "progress": 0.5,
-    "target": (16.875, 16.875),
-    "refused": None,
-    "presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}],
     "done": 2,
     "of": 7,
 }
+VIEW |= {"target": (16.875, 16.875), "refused": None}
+VIEW |= {"presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}]}
 
 
 def setup_of(**settings: object) -> Setup:
@@ -79,7 +77,8 @@ def test_whole_millimetres_do_not_lie_in_a_hole() -> None:
 
 def test_the_pad_is_shown_as_it_is_planned() -> None:
     pad = Morphology.random(2, knots=3, seed=1)
-    view = json.loads(json.dumps(pad_view(pad, "out/hand")))
+    view = json.loads(json.dumps(pad_view(pad, "hand")))
+    assert pad_view(pad, "hand", mirrored=True)["courses"] == pad_view(pad, "hand")["courses"]
     assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
     assert len(view["courses"]) == 4
     ends = np.array([[course[0], course[-1]] for course in view["courses"]])
@@ -98,11 +97,10 @@ def test_a_terminal_shows_the_place_where_it_is() -> None:
     assert rows[ROWS // 2][1 + COLUMNS // 2] == "."
     assert "2 of 7 presses" in lines[-2]
     assert "q: end" in lines[-1]
-    # With its tracks up what is to the right on the plan is to the left of whoever looks; places stay those of the plan.
+    # With its tracks up, what is to the right on the plan is to the left of whoever looks; places stay as planned.
     lying = view_lines(pad_view(pad, "hand", mirrored=True) | VIEW)
     assert [row[::-1] for row in lying[3 : 3 + ROWS]] == rows
     assert lying[0] == lines[0]
-    assert pad_view(pad, "hand", True)["courses"] == pad_view(pad, "hand")["courses"]
 
 
 def test_a_map_of_a_rectangle_is_as_wide_and_high_as_the_pad() -> None:
@@ -142,22 +140,15 @@ def test_what_is_missing_is_asked_for_of_the_plan_that_was_kept(begun: Setup) ->
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda source: source.update(kind="rig"), "holds a recording of kind 'rig', not 'hand'"),
-        (lambda source: source.update(morphology={}), "was begun with another pad"),
-        (lambda source: source.update(plan=None), "has no plan"),
-        (lambda source: source.update(plan={"presses": [[1, 2, 3]]}), "its plan has shape"),
-        (lambda source: source.update(plan={"presses": [["a", 1]]}), "places of the plan"),
-        (
-            lambda source: source["rig"].update(rate_hz=20.0),
-            r"\[rig\] rate_hz: got 13.3, the recording in .* with 20.0",
-        ),
+        ({"kind": "rig"}, "holds a recording of kind 'rig', not 'hand'"),
+        ({"plan": {"presses": [[1, 2, 3]]}}, "its plan has shape"),
+        ({"plan": {"presses": [["a", 1]]}}, "places of the plan"),
     ],
 )
-def test_another_recording_is_not_gone_on_with(begun: Setup, change: Callable[[dict], None], said: str) -> None:
+def test_another_recording_is_not_gone_on_with(begun: Setup, change: dict, said: str) -> None:
     path = begun.out / "start.json"
     document = json.loads(path.read_text())
-    change(document["source"])
-    path.write_text(json.dumps(document))
+    path.write_text(json.dumps(document | {"source": document["source"] | change}))
     with pytest.raises(InputError, match=said):
         opened(begun, BOARD, resume=True)
 

@@ -116,6 +116,12 @@ def known(recording: Recording) -> np.ndarray:
     return recording.presses_mm[recording.known]
 
 
+def off_from(recording: Recording, strokes: np.ndarray) -> list[float]:
+    """How far off their places, mm, the strokes of those presses went that count."""
+    made = zip(strokes[recording.known], known(recording), strict=True)
+    return [float(np.linalg.norm(stroke.place_mm - place)) for stroke, place in made]
+
+
 @pytest.fixture(scope="module")
 def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
     """A recording in which one press of five goes wrong."""
@@ -126,18 +132,15 @@ def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
 def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
     np.testing.assert_array_equal(known(recording), hand.targets)
-    strokes = hand.strokes_of(recording)
-    refused = Counter(stroke.kind for stroke, counts in zip(strokes, recording.known, strict=True) if not counts)
-    counted = Counter(stroke.kind for stroke, counts in zip(strokes, recording.known, strict=True) if counts)
+    strokes = np.array(hand.strokes_of(recording))
+    refused, counted = (
+        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.known, recording.known)
+    )
     assert refused["short"] >= 2
     assert refused["echo"] >= 2
     assert refused["press"] <= 1
     assert counted["short"] + counted["echo"] + counted["light"] == 0
-    off_mm = [
-        np.linalg.norm(stroke.place_mm - place)
-        for stroke, place, counts in zip(strokes, recording.presses_mm, recording.known, strict=True)
-        if counts
-    ]
+    off_mm = off_from(recording, strokes)
     assert max(off_mm) < 4 * SCATTER_MM
     assert np.sqrt(np.mean(np.square(off_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
     held_s = (recording.lifted - recording.begun)[recording.known] / RIG.rate_hz
@@ -181,8 +184,7 @@ def test_a_finder_that_lost_its_way_is_not_believed(hands, monkeypatch: pytest.M
     np.testing.assert_array_equal(known(recording), hand.targets)
     assert not Turned.once
     assert 1 <= (~recording.known).sum() <= 3
-    for stroke, place, counts in zip(hand.strokes_of(recording), recording.presses_mm, recording.known, strict=True):
-        assert not counts or np.linalg.norm(stroke.place_mm - place) < 4 * SCATTER_MM
+    assert max(off_from(recording, np.array(hand.strokes_of(recording)))) < 4 * SCATTER_MM
 
 
 def test_what_is_said_is_done(hands) -> None:
@@ -211,26 +213,21 @@ def test_an_end_that_is_asked_for_keeps_what_counts_and_nothing_is_written_over(
         hand.record()
 
 
-@pytest.mark.parametrize("phase", ["hold", "wait"])
-def test_a_recording_that_broke_off_is_gone_on_with(hands, phase: str) -> None:
+@pytest.mark.parametrize(("phase", "killed"), [("hold", False), ("wait", False), ("hold", True)])
+def test_a_recording_that_broke_off_is_gone_on_with(hands, monkeypatch, phase: str, killed: bool) -> None:
+    """A press that was under way is none; after a kill nothing tells the journal of it."""
     hand = hands(presses=6)
-    hand.broken_off(3, phase)
+    with monkeypatch.context() as patched:
+        if killed:
+            patched.setattr(session.Recorder, "abort", lambda self, reason: None)
+        hand.broken_off(3, phase)
+    assert len(read_journal(hand.out / "journal.ndjson")) == 3
     before = Recording.open(hand.out)
     np.testing.assert_array_equal(before.presses_mm, hand.targets[:3])
     recording = hand.record(resume=True)
     np.testing.assert_array_equal(known(recording), hand.targets)
     np.testing.assert_array_equal(recording.readings[: len(before.readings)], before.readings)
     assert hand.views[-1]["done"] == 6
-
-
-def test_a_press_that_was_under_way_at_a_kill_is_none(hands, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is told to the journal any more: as after a kill."""
-    hand = hands(presses=4)
-    with monkeypatch.context() as killed:
-        killed.setattr(session.Recorder, "abort", lambda self, reason: None)
-        hand.broken_off(2, "hold")
-    assert len(read_journal(hand.out / "journal.ndjson")) == 2
-    np.testing.assert_array_equal(known(hand.record(resume=True)), hand.targets)
 
 
 def test_a_full_disk_is_told(hands, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,16 +103,12 @@ def test_answers_are_those_of_a_press_alone() -> None:
     assert np.isfinite(answers(readings(PRESS, PRESS)[9:13], 1, 2)).all()  # the shortest there is
 
 
-def test_a_weak_press_and_one_that_moved_do_not_count(judge: Judge) -> None:
-    assert judge.fault_of(answers(readings(PRESS, 1.3 * PRESS), 10, 30)) == ""
-    assert judge.fault_of(np.array([0.3 * PRESS, 0.3 * PRESS])) == ""
-    assert "weaker" in judge.fault_of(np.array([0.1 * PRESS, 0.1 * PRESS]))
+def test_a_weak_press_one_that_moved_and_what_is_no_touch_do_not_count(judge: Judge) -> None:
+    weak, pressed = np.array([0.1 * PRESS, 0.1 * PRESS]), REST + PRESS
+    assert judge.fault_of(answers(readings(PRESS, 1.3 * PRESS), 10, 30)) == judge.fault_of(3 * weak) == ""
+    assert "weaker" in judge.fault_of(weak)
     assert "changed" in judge.fault_of(answers(readings(PRESS, PRESS[::-1]), 10, 30))
-    assert Judge().fault_of(np.array([0.1 * PRESS, 0.1 * PRESS])) == ""  # nobody knows yet what is weak
-
-
-def test_what_is_no_touch_is_told(judge: Judge) -> None:
-    pressed = REST + PRESS
+    assert Judge().fault_of(weak) == ""  # nobody knows yet what is weak
     assert not judge.untouched(pressed, REST, held_s=5.0)
     assert judge.untouched(REST + 0.1 * PRESS, REST, held_s=2.0)
     assert not judge.untouched(REST + 0.1 * PRESS, REST, held_s=0.5)  # it may still be sinking in

@@ -89,7 +89,7 @@ def program_of(student: Student, folder: Path, *flags: str, budget: Budget = BUD
         mask = "".join("0" if fibre in lost else "1" for fibre in range(student.localizer.fibres))
         lines = subprocess.run([path, mask], input=rows, capture_output=True, check=True).stdout.split(b"\n")
         state, tables = map(int, lines[0].split())
-        events = np.array([line.split() for line in lines[1:-1]], float).reshape(len(lines) - 2, -1)
+        events = np.array([line.split() for line in lines[1:-1]], float)
         return Told(state, tables, events if len(events) else np.empty((0, 7)))
 
     return run

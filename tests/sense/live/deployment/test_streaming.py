@@ -15,9 +15,7 @@ def nothing() -> Detector:
     return Detector(np.full(4, np.inf), np.inf, 0)
 
 
-def test_presses_are_seen_as_they_were_commanded_with_the_windows_of_the_features(
-    recording: Recording, nothing: Detector
-) -> None:
+def test_presses_are_seen_as_commanded_with_the_windows_of_the_features(recording, nothing) -> None:
     found = seen(recording.readings, nothing, held(recording))
     assert np.array_equal(found.begun, recording.begun)
     assert np.array_equal(found.ended, recording.lifted)
