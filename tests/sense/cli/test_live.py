@@ -77,7 +77,7 @@ def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch,
     board.connect.return_value = {"channels": 4, "rate_hz": 13.3}
     Localizer.load(model).save("mine")
     recording = Recording.open(model / "recording")
-    source = recording.source | {"rig": recording.source["rig"] | {"mirrored": True}}
+    source = {**recording.source, "rig": {**recording.source["rig"], "mirrored": True}}
     replace(recording, source=source).save("mine/recording", {})
     monkeypatch.setattr(live_pad, "SimulatedConverter", lambda *pad, **size: board)
     monkeypatch.setattr(messages, "Messages", told)

@@ -55,7 +55,7 @@ calibrate rec --seed 5 --out studied            | localizer.json: fibre_loss.jso
 calibrate rec --features early --out studied    | localizer.json: fibre_loss.json was made from it; choose another
 recalibrate --model model rec --out studied     | localizer.json: fibre_loss.json was made from it; choose another
 identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
-recalibrate --model ./model model/recording     | padforge: model: holds the old model; name a folder for the new one
+recalibrate --model empty/../model model/recording | padforge: model: holds the old model; name a folder
 deploy --model model localizer.tflite           | localizer.tflite: cannot be written, expected a name that ends in
 deploy --model model rec none/l.h               | none/l.h: cannot be written, there is no folder none
 deploy --model model l.h                        | l.h: a .h learns from a recording, which is not given

@@ -40,8 +40,11 @@ def test_a_twin_is_recorded_as_it_was_wired_and_another_pad_as_planned(padforge_
     assert own.source["contact"] == twin.contact().model_dump(mode="json")
     made_by = json.loads(Path("own/start.json").read_text())["provenance"]
     assert made_by["inputs"]["twin.json"] == sha256(Path("twin.json"))
-    Morphology.straight(3).save("other.json")
-    assert padforge_sense("record", "--twin", "twin.json", "--morphology", "other.json", "--out", "other")[0] == 0
+    for name, pad in (("planned", twin.morphology), ("other", Morphology.straight(3))):
+        pad.save(f"{name}.json")
+        words = ("record", "--twin", "twin.json", "--morphology", f"{name}.json", "--presses", "4", "--out", name)
+        assert padforge_sense(*words)[0] == 0
+    assert not np.array_equal(Recording.open("planned").readings, own.readings)
     assert Recording.open("other").fibres == 6
 
 

@@ -204,7 +204,9 @@ HAND |= {"said": "press x 1, y -2 mm", "told": HOSTILE, "phase": "press", "progr
 HAND |= {"target": [1.0, -2.0], "refused": None}
 
 
-def test_a_browser_shows_where_to_press_and_says_what_is_said(asking: LivePage, browser: Chromium) -> None:
+def test_a_browser_shows_where_to_press_on_the_pad_as_it_lies_and_says_what_is_said(
+    asking: LivePage, browser: Chromium
+) -> None:
     asking.show(HAND)
     browser.open(asking.url)
     browser.wait_for("document.getElementById('said').textContent == 'press x 1, y -2 mm'")
@@ -219,22 +221,20 @@ def test_a_browser_shows_where_to_press_and_says_what_is_said(asking: LivePage, 
         heard += asking.said()
         time.sleep(0.02)
     assert heard == ["skip", "skip"]
+    for mirrored in (False, True):
+        asking.show(HAND | {"target": [11.0, -2.0], "mirrored": mirrored})
+        browser.open(asking.url)
+        browser.wait_for("document.querySelector('.press .ring') != null")
+        ring, edge = box_of(browser, ".press .ring"), box_of(browser, "#pad .edge")
+        assert (ring[0] - edge[0]) / edge[2] == pytest.approx(-0.25 if mirrored else 0.25)
+        assert ring[1] == pytest.approx(edge[1])
+        ticks = "[...document.querySelectorAll('#pad text[y=\"466\"][text-anchor=middle]')]"
+        names, places = (browser.ask(f"{ticks}.map(t => +{what})") for what in ("t.textContent", "t.getAttribute('x')"))
+        assert names == sorted(names)
+        assert places == sorted(places, reverse=mirrored)
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_a_browser_shows_the_pad_as_it_lies(asking: LivePage, browser: Chromium, mirrored: bool) -> None:
-    asking.show(HAND | {"target": [11.0, -2.0], "mirrored": mirrored})
-    browser.open(asking.url)
-    browser.wait_for("document.querySelector('.press .ring') != null")
-    ring, edge = box_of(browser, ".press .ring"), box_of(browser, "#pad .edge")
-    assert (ring[0] - edge[0]) / edge[2] == pytest.approx(-0.25 if mirrored else 0.25)
-    assert ring[1] == pytest.approx(edge[1])
-    ticks = "[...document.querySelectorAll('#pad text[y=\"466\"][text-anchor=middle]')]"
-    names, places = (browser.ask(f"{ticks}.map(t => +{what})") for what in ("t.textContent", "t.getAttribute('x')"))
-    assert names == sorted(names)
-    assert places == sorted(places, reverse=mirrored)
-
-
+@pytest.mark.slow
 def test_a_browser_comes_back_to_a_page_that_was_away(browser: Chromium) -> None:
     with LivePage(0) as page:
         port = port_of(page)

@@ -1,6 +1,7 @@
 """The pipeline from readings as they come to places: it has to give what the same readings give all at once."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,7 +15,7 @@ from design.common.errors import InputError
 from sense import Localizer, Recording, calibrate, locate
 from sense.health.monitor import FibreFault
 from sense.live.pipeline import Estimate, Live
-from sense.live.press_buffer import HISTORY, SLACK
+from sense.live.press_buffer import HISTORY, SLACK, Press
 from sense.recordings.processing.press_detection import Event
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
@@ -136,7 +137,8 @@ def test_the_earliest_answers_first_and_others_refine_it(recording, learnt) -> N
 
 def test_a_press_may_be_held_for_hours(recording, learnt) -> None:
     part = first_presses(recording, 110)
-    held, extra = 105, 2 * (HISTORY + SLACK) + 1000
+    held = 105
+    extra = 3 * (HISTORY + SLACK) - int(part.begun[107]) - 5  # old readings are given up for the second time in a press
     at = int(part.lifted[held]) - 2
     readings = np.insert(part.readings, at, np.repeat(part.readings[at : at + 1], extra, axis=0), axis=0)
     later = np.arange(110) > held
@@ -148,6 +150,9 @@ def test_a_press_may_be_held_for_hours(recording, learnt) -> None:
 
 def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt, monkeypatch) -> None:
     part, localizer, watching = first_presses(recording, 12), learnt("full"), Watching(None)
+    begun, lifted = part.begun.copy(), part.lifted.copy()
+    begun[8], lifted[8] = lifted[7] + 4, lifted[7] + 20  # soon after the one before
+    part = replace(part, begun=begun, lifted=lifted)
     monkeypatch.setattr(sense.live.pipeline, "Monitor", lambda model: watching)
     monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
     live = Live([localizer], localizer, part.fibres, part.rate_hz)  # as alike as it looks at
@@ -162,9 +167,15 @@ def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt,
     assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "silent", "sound", "sound"]
     assert view["findings"] == [live.findings[0].text]
     for press, (readings, begun, lifted) in enumerate(watching.told):  # of each press alone
-        first, last = part.begun[press] - 10, part.lifted[press] + 20
-        assert (begun, lifted) == (10, 10 + part.lifted[press] - part.begun[press])
+        first, last = part.begun[press] - (4 if press == 8 else 10), part.lifted[press] + (4 if press == 7 else 20)
+        assert (first + begun, first + lifted) == (part.begun[press], part.lifted[press])
         np.testing.assert_array_equal(readings, part.readings[first:last])
+
+
+def test_a_press_that_is_let_go_before_it_began_lasts_a_reading() -> None:
+    press = Press(0, 0.0, 12, 10, 0, np.zeros(1))
+    press.let_go(4)
+    assert press.lifted == 11
 
 
 def test_without_any_fibre_a_press_may_be_anywhere(recording, learnt) -> None:

@@ -128,6 +128,6 @@ def test_the_simulated_pad_is_that_of_the_model(brief: Recording, tmp_path: Path
     source = simulate(Morphology.straight(2), RigSettings(presses=1)).source
     path.write_text(json.dumps({"format": FORMAT, "source": source}))
     assert simulated(tmp_path).connect()["channels"] == 4
-    path.write_text(json.dumps({"format": FORMAT, "source": source | change}))
+    path.write_text(json.dumps({"format": FORMAT, "source": {**source, **change}}))
     with pytest.raises(InputError, match=said):
         simulated(tmp_path)

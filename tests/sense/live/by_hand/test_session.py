@@ -151,7 +151,7 @@ def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hand
 
 def test_presses_by_hand_are_learnt_from(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
-    _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 20}))
+    _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     spread_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert document["errors"][0]["mean_mm"] < 0.55 * spread_mm
 

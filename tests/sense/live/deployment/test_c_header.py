@@ -105,7 +105,7 @@ def test_whatever_the_readings_it_does_as_its_twin(taught, program) -> None:
     """Steps, spikes, gaps and values that are no voltage, one or a hundred, by its own judgement and by another's."""
 
     @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 0.1, 10.0]), st.booleans())
-    @settings(max_examples=25)
+    @settings(max_examples=15)
     def check(seed: int, step: float, by_others: bool) -> None:
         rng = np.random.default_rng(seed)
         levels = np.cumsum(step * rng.standard_normal((400, 4)) * (rng.random((400, 1)) < 0.1), axis=0)

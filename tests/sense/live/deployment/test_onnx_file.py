@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -44,7 +45,7 @@ def presses_of(recording: Recording, alive: np.ndarray) -> dict[str, np.ndarray]
     return {"readings": bridged(recording.readings), **edges, "alive": alive}
 
 
-def require_places(places_mm: object, found: Found) -> None:
+def require_places(places_mm: Any, found: Found) -> None:
     assert np.shape(places_mm) == found.places_mm.shape
     assert np.hypot(*(np.asarray(places_mm) - found.places_mm).T).max() < MOST_OFF_MM
 
@@ -101,11 +102,8 @@ def test_the_file_says_what_it_is(exported: tuple[Path, Exported]) -> None:
     assert onnx_line(exported[1]).startswith("1.9 MB, tried on 300 presses with up to 3 fibres lost: places within ")
 
 
-def test_what_is_off_or_does_not_suit_is_not_written(localizer, recording, tmp_path, monkeypatch) -> None:
+def test_what_is_off_or_does_not_suit_is_not_written(localizer, tmp_path, monkeypatch) -> None:
     path = tmp_path / "l.onnx"
-    edges = (getattr(recording, name) for name in ("times_s", "presses_mm", "begun", "lifted"))
-    with pytest.raises(InputError, match="3 fibres, the localizer was learnt from 4"):
-        export_onnx(localizer, DIGEST, path, Recording(recording.readings[:, :3], *edges))
     with pytest.raises(InputError, match="method published, expected masked"):
         export_onnx(replace(localizer, method="published"), DIGEST, path)
     monkeypatch.setattr(onnx_file, "MOST_OFF_MM", 1e-9)

@@ -84,5 +84,5 @@ def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
 
 def test_the_first_of_several_in_a_press_is_it(recording: Recording) -> None:
     first = recording.begun[0]
-    begun = np.array([first - 5, first - 1, first + 3, recording.lifted[0] + 2, recording.begun[1]])
-    assert owners(recording, begun).tolist() == [-1, 0, -1, -1, 1]
+    begun = [first - 5, first - 1, first + 3, recording.lifted[0] + 2, recording.begun[1], recording.lifted[2]]
+    assert owners(recording, np.array(begun)).tolist() == [-1, 0, -1, -1, 1, -3]
