@@ -149,6 +149,7 @@ def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hand
     assert hand.views[-1]["done"] == hand.views[-1]["of"] == 60
 
 
+@pytest.mark.slow
 def test_presses_by_hand_are_learnt_from(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
     _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
