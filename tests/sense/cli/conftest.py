@@ -14,6 +14,7 @@ from design.common.settings import Spec
 from sense.cli.calibration import run_calibration
 from sense.health import fibre_prediction
 from sense.rig.operation import record_simulated
+from tests.helpers.once import Once
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
 
@@ -47,24 +48,24 @@ def made(folder: Path, presses: int) -> Path:
 
 
 @pytest.fixture(scope="session")
-def _few(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("few"), 60)
+def few_made(once: Once) -> Path:
+    return once("few presses and their model", lambda folder: made(folder, 60))
 
 
 @pytest.fixture(scope="session")
-def _enough(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(tmp_path_factory.mktemp("enough"), 360)
+def enough_made(once: Once) -> Path:
+    return once("enough presses and their model", lambda folder: made(folder, 360))
 
 
 @pytest.fixture
-def few(padforge_sense: Run, _few: Path) -> Run:
+def few(padforge_sense: Run, few_made: Path) -> Run:
     """As `padforge_sense`, in a folder with `rec` of 60 presses and `model`."""
-    shutil.copytree(_few, Path(), dirs_exist_ok=True)
+    shutil.copytree(few_made, Path(), dirs_exist_ok=True)
     return padforge_sense
 
 
 @pytest.fixture
-def enough(padforge_sense: Run, _enough: Path) -> Run:
+def enough(padforge_sense: Run, enough_made: Path) -> Run:
     """As `few`, with presses enough for health to be learnt."""
-    shutil.copytree(_enough, Path(), dirs_exist_ok=True)
+    shutil.copytree(enough_made, Path(), dirs_exist_ok=True)
     return padforge_sense

@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 
 import sense.live.pipeline
 from design.common.errors import InputError
-from sense import Localizer, Recording, locate
+from sense import Localizer, Recording, calibrate, locate
 from sense.health.monitor import FibreFault
 from sense.live.pipeline import Estimate, Live
-from sense.live.press_buffer import HISTORY, SLACK, Press, Ring
-from sense.localizer.features import press_inputs
-from sense.localizer.network import OUTPUTS
-from sense.localizer.normalization import Normalization
+from sense.live.press_buffer import HISTORY, SLACK, Press
 from sense.recordings.processing.press_detection import Event
+from tests.sense.conftest import QUICK
+from tests.sense.live.conftest import first_presses
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -66,41 +65,23 @@ class Watching:
 
 
 @pytest.fixture(scope="module")
-def untrained(recording: Recording, localizer: Localizer) -> Callable[..., Localizer]:
-    """Makes localizers whose places mean nothing but depend on everything."""
+def learnt(brief: Recording) -> Callable[[str], Localizer]:
+    """Localizers that have learnt next to nothing, so that their places depend on every reading they look at."""
 
     @cache
-    def scaled(features: str) -> tuple[Normalization, np.ndarray]:
-        raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-        return Normalization.fit(raw, recording.presses_mm)
+    def learn(features: str) -> Localizer:
+        options = {"features": features, "members": 1, "hidden": 16, "epochs": 1}
+        return calibrate(brief, QUICK.model_copy(update=options))[0]
 
-    def make(part: Recording, features: str = "full") -> Localizer:
-        scaling, table = scaled(features)
-        method = "published" if features == "published" else "masked"
-        hidden, outputs = 16, 2 if method == "published" else OUTPUTS
-        shapes = {"first.w": (1, scaling.entries(method), hidden), "first.b": (1, 1, hidden)}
-        shapes |= {"last.w": (1, hidden, outputs), "last.b": (1, 1, outputs)}
-        if method == "masked":
-            shapes |= {"hidden.w": (1, 1, hidden, hidden), "hidden.b": (1, 1, 1, hidden)}
-        rng = np.random.default_rng(3)
-        weights = {name: 0.3 * rng.standard_normal(shape).astype(np.float32) for name, shape in shapes.items()}
-        made = {"weights": weights, "normalization": scaling, "table": table, "method": method, "features": features}
-        made |= {"observer": None, "corrector": {}}
-        return replace(localizer, **made, factors=np.ones((1, 3)), rate_hz=part.rate_hz)
-
-    return make
+    return learn
 
 
 def follow(
-    monkeypatch: pytest.MonkeyPatch,
-    recording: Recording,
-    localizers: Sequence[Localizer],
-    *,
-    lags: tuple[int, int] = (2, 1),
-    cuts: Sequence[int] = (),
+    recording: Recording, localizers: Sequence[Localizer], lags: tuple[int, int] = (2, 1), cuts: Sequence[int] = ()
 ) -> tuple[Live, list[Any]]:
-    monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(recording, lags))
-    live = Live(localizers, None, recording.fibres, recording.rate_hz)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(recording, lags))
+        live = Live(localizers, None, recording.fibres, recording.rate_hz)
     events = []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
         events += live.feed(times_s, readings)
@@ -113,12 +94,9 @@ def places(estimates: Sequence[Estimate]) -> np.ndarray:
 
 @pytest.mark.parametrize("features", ["full", "causal", "early", "published"])
 @pytest.mark.parametrize("lags", [(0, 0), (2, 1), (6, 3)])
-def test_live_places_are_those_of_the_whole_recording(
-    monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained, features: str, lags: tuple[int, int]
-) -> None:
-    part = cut(recording, 60)
-    localizer = untrained(part, features)
-    _, events = follow(monkeypatch, part, [localizer], lags=lags)
+def test_live_places_are_those_of_the_whole_recording(recording, learnt, features: str, lags: tuple[int, int]) -> None:
+    part, localizer = first_presses(recording, 60), learnt(features)
+    _, events = follow(part, [localizer], lags)
     expected = locate(localizer, part)
     assert [each.press for each in events] == list(range(len(events)))
     # The last press is not over while no reading is there that says so.
@@ -128,92 +106,70 @@ def test_live_places_are_those_of_the_whole_recording(
     np.testing.assert_allclose([each.time_s for each in events], part.times_s[part.begun[: len(events)]])
 
 
-def cut(recording: Recording, presses: int) -> Recording:
-    """Its first presses."""
-    end = int(recording.begun[presses]) - 3
-    edges = recording.begun[:presses], recording.lifted[:presses]
-    return Recording(recording.readings[:end], recording.times_s[:end], recording.presses_mm[:presses], *edges)
-
-
-@pytest.fixture(scope="module")
-def blocks(recording: Recording, untrained) -> Callable[..., list[Any]]:
-    """What comes of the first presses when their readings are cut there."""
-    part = cut(recording, 8)
-    localizers = [untrained(part, features) for features in ("full", "early", "causal")]
-
-    @cache
-    def events(*cuts: int) -> list[Any]:
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            return follow(monkeypatch, part, localizers, cuts=cuts)[1]
-
-    return events
-
-
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.lists(st.integers(0, 8 * 40), max_size=6))
-def test_how_readings_are_cut_into_blocks_is_all_the_same(blocks: Callable[..., list[Any]], cuts: list[int]) -> None:
-    assert blocks(*sorted(cuts)) == blocks()
+def test_how_readings_are_cut_into_blocks_is_all_the_same(recording, learnt, cuts: list[int]) -> None:
+    part, localizers = first_presses(recording, 8), [learnt(name) for name in ("full", "early")]
+    assert follow(part, localizers, cuts=sorted(cuts))[1] == follow(part, localizers)[1]
 
 
 @settings(max_examples=30)
-@given(st.data())
-def test_presses_of_any_length_and_distance(recording: Recording, untrained, data: st.DataObject) -> None:
+@given(st.lists(st.integers(1, 45), min_size=14, max_size=14))
+def test_presses_of_any_length_and_distance(recording, learnt, lengths: list[int]) -> None:
     """Single ones, such as are held for one reading, and such as follow at once."""
-    part = cut(recording, 12)
-    lengths = data.draw(st.lists(st.integers(1, 45), min_size=14, max_size=14))
+    part = first_presses(recording, 12)
     edges = 12 + np.cumsum(lengths)
-    edges = edges[edges < len(part.readings) - 30][: len(lengths) // 2 * 2]
+    edges = edges[edges < len(part.readings) - 30]
     edges = edges[: len(edges) // 2 * 2]
-    if len(edges) == 0:
-        return
     begun, lifted = edges[::2], edges[1::2]
     odd = Recording(part.readings, part.times_s, part.presses_mm[: len(begun)], begun, lifted)
-    localizer = untrained(part, "full")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        _, events = follow(monkeypatch, odd, [localizer], lags=(0, 0))
-    np.testing.assert_allclose(places(events), locate(localizer, odd).places_mm, atol=1e-3)
+    _, events = follow(odd, [learnt("full")], lags=(0, 0))
+    np.testing.assert_allclose(places(events), locate(learnt("full"), odd).places_mm, atol=1e-3)
 
 
-def test_the_earliest_answers_first_and_others_refine_it(
-    monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained
-) -> None:
-    part = cut(recording, 6)
-    live, events = follow(monkeypatch, part, [untrained(part, name) for name in ("full", "early", "causal")])
+def test_the_earliest_answers_first_and_others_refine_it(recording, learnt) -> None:
+    live, events = follow(first_presses(recording, 6), [learnt(name) for name in ("full", "early", "causal")])
     told = [(each.press, each.features, each.final) for each in events]
     assert told[:6] == [(press, name, name == "full") for press in (0, 1) for name in ("early", "causal", "full")]
     assert [each.press for each in live.presses] == [0, 1, 2, 3, 4, 5]
     assert all(each.final for each in list(live.presses)[:-1])
 
 
-def test_a_press_may_be_held_for_hours(monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained) -> None:
-    part = cut(recording, 110)
-    held, extra = 105, 2 * (HISTORY + SLACK) + 1000
+def test_a_press_may_be_held_for_hours(recording, learnt) -> None:
+    part = first_presses(recording, 110)
+    held = 105
+    extra = 3 * (HISTORY + SLACK) - int(part.begun[107]) - 5  # old readings are given up for the second time in a press
     at = int(part.lifted[held]) - 2
     readings = np.insert(part.readings, at, np.repeat(part.readings[at : at + 1], extra, axis=0), axis=0)
     later = np.arange(110) > held
-    long = Recording(
-        readings,
-        np.arange(len(readings)) / part.rate_hz,
-        part.presses_mm,
-        part.begun + extra * later,
-        part.lifted + extra * (later | (np.arange(110) == held)),
-    )
-    localizer = replace(untrained(part, "full"), rate_hz=long.rate_hz)
-    _, events = follow(monkeypatch, long, [localizer])
-    np.testing.assert_allclose(places(events)[held], locate(localizer, long).places_mm[held], atol=1e-3)
+    edges = part.begun + extra * later, part.lifted + extra * (later | (np.arange(110) == held))
+    long = Recording(readings, np.arange(len(readings)) / part.rate_hz, part.presses_mm, *edges)
+    _, events = follow(long, [learnt("full")])
+    np.testing.assert_allclose(places(events)[held:109], locate(learnt("full"), long).places_mm[held:109], atol=1e-3)
 
 
-def test_the_ring_keeps_the_latest_rows() -> None:
-    ring = Ring(1)
-    capacity = 2 * (HISTORY + SLACK)
-    for index in range(capacity + 10):
-        ring.append(np.array([float(index)]))
-        assert ring.rows(index, index + 1).tolist() == [[index]]
-    assert ring.end == capacity + 10
-    kept = ring.rows(0, ring.end)[:, 0]
-    assert len(kept) >= HISTORY + SLACK
-    assert kept.tolist() == list(range(ring.end - len(kept), ring.end))
-    assert ring.rows(ring.end, ring.end + 5).shape == (0, 1)
+def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt, monkeypatch) -> None:
+    part, localizer, watching = first_presses(recording, 12), learnt("full"), Watching(None)
+    begun, lifted = part.begun.copy(), part.lifted.copy()
+    begun[8], lifted[8] = lifted[7] + 4, lifted[7] + 20  # soon after the one before
+    part = replace(part, begun=begun, lifted=lifted)
+    monkeypatch.setattr(sense.live.pipeline, "Monitor", lambda model: watching)
+    monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
+    live = Live([localizer], localizer, part.fibres, part.rate_hz)  # as alike as it looks at
+    events = live.feed(part.times_s, part.readings)
+    found = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
+    estimates = [event for event in events if isinstance(event, Estimate)]
+    assert [event.press for event in events[:found]] == [0, 1, 2, 3, 4, 5]
+    assert [each.lost for each in estimates] == [()] * 6 + [(1,)] * (len(estimates) - 6)
+    expected = locate(localizer, part, (1,)).places_mm
+    np.testing.assert_allclose(places(estimates)[6:], expected[6 : len(estimates)], atol=1e-3)
+    view = live.view()
+    assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "silent", "sound", "sound"]
+    assert view["findings"] == [live.findings[0].text]
+    for press, (readings, begun, lifted) in enumerate(watching.told):  # of each press alone
+        first, last = part.begun[press] - (4 if press == 8 else 10), part.lifted[press] + (4 if press == 7 else 20)
+        assert (first + begun, first + lifted) == (part.begun[press], part.lifted[press])
+        np.testing.assert_array_equal(readings, part.readings[first:last])
 
 
 def test_a_press_that_is_let_go_before_it_began_lasts_a_reading() -> None:
@@ -222,65 +178,23 @@ def test_a_press_that_is_let_go_before_it_began_lasts_a_reading() -> None:
     assert press.lifted == 11
 
 
-@pytest.fixture
-def watched(
-    monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained
-) -> tuple[Recording, Live, list[Any], Watching]:
-    part = cut(recording, 12)
-    watching = Watching(None)
-    monkeypatch.setattr(sense.live.pipeline, "Monitor", lambda model: watching)
-    monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
-    localizer = untrained(part, "full")
-    live = Live([localizer], localizer, part.fibres, part.rate_hz)  # type: ignore[arg-type]  as alike as it looks at
-    return part, live, live.feed(part.times_s, part.readings), watching
-
-
-def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(watched, untrained) -> None:
-    part, live, events, _ = watched
-    found = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
-    estimates = [event for event in events if isinstance(event, Estimate)]
-    assert [event.press for event in events[:found]] == [0, 1, 2, 3, 4, 5]
-    assert [each.lost for each in estimates] == [()] * 6 + [(1,)] * (len(estimates) - 6)
-    expected = locate(untrained(part, "full"), part, (1,)).places_mm
-    np.testing.assert_allclose(places(estimates)[6:], expected[6 : len(estimates)], atol=1e-3)
-    view = live.view()
-    assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "silent", "sound", "sound"]
-    assert view["findings"] == [live.findings[0].text]
-
-
-def test_health_is_told_the_readings_of_each_press_alone(watched) -> None:
-    part, _, _, watching = watched
-    for press, (readings, begun, lifted) in enumerate(watching.told):
-        first, last = part.begun[press] - 10, part.lifted[press] + 20
-        assert (begun, lifted) == (10, 10 + part.lifted[press] - part.begun[press])
-        np.testing.assert_array_equal(readings, part.readings[first:last])
-
-
-def test_without_any_fibre_a_press_may_be_anywhere(
-    monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained
-) -> None:
-    part = cut(recording, 3)
+def test_without_any_fibre_a_press_may_be_anywhere(recording, learnt) -> None:
+    part, scaling = first_presses(recording, 3), learnt("full").normalization
     readings = part.readings.copy()
     readings[int(part.begun[1]) - 12 :] = np.nan
-    blind = Recording(readings, part.times_s, part.presses_mm, part.begun, part.lifted)
-    localizer = untrained(part, "full")
-    live, events = follow(monkeypatch, blind, [localizer])
+    live, events = follow(Recording(readings, part.times_s, part.presses_mm, part.begun, part.lifted), [learnt("full")])
     assert events[1].lost == (0, 1, 2, 3)
-    assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(localizer.normalization.middle_mm))
-    assert events[1].r90_mm > localizer.normalization.span_mm
+    assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(scaling.middle_mm))
+    assert events[1].r90_mm > scaling.span_mm
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
 
 
-def test_the_view_follows_the_pad(monkeypatch: pytest.MonkeyPatch, recording: Recording, untrained) -> None:
-    part = cut(recording, 3)
+def test_the_view_follows_the_pad(recording, learnt, monkeypatch) -> None:
+    part = first_presses(recording, 3)
     monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
-    live = Live([untrained(part, "full")], None, part.fibres, part.rate_hz)
-    assert live.view() == {
-        "pressed": False,
-        "fibres": [{"swing": None, "state": "missing"}] * 4,
-        "presses": [],
-        "findings": [],
-    }
+    live = Live([learnt("full")], None, part.fibres, part.rate_hz)
+    missing = [{"swing": None, "state": "missing"}] * 4
+    assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "findings": []}
     down, up = int(part.begun[0]) + 15, int(part.lifted[0]) + 18
     swings = []
     for first, last in ((0, 15), (15, down), (down, up)):
@@ -291,9 +205,19 @@ def test_the_view_follows_the_pad(monkeypatch: pytest.MonkeyPatch, recording: Re
     assert swings[2] < swings[1] / 2
 
 
-def test_what_does_not_fit_together_is_refused(recording: Recording, untrained) -> None:
-    localizer = untrained(cut(recording, 20), "full")
-    with pytest.raises(InputError, match="readings are of 6 fibres, the localizer was learnt from 4"):
-        Live([localizer], None, 6, localizer.rate_hz)
-    with pytest.raises(InputError, match=r"there are 20 readings a second, allowed is 13\.\d, .* within 25%"):
-        Live([localizer], None, 4, 20.0)
+def test_what_does_not_fit_together_is_refused(recording, learnt) -> None:
+    localizer = learnt("full")
+    for localizers, fibres, rate_hz, said in (
+        ([localizer], 6, localizer.rate_hz, "readings are of 6 fibres, the localizer was learnt from 4"),
+        ([localizer], 4, 20.0, r"there are 20 readings a second, allowed is 13\.\d, .* within 25%"),
+        ([], 4, localizer.rate_hz, "expected at least one"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Live(localizers, None, fibres, rate_hz)
+    live = Live([localizer], None, 4, localizer.rate_hz)
+    live.feed(recording.times_s[:9], recording.readings[:9])
+    for rows, said in ((slice(8, 12), "times begin at .* later than"), (slice(12, 8, -1), "times")):
+        with pytest.raises(InputError, match=said):
+            live.feed(recording.times_s[rows], recording.readings[rows])
+    with pytest.raises(InputError, match="readings"):
+        live.feed(recording.times_s[9:12], recording.readings[9:12, :3])

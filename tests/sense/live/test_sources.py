@@ -1,7 +1,6 @@
 """Where live readings come from."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,29 +14,16 @@ from sense import Recording
 from sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
 from sense.recordings.recorder import FORMAT, START
 from sense.recordings.simulation.published_protocol import simulate
-from sense.rig.boards.due.driver import Arduino
 from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.rig.emulators.due_board import EmulatedBoard
 from sense.rig.emulators.live_pad import SimulatedConverter
 from sense.settings import RigSettings
-
-
-class Time:
-    """A clock that stands still but where somebody waits."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-    def sleep(self, seconds: float) -> None:
-        self.now_s += seconds
+from tests.sense.rig.devices.fakes import Time
 
 
 @pytest.fixture
 def still(monkeypatch: pytest.MonkeyPatch) -> Time:
-    time = Time()
+    """A clock that stands still but where somebody waits."""
+    time = Time(least_s=0)
     monkeypatch.setattr(sense.live.sources.time, "monotonic", time)
     monkeypatch.setattr(sense.live.sources.time, "sleep", time.sleep)
     return time
@@ -49,13 +35,16 @@ def test_a_replay_gives_every_reading_once_when_it_is_due(brief: Recording, stil
     times, readings = [], []
     for times_s, block in source.blocks:
         if len(times_s):
-            late_s = (still.now_s - 100.0) * 10 - (times_s[-1] - brief.times_s[0])
+            late_s = (still() - 100.0) * 10 - (times_s[-1] - brief.times_s[0])
             assert 0 <= late_s < 10 * (0.01 + 1e-6) + 1.3 / brief.rate_hz
         times.append(times_s)
         readings.append(block)
     np.testing.assert_array_equal(np.concatenate(times), brief.times_s)
     np.testing.assert_array_equal(np.concatenate(readings), brief.readings)
     assert max(map(len, times)) <= 64
+    for speed in (float("nan"), 0.0, -1.0):  # it would wait for ever
+        with pytest.raises(InputError, match="speed is"):
+            replayed(brief, speed)
 
 
 def test_samples_are_averaged_to_the_rate_of_the_localizer(still: Time) -> None:
@@ -64,27 +53,29 @@ def test_samples_are_averaged_to_the_rate_of_the_localizer(still: Time) -> None:
             return {"channels": 2, "rate_hz": 1000.0}
 
         def read(self) -> ConverterSamples:
-            times_s = np.arange(still.now_s, still.now_s + 0.01, 0.001)[:10]
+            if still() > 102:
+                raise RigFault("lost", "the board is gone")
+            times_s = np.arange(still(), still() + 0.01, 0.001)[:10]
             return ConverterSamples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
 
         def close(self) -> None:
             pass
 
     source = connected(Ramp(), 13.4)
-    assert source.fibres == 2
-    assert source.rate_hz == pytest.approx(1000 / 75)
+    assert (source.fibres, source.rate_hz) == (2, pytest.approx(1000 / 75))
     blocks = [next(source.blocks) for _ in range(100)]
     times_s, readings = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     assert len(times_s) == 1000 // 75
     np.testing.assert_allclose(np.diff(times_s), 0.075)
     np.testing.assert_allclose(readings, np.stack([times_s, -times_s], axis=1))
+    with pytest.raises(RigFault, match="the board is gone"):
+        list(source.blocks)
 
 
 def test_the_simulated_rig_presses_the_pad_that_was_recorded() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
     rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
-    recorded = simulate(pad, rig)
-    time = Time()
+    recorded, time = simulate(pad, rig), Time(least_s=0)
     converter = SimulatedConverter(pad, rig, PUBLISHED_CONTACT, time)
     with pytest.raises(RigFault, match="not connected"):
         converter.read()
@@ -103,32 +94,9 @@ def test_the_simulated_rig_presses_the_pad_that_was_recorded() -> None:
     assert 0.5 < np.abs(volts - volts[0]).max() / np.abs(recorded.readings - volts[0]).max() < 2
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the emulated board needs a pseudo-terminal")
-def test_a_board_is_followed_and_its_loss_told() -> None:
-    with EmulatedBoard(lambda times_s: np.full((len(times_s), 3), 1.65)) as board:
-        converter = Arduino(board.port, 1000.0, (0, 1, 2))
-        try:
-            source = connected(converter, 100.0)
-            readings = np.concatenate([next(source.blocks)[1] for _ in range(30)])
-            assert readings.shape[1] == 3
-            np.testing.assert_allclose(readings, 1.65, atol=1e-3)
-            board.unplug()
-            with pytest.raises(RigFault, match="the board is gone"):
-                for _ in source.blocks:
-                    pass
-        finally:
-            converter.close()
-
-
 @pytest.mark.parametrize(
     ("said", "recorded", "lies"),
-    [
-        (None, True, True),  # a holder had said so
-        (None, False, False),
-        (None, None, False),
-        (True, False, True),
-        (False, True, False),
-    ],
+    [(None, True, True), (None, False, False), (None, None, False), (True, False, True), (False, True, False)],
 )
 def test_a_pad_lies_as_the_rig_says_or_else_as_it_was_recorded(
     tmp_path: Path, said: bool | None, recorded: bool | None, lies: bool
@@ -141,26 +109,25 @@ def test_a_pad_lies_as_the_rig_says_or_else_as_it_was_recorded(
     assert lies_mirrored(tmp_path, rig) is lies
 
 
-def test_the_simulated_pad_is_that_of_the_model(model: Path, tmp_path: Path) -> None:
-    assert simulated(model).connect()["channels"] == 4
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"kind": "rig"}, "of no simulated pad"),
+        ({"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
+        ({"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
+        ({"morphology": {}}, "no pad that can be simulated"),
+        ({"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "there are 1 fibres"),
+        ({"morphology": {"pitch_mm": 1, "knots": [[1, 2], [3, 4]]}}, "knots"),
+    ],
+)
+def test_the_simulated_pad_is_that_of_the_model(brief: Recording, tmp_path: Path, change: dict, said: str) -> None:
     with pytest.raises(InputError, match=r"start\.json: not there"):
         simulated(tmp_path)
-    (tmp_path / "recording").mkdir()
-    start = json.loads((model / "recording" / "start.json").read_text())
-    for source, message in (
-        ({"kind": "rig"}, "of no simulated pad"),
-        (start["source"] | {"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
-        (start["source"] | {"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
-        (start["source"] | {"morphology": {}}, "no pad that can be simulated"),
-        (start["source"] | {"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "there are 1 fibres"),
-        (start["source"] | {"morphology": {"pitch_mm": 1, "knots": [[1, 2], [3, 4]]}}, "knots"),
-    ):
-        (tmp_path / "recording" / "start.json").write_text(json.dumps(start | {"source": source}))
-        with pytest.raises(InputError, match=message):
-            simulated(tmp_path)
-
-
-@pytest.mark.parametrize("speed", [float("nan"), 0.0, -1.0])
-def test_a_replay_without_a_speed_is_refused_and_does_not_wait_for_ever(recording: Recording, speed: float) -> None:
-    with pytest.raises(InputError, match="speed is"):
-        replayed(recording, speed)
+    brief.save(tmp_path / RECORDED, {})
+    path = tmp_path / RECORDED / START
+    source = simulate(Morphology.straight(2), RigSettings(presses=1)).source
+    path.write_text(json.dumps({"format": FORMAT, "source": source}))
+    assert simulated(tmp_path).connect()["channels"] == 4
+    path.write_text(json.dumps({"format": FORMAT, "source": {**source, **change}}))
+    with pytest.raises(InputError, match=said):
+        simulated(tmp_path)

@@ -1,59 +1,146 @@
-"""Recordings by hand, of a finger that errs as people do."""
+"""Recordings by hand, of a finger that errs as people do, in virtual time: minutes of pressing take a moment."""
 
 import json
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+import sense.live.sources
+from design import Contact, Morphology
 from design.common.errors import InputError
 from sense import Recording
 from sense.live.by_hand import session
+from sense.live.by_hand.session import record_by_hand
 from sense.live.by_hand.targets import targets_of
 from sense.localizer.calibration.calibration import calibrate
 from sense.recordings.press_journal import read_journal
 from sense.recordings.processing.press_detection import Event, Finder
-from sense.rig.devices.protocols import RigFault
+from sense.rig.devices.protocols import ConverterSamples, RigFault
 from sense.rig.emulators.finger import SCATTER_MM, Finger
+from sense.rig.planning.setup import Setup
+from sense.settings import RigSettings
 from tests.sense.conftest import QUICK
-from tests.sense.live.by_hand.hands import RIG, Hands, made
+from tests.sense.rig.devices.fakes import Time
 
-Made = Callable[..., Hands]
+PAD = Morphology.random(3, knots=3, seed=5)
+RIG = RigSettings(presses=6, readings_per_press=16, converter_rate_hz=40.0)
 
 
-def targets(hand: Hands) -> np.ndarray:
-    return targets_of(hand._setup)
+class Board:
+    """A converter that reads what the finger does to the pad."""
+
+    def __init__(self, finger: Finger, clock: Time) -> None:
+        self._finger, self._clock = finger, clock
+
+    def connect(self) -> dict[str, Any]:
+        self._began_s, self._count = self._clock(), 0
+        return {"name": "virtual", "channels": 2 * PAD.grid, "rate_hz": RIG.converter_rate_hz}
+
+    def read(self) -> ConverterSamples:
+        count = int((self._clock() - self._began_s) * RIG.converter_rate_hz)
+        times_s = self._began_s + np.arange(self._count + 1, count + 1) / RIG.converter_rate_hz
+        self._count = count
+        return ConverterSamples(times_s, self._finger.volts(times_s), np.zeros(len(times_s), np.int64))
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Hands:
+    """Records by hand, again and again, with one finger on one pad.
+
+    Attributes:
+        told: what became of presses, in order. views: all that was shown.
+    """
+
+    def __init__(self, folder: Path, finger: type[Finger] = Finger, mishaps: float = 0.0, **settings: Any) -> None:
+        rig = RIG.model_copy(update=settings)
+        self.out, self.clock = folder / "hand", Time(least_s=0.025)
+        self.finger = finger(PAD, Contact(), rig, rig.converter_rate_hz, mishaps=mishaps)
+        self.setup = Setup(PAD, Contact(), rig, self.out, "test")
+        self.targets = targets_of(self.setup)
+        self.told: list[str] = []
+        self.views: list[dict[str, Any]] = []
+
+    def record(
+        self,
+        resume: bool = False,
+        said: Callable[[], list[str]] = list,
+        watch: Callable[[dict[str, Any]], None] = lambda view: None,
+    ) -> Recording:
+        def show(view: dict[str, Any]) -> None:
+            if view["told"] and (not self.views or self.views[-1]["told"] != view["told"]):
+                self.told.append(view["told"])
+            self.views.append(view)
+            assert self.clock() < 1000, "the recording comes to no end"
+            self.finger.look(view)
+            watch(view)
+
+        with pytest.MonkeyPatch.context() as patch:  # nobody else sleeps meanwhile
+            patch.setattr(sense.live.sources.time, "sleep", self.clock.sleep)
+            board = Board(self.finger, self.clock)
+            return record_by_hand(self.setup, board, show, lambda: [*said(), *self.finger.said()], resume)
+
+    def strokes_of(self, recording: Recording) -> list[Any]:
+        """The stroke of each press of a recording that was made at once."""
+        zero_s = 100.0 + 1 / RIG.rate_hz
+        downs = np.array([stroke.down_s - zero_s for stroke in self.finger.strokes])
+        times_s = recording.times_s[recording.begun]
+        return [self.finger.strokes[int(np.argmin(np.abs(downs - time_s)))] for time_s in times_s]
+
+    def broken_off(self, done: int, phase: str) -> None:
+        """Record until Ctrl-C after so many presses in that phase; half a minute later nothing touches the pad."""
+
+        def watch(view: dict) -> None:
+            if (view["done"], view["phase"]) == (done, phase):
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            self.record(watch=watch)
+        self.finger.look({"phase": "settle"})
+        self.clock.sleep(30)
+
+
+@pytest.fixture
+def hands(tmp_path: Path) -> Callable[..., Hands]:
+    return partial(Hands, tmp_path)
 
 
 def known(recording: Recording) -> np.ndarray:
     return recording.presses_mm[recording.known]
 
 
+def off_from(recording: Recording, strokes: np.ndarray) -> list[float]:
+    """How far off their places, mm, the strokes of those presses went that count."""
+    made = zip(strokes[recording.known], known(recording), strict=True)
+    return [float(np.linalg.norm(stroke.place_mm - place)) for stroke, place in made]
+
+
 @pytest.fixture(scope="module")
 def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
     """A recording in which one press of five goes wrong."""
-    with pytest.MonkeyPatch.context() as patch:
-        hand = made(tmp_path_factory.mktemp("hand"), patch, mishaps=0.2, presses=60)
-        return hand, hand.record()
+    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.2, presses=60)
+    return hand, hand.record()
 
 
 def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
-    np.testing.assert_array_equal(known(recording), targets(hand))
-    strokes = hand.strokes_of(recording)
-    refused = Counter(stroke.kind for stroke, counts in zip(strokes, recording.known, strict=True) if not counts)
-    counted = Counter(stroke.kind for stroke, counts in zip(strokes, recording.known, strict=True) if counts)
+    np.testing.assert_array_equal(known(recording), hand.targets)
+    strokes = np.array(hand.strokes_of(recording))
+    refused, counted = (
+        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.known, recording.known)
+    )
     assert refused["short"] >= 2
     assert refused["echo"] >= 2
     assert refused["press"] <= 1
     assert counted["short"] + counted["echo"] + counted["light"] == 0
-    off_mm = [
-        np.linalg.norm(stroke.place_mm - place)
-        for stroke, place, counts in zip(strokes, recording.presses_mm, recording.known, strict=True)
-        if counts
-    ]
+    off_mm = off_from(recording, strokes)
     assert max(off_mm) < 4 * SCATTER_MM
     assert np.sqrt(np.mean(np.square(off_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
     held_s = (recording.lifted - recording.begun)[recording.known] / RIG.rate_hz
@@ -62,10 +149,11 @@ def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hand
     assert hand.views[-1]["done"] == hand.views[-1]["of"] == 60
 
 
+@pytest.mark.slow
 def test_presses_by_hand_are_learnt_from(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
-    _, document = calibrate(recording, QUICK)
-    spread_mm = np.linalg.norm(targets(hand) - targets(hand).mean(axis=0), axis=1).mean()
+    _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
+    spread_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert document["errors"][0]["mean_mm"] < 0.55 * spread_mm
 
 
@@ -89,19 +177,18 @@ class Turned(Finder):
         return [Event(event.down != self._turned, event.reading) for event in events]
 
 
-def test_a_finder_that_lost_its_way_is_not_believed(hands: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finder_that_lost_its_way_is_not_believed(hands, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "Finder", Turned)
     hand = hands(presses=14)
     monkeypatch.setattr(hand.finger, "said", list)  # nobody helps
     recording = hand.record()
-    np.testing.assert_array_equal(known(recording), targets(hand))
+    np.testing.assert_array_equal(known(recording), hand.targets)
     assert not Turned.once
     assert 1 <= (~recording.known).sum() <= 3
-    for stroke, place, counts in zip(hand.strokes_of(recording), recording.presses_mm, recording.known, strict=True):
-        assert not counts or np.linalg.norm(stroke.place_mm - place) < 4 * SCATTER_MM
+    assert max(off_from(recording, np.array(hand.strokes_of(recording)))) < 4 * SCATTER_MM
 
 
-def test_what_is_said_is_done(hands: Made) -> None:
+def test_what_is_said_is_done(hands) -> None:
     hand = hands(presses=5)
     say = {2: ["back"], 4: ["skip"]}
 
@@ -109,79 +196,52 @@ def test_what_is_said_is_done(hands: Made) -> None:
         return say.pop(len(hand.told), []) if hand.views and hand.views[-1]["phase"] == "wait" else []
 
     recording = hand.record(said=said)
-    first, second, third, *rest = targets(hand).tolist()
+    first, second, third, *rest = hand.targets.tolist()
     assert known(recording).tolist() == [first, second, *rest]  # the second again, and the third left out
     assert len(recording.presses_mm) == 5
     journal = [json.loads(line) for line in (hand.out / "journal.ndjson").read_text().splitlines()]
     assert [event["refused"] for event in journal if "refused" in event] == ["it was taken back"]
     assert third not in known(recording).tolist()
     hand.record(resume=True)  # what was skipped is asked for again
-    np.testing.assert_array_equal(np.sort(known(Recording.open(hand.out)), axis=0), np.sort(targets(hand), axis=0))
+    np.testing.assert_array_equal(np.sort(known(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
 
 
-def test_an_end_that_is_asked_for_keeps_what_counts(hands: Made) -> None:
+def test_an_end_that_is_asked_for_keeps_what_counts_and_nothing_is_written_over(hands) -> None:
     hand = hands()
     recording = hand.record(said=lambda: ["quit"] if len(hand.told) == 3 else [])
     assert len(known(recording)) == 3
+    with pytest.raises(InputError, match="never written over"):
+        hand.record()
 
 
-@pytest.mark.parametrize("phase", ["hold", "wait"])
-def test_a_recording_that_broke_off_is_gone_on_with(hands: Made, phase: str) -> None:
+@pytest.mark.parametrize(("phase", "killed"), [("hold", False), ("wait", False), ("hold", True)])
+def test_a_recording_that_broke_off_is_gone_on_with(hands, monkeypatch, phase: str, killed: bool) -> None:
+    """A press that was under way is none; after a kill nothing tells the journal of it."""
     hand = hands(presses=6)
-
-    def watch(view: dict) -> None:
-        if view["done"] == 3 and view["phase"] == phase:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        hand.record(watch=watch)
+    with monkeypatch.context() as patched:
+        if killed:
+            patched.setattr(session.Recorder, "abort", lambda self, reason: None)
+        hand.broken_off(3, phase)
+    assert len(read_journal(hand.out / "journal.ndjson")) == 3
     before = Recording.open(hand.out)
-    np.testing.assert_array_equal(before.presses_mm, targets(hand)[:3])
-    hand.finger.look({"phase": "settle"})
-    hand.clock.now_s += 30
+    np.testing.assert_array_equal(before.presses_mm, hand.targets[:3])
     recording = hand.record(resume=True)
-    np.testing.assert_array_equal(known(recording), targets(hand))
+    np.testing.assert_array_equal(known(recording), hand.targets)
     np.testing.assert_array_equal(recording.readings[: len(before.readings)], before.readings)
     assert hand.views[-1]["done"] == 6
 
 
-def test_a_press_that_was_under_way_at_a_kill_is_none(hands: Made, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is told to the journal any more: as after a kill."""
-    hand = hands(presses=4)
-
-    def watch(view: dict) -> None:
-        if view["done"] == 2 and view["phase"] == "hold":
-            monkeypatch.setattr(session.Recorder, "abort", lambda self, reason: None)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        hand.record(watch=watch)
-    assert len(read_journal(hand.out / "journal.ndjson")) == 2
-    hand.finger.look({"phase": "settle"})
-    hand.clock.now_s += 30
-    np.testing.assert_array_equal(known(hand.record(resume=True)), targets(hand))
-
-
-def test_a_full_disk_is_told(hands: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_told(hands, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: object) -> None:
         raise OSError(28, "No space left on device")
-
-    hand = hands()
 
     def watch(view: dict) -> None:
         if view["done"] == 1:
             monkeypatch.setattr(session.Recorder, "sync", full)
 
     with pytest.raises(RigFault, match="cannot be written") as fault:
-        hand.record(watch=watch)
+        hands().record(watch=watch)
     assert fault.value.cause == "disk"
-
-
-def test_nothing_is_written_over(hands: Made) -> None:
-    hand = hands(presses=1)
-    hand.record()
-    with pytest.raises(InputError, match="never written over"):
-        hand.record()
 
 
 class Resting(Finger):
@@ -194,9 +254,9 @@ class Resting(Finger):
         return place, depth
 
 
-def test_a_hand_that_rests_on_the_pad_is_told_to_lift(hands: Made) -> None:
+def test_a_hand_that_rests_on_the_pad_is_told_to_lift(hands) -> None:
     hand = hands(finger=Resting, presses=4)
     recording = hand.record()
-    np.testing.assert_array_equal(known(recording), targets(hand))
+    np.testing.assert_array_equal(known(recording), hand.targets)
     assert [why for why in hand.told if "held for" in why and "lift after 0.6 s" in why]
     assert any(view["said"].startswith("lift; if nothing") for view in hand.views)

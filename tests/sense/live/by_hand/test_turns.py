@@ -1,9 +1,14 @@
+"""What a person is asked for, which presses count, and why others do not."""
+
 import numpy as np
 import pytest
 
+from sense.live.by_hand.judging import BACK, LEARNT, Judge, answers
 from sense.live.by_hand.turns import SEEN_S, SETTLE_S, Turns
 
 PLACES = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+REST = np.array([2.0, 1.8, 1.9])
+PRESS = np.array([0.1, -0.2, 0.2])
 
 
 @pytest.fixture
@@ -31,6 +36,9 @@ def test_a_person_is_asked_step_by_step(turns: Turns) -> None:
         turns.keep(down_s + 1.1)
     assert turns.target is None
     assert [turns.phase(at_s) for at_s in (107.9, 108.0)] == ["wait", "done"]
+    turns.skip(108.1)
+    assert turns.touch(110.0) is None
+    assert turns.release(111.0) == "it came before it was asked for"
 
 
 @pytest.mark.parametrize(
@@ -73,9 +81,46 @@ def test_what_was_wrong_is_taken_back(turns: Turns) -> None:
     assert turns.target == (3.0, 4.0)
 
 
-def test_nothing_is_asked_for_once_all_is_done() -> None:
-    turns = Turns(PLACES[:1], 1.0, 0.0)
-    turns.skip(5.0)
-    turns.skip(5.1)
-    assert turns.touch(10.0) is None
-    assert turns.release(11.0) == "it came before it was asked for"
+def readings(early: np.ndarray, late: np.ndarray) -> np.ndarray:
+    """Ten readings at rest, ten of the first part of a press, ten of its last, and one at rest."""
+    return np.repeat([REST, REST + early, REST + late, REST], [10, 10, 10, 1], axis=0)
+
+
+@pytest.fixture
+def judge() -> Judge:
+    judge = Judge()
+    for _ in range(LEARNT):
+        judge.keep(np.array([PRESS, PRESS]), REST)
+    return judge
+
+
+def test_answers_are_those_of_a_press_alone() -> None:
+    np.testing.assert_allclose(answers(readings(PRESS, 2 * PRESS), 10, 30), [PRESS, 2 * PRESS])
+    holes = readings(PRESS, PRESS)
+    holes[12:18, 0] = np.nan
+    holes[:, 2] = np.nan
+    np.testing.assert_allclose(answers(holes, 10, 30)[1], [0.1, -0.2, 0.0])
+    assert np.isfinite(answers(readings(PRESS, PRESS)[9:13], 1, 2)).all()  # the shortest there is
+
+
+def test_a_weak_press_one_that_moved_and_what_is_no_touch_do_not_count(judge: Judge) -> None:
+    weak, pressed = np.array([0.1 * PRESS, 0.1 * PRESS]), REST + PRESS
+    assert judge.fault_of(answers(readings(PRESS, 1.3 * PRESS), 10, 30)) == judge.fault_of(3 * weak) == ""
+    assert "weaker" in judge.fault_of(weak)
+    assert "changed" in judge.fault_of(answers(readings(PRESS, PRESS[::-1]), 10, 30))
+    assert Judge().fault_of(weak) == ""  # nobody knows yet what is weak
+    assert not judge.untouched(pressed, REST, held_s=5.0)
+    assert judge.untouched(REST + 0.1 * PRESS, REST, held_s=2.0)
+    assert not judge.untouched(REST + 0.1 * PRESS, REST, held_s=0.5)  # it may still be sinking in
+    # Taken for a touch, but it began under a finger and ended where the pad rests.
+    assert judge.untouched(REST + 0.2 * PRESS, pressed, held_s=0.5)
+    assert not judge.untouched(pressed[::-1], pressed, held_s=0.5)
+
+
+def test_the_rest_is_followed_where_nothing_touches(judge: Judge) -> None:
+    drift = 0.8 * BACK * PRESS
+    for step in range(1, 9):
+        assert judge.touched(REST + step * drift) is False
+    assert judge.touched(REST) is True
+    judge.rest_anew()
+    assert judge.touched(REST) is None

@@ -21,6 +21,7 @@ from tests.sense.conftest import QUICK
 HERE = Path(__file__).parent
 ROOT = HERE.parents[3]
 BUDGET = Budget(40_000, 8_000)
+SHORT = QUICK.model_copy(update={"epochs": 4})
 
 
 class Told(NamedTuple):
@@ -36,15 +37,15 @@ class Told(NamedTuple):
         return self.events[(self.events[:, 1].astype(int) & 2) > 0]
 
 
+Program = Callable[..., Told]
+
+
 def tutorial(name: str, language: str) -> str:
     """The code in the tutorial that follows the comment of a name."""
     text = (ROOT / "docs" / "tutorial-sense.md").read_text(encoding="utf-8")
     found = re.search(rf"<!-- {name} -->\n```{language}\n(.*?)```", text, re.DOTALL)
     assert found is not None
     return found[1]
-
-
-Program = Callable[..., Told]
 
 
 def compiled(source: Path, folder: Path, *flags: str) -> Path:
@@ -60,41 +61,41 @@ def compiled(source: Path, folder: Path, *flags: str) -> Path:
 
 @pytest.fixture(scope="session")
 def taught(recording: Recording, localizer: Localizer) -> Student:
-    training, _ = split(recording, localizer, QUICK)
-    return teach(recording, localizer, training, BUDGET, QUICK)
+    return teach(recording, localizer, split(recording, localizer, SHORT)[0], BUDGET, SHORT)
 
 
 @pytest.fixture(scope="session")
 def quantized(taught: Student) -> Student:
     """The same in int8."""
-    return replace(
-        taught, localizer=replace(taught.localizer, weights=as_int8(taught.localizer.weights)), quantized=True
-    )
+    weights = as_int8(taught.localizer.weights)
+    return replace(taught, localizer=replace(taught.localizer, weights=weights), quantized=True)
 
 
 @pytest.fixture(scope="session")
 def deeply(deep_recording: Recording, deep_localizer: Localizer) -> Student:
     """One that has learnt depth and force."""
-    options = QUICK.model_copy(update={"epochs": 20})
-    return teach(deep_recording, deep_localizer, split(deep_recording, deep_localizer, options)[0], BUDGET, options)
+    training, _ = split(deep_recording, deep_localizer, SHORT)
+    return teach(deep_recording, deep_localizer, training, BUDGET, SHORT)
 
 
-@pytest.fixture
-def program(tmp_path: Path) -> Callable[..., Program]:
-    """The header of a student in a program that takes readings, whether the pad is pressed, and lost fibres."""
+def program_of(student: Student, folder: Path, *flags: str, budget: Budget = BUDGET, text: str = "") -> Program:
+    """A program with the header of a student: takes readings, whether the pad is pressed, and lost fibres."""
+    (folder / "localizer.h").write_text(text or c_header(student, budget, ["of a test"]))
+    path = compiled(HERE / "driver.c", folder, *flags)
 
-    def build(student: Student, budget: Budget = BUDGET, *flags: str, text: str = "") -> Program:
-        (tmp_path / "localizer.h").write_text(text or c_header(student, budget, ["of a test"]))
-        path = compiled(HERE / "driver.c", tmp_path, *flags)
+    def run(readings: Array, held: Mask | None = None, lost: tuple[int, ...] = ()) -> Told:
+        pressed = np.full(len(readings), -1) if held is None else held
+        rows = np.column_stack([readings, pressed]).astype(np.float32).tobytes()
+        mask = "".join("0" if fibre in lost else "1" for fibre in range(student.localizer.fibres))
+        lines = subprocess.run([path, mask], input=rows, capture_output=True, check=True).stdout.split(b"\n")
+        state, tables = map(int, lines[0].split())
+        events = np.array([line.split() for line in lines[1:-1]], float)
+        return Told(state, tables, events if len(events) else np.empty((0, 7)))
 
-        def run(readings: Array, held: Mask | None = None, lost: tuple[int, ...] = ()) -> Told:
-            pressed = np.full(len(readings), -1) if held is None else held
-            rows = np.column_stack([readings, pressed]).astype(np.float32).tobytes()
-            mask = "".join("0" if fibre in lost else "1" for fibre in range(student.localizer.fibres))
-            lines = subprocess.run([path, mask], input=rows, capture_output=True, check=True).stdout.split(b"\n")
-            state, tables = map(int, lines[0].split())
-            return Told(state, tables, np.array([line.split() for line in lines[1:-1]], float))
+    return run
 
-        return run
 
-    return build
+@pytest.fixture(scope="session")
+def program(taught: Student, tmp_path_factory: pytest.TempPathFactory) -> Program:
+    """That of the student as it was taught."""
+    return program_of(taught, tmp_path_factory.mktemp("program"))

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,17 +16,28 @@ import pytest
 from design.common.errors import Fault, InputError
 from sense import Localizer, Recording, calibrate, export_csv
 from sense.live.deployment import onnx_file
-from sense.live.deployment.onnx_file import MOST_OFF_MM, export_onnx, onnx_line
+from sense.live.deployment.onnx_file import MOST_OFF_MM, Exported, export_onnx, onnx_line
 from sense.localizer.features import bridged
+from sense.localizer.localizer import Found
 from tests.sense.conftest import QUICK
-from tests.sense.live.deployment.conftest import tutorial
+from tests.sense.live.deployment.conftest import ROOT, tutorial
 
-DIGEST = "0" * 64
-ROOT = Path(__file__).resolve().parents[4]
+DIGEST = "a" * 64
 
 
-def session(path: Path) -> onnxruntime.InferenceSession:
+@pytest.fixture(scope="module")
+def exported(localizer: Localizer, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple:
+    path = tmp_path_factory.mktemp("onnx") / "localizer.onnx"
+    return path, export_onnx(localizer, DIGEST, path, recording)
+
+
+def opened(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture
+def graph(exported: tuple[Path, Exported]) -> onnxruntime.InferenceSession:
+    return opened(exported[0])
 
 
 def presses_of(recording: Recording, alive: np.ndarray) -> dict[str, np.ndarray]:
@@ -33,30 +45,29 @@ def presses_of(recording: Recording, alive: np.ndarray) -> dict[str, np.ndarray]
     return {"readings": bridged(recording.readings), **edges, "alive": alive}
 
 
-@pytest.mark.parametrize("lost", [(), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)])
-def test_places_and_radii_are_those_of_locate(lost, localizer: Localizer, recording: Recording, tmp_path: Path) -> None:
-    export_onnx(localizer, DIGEST, tmp_path / "l.onnx", recording)
-    presses = localizer.inputs(recording)
-    alive = presses.alive & ~np.isin(np.arange(4), lost)
-    found = localizer.locate(replace(presses, alive=alive))
-    names = ["places_mm", "sd_mm", "r50_mm", "r90_mm"]
-    given = presses_of(recording, alive)
-    told = dict(zip(names, map(np.asarray, session(tmp_path / "l.onnx").run(names, given)), strict=True))
-    assert np.hypot(*(told["places_mm"] - found.places_mm).T).max() < MOST_OFF_MM
-    for name in names[1:]:
-        np.testing.assert_allclose(told[name], getattr(found, name), rtol=1e-4)
+def require_places(places_mm: Any, found: Found) -> None:
+    assert np.shape(places_mm) == found.places_mm.shape
+    assert np.hypot(*(np.asarray(places_mm) - found.places_mm).T).max() < MOST_OFF_MM
 
 
-def test_any_number_of_presses_and_readings_will_do(localizer: Localizer, brief: Recording, tmp_path: Path) -> None:
+def test_places_and_radii_are_those_of_locate(graph, localizer, recording) -> None:
+    presses, names = localizer.inputs(recording), ["places_mm", "sd_mm", "r50_mm", "r90_mm"]
+    for lost in ((), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)):
+        alive = presses.alive & ~np.isin(np.arange(4), lost)
+        found = localizer.locate(replace(presses, alive=alive))
+        places_mm, *others = graph.run(names, presses_of(recording, alive))
+        require_places(places_mm, found)
+        for name, values in zip(names[1:], others, strict=True):
+            np.testing.assert_allclose(values, getattr(found, name), rtol=1e-4)
+
+
+def test_any_number_of_presses_and_readings_will_do(graph, localizer, brief) -> None:
     """The last press of a recording is found as it is in it by itself, where the one before stands by its end."""
-    export_onnx(localizer, DIGEST, tmp_path / "l.onnx")
-    graph, found = session(tmp_path / "l.onnx"), localizer.locate(localizer.inputs(brief))
+    presses = localizer.inputs(brief)
     for count in (1, 2, 7):
         part = {"begun": brief.begun[:count], "lifted": brief.lifted[:count], "alive": np.ones((count, 4), bool)}
-        end = brief.begun[count]
-        places = np.asarray(graph.run(["places_mm"], {"readings": brief.readings[:end], **part})[0])
-        assert places.shape == (count, 2)
-        assert np.hypot(*(places - found.places_mm[:count]).T).max() < MOST_OFF_MM
+        given = {"readings": brief.readings[: brief.begun[count]], **part}
+        require_places(graph.run(["places_mm"], given)[0], localizer.locate(presses[np.arange(count)]))
 
 
 @pytest.mark.parametrize("features", ["causal", "early", "published"])
@@ -67,59 +78,49 @@ def test_whatever_its_inputs_are_made_of(features: str, brief: Recording, tmp_pa
     assert found.presses == 40
 
 
-def test_depth_and_force_come_too(deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path) -> None:
+def test_depth_and_force_come_too(deep_localizer, deep_recording, tmp_path) -> None:
     export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", deep_recording)
     presses = deep_localizer.inputs(deep_recording)
-    found = deep_localizer.locate(presses).measures
-    graph = session(tmp_path / "l.onnx")
+    found, graph = deep_localizer.locate(presses), opened(tmp_path / "l.onnx")
     names = [each.name for each in graph.get_outputs()][4:]
     assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
     told = graph.run(names, presses_of(deep_recording, presses.alive))
-    expected = [column for each in found.values() for column in (each.values, each.r90)]
+    expected = [column for each in found.measures.values() for column in (each.values, each.r90)]
     np.testing.assert_allclose(np.array(told), np.array(expected), rtol=1e-4, atol=1e-4)
 
 
-def test_the_file_says_what_it_is(localizer: Localizer, tmp_path: Path) -> None:
-    found = export_onnx(localizer, "a" * 64, tmp_path / "l.onnx")
-    model = onnx.load(tmp_path / "l.onnx")
+def test_the_file_says_what_it_is(exported: tuple[Path, Exported]) -> None:
+    model = onnx.load(exported[0])
     onnx.checker.check_model(model, full_check=True)
     about = {each.key: each.value for each in model.metadata_props}
     assert about["format"] == "padforge-onnx/1"
-    assert about["localizer_sha256"] == "a" * 64
+    assert about["localizer_sha256"] == DIGEST
     assert json.loads(about["fibres"]) == ["fibre_0_v", "fibre_1_v", "fibre_2_v", "fibre_3_v"]
     assert list(json.loads(about["inputs"])) == [each.name for each in model.graph.input]
     assert list(json.loads(about["outputs"])) == [each.name for each in model.graph.output]
     assert [each.dim_param for each in model.graph.input[1].type.tensor_type.shape.dim] == ["presses"]
-    assert onnx_line(found).startswith("1.9 MB, tried on 64 presses with up to 3 fibres lost: places within ")
+    assert onnx_line(exported[1]).startswith("1.9 MB, tried on 300 presses with up to 3 fibres lost: places within ")
 
 
-def test_a_graph_that_is_off_is_not_written(localizer, recording, tmp_path, monkeypatch) -> None:
+def test_what_is_off_or_does_not_suit_is_not_written(localizer, tmp_path, monkeypatch) -> None:
+    path = tmp_path / "l.onnx"
+    with pytest.raises(InputError, match="method published, expected masked"):
+        export_onnx(replace(localizer, method="published"), DIGEST, path)
     monkeypatch.setattr(onnx_file, "MOST_OFF_MM", 1e-9)
     with pytest.raises(Fault, match="not written, onnxruntime finds places"):
-        export_onnx(localizer, DIGEST, tmp_path / "l.onnx", recording)
+        export_onnx(localizer, DIGEST, path)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_does_not_suit_is_refused(localizer, recording, tmp_path) -> None:
-    fewer = Recording(
-        recording.readings[:, :3], *(getattr(recording, n) for n in ("times_s", "presses_mm", "begun", "lifted"))
-    )
-    with pytest.raises(InputError, match="3 fibres, the localizer was learnt from 4"):
-        export_onnx(localizer, DIGEST, tmp_path / "l.onnx", fewer)
-    with pytest.raises(InputError, match="method published, expected masked"):
-        export_onnx(replace(localizer, method="published"), DIGEST, tmp_path / "l.onnx")
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_script_of_the_tutorial_does_as_it_says(localizer, brief, tmp_path, monkeypatch) -> None:
+def test_the_script_of_the_tutorial_does_as_it_says(localizer, brief, exported, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    export_onnx(localizer, DIGEST, Path("localizer.onnx"))
+    Path("localizer.onnx").write_bytes(exported[0].read_bytes())
     export_csv(brief, "presses.csv")
     found: dict[str, np.ndarray] = {}
     exec(tutorial("graph", "python"), found)
     assert np.array_equal(found["begun"], brief.begun)
-    places_mm = localizer.locate(localizer.inputs(brief)).places_mm
-    assert np.hypot(*(found["places_mm"][:-1] - places_mm[:-1]).T).max() < MOST_OFF_MM
+    presses = localizer.inputs(brief)
+    require_places(found["places_mm"][:-1], localizer.locate(presses[np.arange(len(brief.begun) - 1)]))
 
 
 def test_onnxruntime_is_kept_from_telling_its_maker_of_its_use(tmp_path: Path) -> None:

@@ -15,9 +15,13 @@ def nothing() -> Detector:
     return Detector(np.full(4, np.inf), np.inf, 0)
 
 
-def test_windows_are_those_of_the_features(recording: Recording) -> None:
-    assert press_stream.WINDOWS == features.DOWN
-    assert press_stream.MOST_V == limits.MAX_VOLTS
+def test_presses_are_seen_as_commanded_with_the_windows_of_the_features(recording, nothing) -> None:
+    found = seen(recording.readings, nothing, held(recording))
+    assert np.array_equal(found.begun, recording.begun)
+    assert np.array_equal(found.ended, recording.lifted)
+    assert np.array_equal(found.told, recording.begun + press_stream.SEEN - 1)
+    assert found.inputs.alive.all()
+    assert (press_stream.WINDOWS, press_stream.MOST_V) == (features.DOWN, limits.MAX_VOLTS)
     assert features.REST == (-press_stream.REST, 0)
     expected = features.window_inputs(recording.readings, recording.begun, recording.lifted, release=False)
     np.testing.assert_allclose(commanded(recording).windows, expected, atol=2e-6)
@@ -36,14 +40,6 @@ def test_history_is_what_averages_were_when_the_press_began(recording: Recording
     assert press == 20
 
 
-def test_all_presses_are_seen_as_they_were_told(recording: Recording, nothing: Detector) -> None:
-    found = seen(recording.readings, nothing, held(recording))
-    assert np.array_equal(found.begun, recording.begun)
-    assert np.array_equal(found.ended, recording.lifted)
-    assert np.array_equal(found.told, recording.begun + press_stream.SEEN - 1)
-    assert found.inputs.alive.all()
-
-
 def test_short_presses_and_such_without_a_pause_are_seen(recording: Recording, nothing: Detector) -> None:
     pressed = np.zeros(200, bool)
     for first, end in ((0, 3), (5, 6), (7, 8), (40, 90), (91, 92)):
@@ -58,13 +54,11 @@ def test_short_presses_and_such_without_a_pause_are_seen(recording: Recording, n
 
 
 def test_the_detector_finds_what_it_never_learnt_from(recording: Recording) -> None:
-    detector = Detector.fit(recording, np.arange(0, 200))
-    found = seen(recording.readings, detector)
+    found = seen(recording.readings, Detector.fit(recording, np.arange(0, 200)))
     press = owners(recording, found.begun)
     assert np.isin(np.arange(200, 300), press).all()
     assert (press >= 0).all()
-    off = found.begun - recording.begun[press]
-    assert np.abs(off).max() <= 2
+    assert np.abs(found.begun - recording.begun[press]).max() <= 2
     assert np.abs(found.ended[:-1] - recording.lifted[press[:-1]]).max() <= 5  # the simulated pad takes its time
 
 
@@ -79,10 +73,9 @@ def test_a_fibre_that_tells_nothing_is_no_noise(recording: Recording) -> None:
 
 def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
     """A fibre breaks while the pad is free: what follows is found again after that."""
-    detector = Detector.fit(recording, np.arange(300))
     readings = np.array(recording.readings)
     readings[2012:, 0] = 0.0
-    found = seen(readings, detector)
+    found = seen(readings, Detector.fit(recording, np.arange(300)))
     long = np.flatnonzero(found.ended - found.begun > press_stream.LONGEST)
     assert len(long) == 1
     assert found.ended[long[0]] < recording.begun[100]
@@ -91,5 +84,5 @@ def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
 
 def test_the_first_of_several_in_a_press_is_it(recording: Recording) -> None:
     first = recording.begun[0]
-    begun = np.array([first - 5, first - 1, first + 3, recording.lifted[0] + 2, recording.begun[1]])
-    assert owners(recording, begun).tolist() == [-1, 0, -1, -1, 1]
+    begun = [first - 5, first - 1, first + 3, recording.lifted[0] + 2, recording.begun[1], recording.lifted[2]]
+    assert owners(recording, np.array(begun)).tolist() == [-1, 0, -1, -1, 1, -3]

@@ -1,0 +1,178 @@
+"""What a command cannot do is one line that says why, and leaves nothing."""
+
+import json
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import Morphology
+from design.common.files import sha256
+from design.pad.twin import TwinChannel
+from sense import Recording
+from sense.live.page_server import LivePage
+from sense.recordings.simulation.published_protocol import simulate
+from sense.settings import RigSettings
+from sense.twin.benchmark import printed_pad
+
+ROWS = """
+import noise.mat --out r                        | noise.mat
+import noise.csv --out r                        | noise.csv
+import noise.txt --out r                        | noise.txt
+import absent.mat --out r                       | absent.mat
+import absent.csv --out r                       | absent.csv
+import empty                                    | or a rosbag2 folder
+import noise.csv --out pad.toml/r               | pad.toml
+import rec --out r                              | rec: ends in '', allowed are .mat
+import noise.csv --map time=t,fibres=b --out r  | noise.csv: time is 't', expected one of 'a', 'b'
+export rec set --model model                    | allowed are .csv, .h5, .mcap, or --format lerobot
+export rec r.bag --model model                  | allowed are .csv, .h5, .mcap, or --format lerobot
+export rec r.h5 --model model                   | r.h5: what a model says can be written as .mcap or lerobot only
+export rec pad.toml/r.csv                       | pad.toml
+export rec model --format lerobot               | model: exists and is not empty
+calibrate . --out m                             | .: no recording, expected a folder with start.json
+calibrate absent --out m                        | absent: no recording, expected a folder with start.json
+calibrate pad.toml --out m                      | pad.toml: no recording, expected a folder
+calibrate rec --out pad.toml/model              | pad.toml is a file, expected a folder
+evaluate --model model rec --lost a             | 'a' is not a valid integer
+evaluate --model model rec --lost 0,1           | '0,1' is not a valid integer
+evaluate --model model rec --lost ''            | '' is not a valid integer
+evaluate --model model rec --lost {huge}        | {huge} is not in the range 0<=x<=8
+evaluate --model model other --lost 0           | readings are of 6 fibres, the localizer was learnt from 4
+locate --model absent rec --out p.csv           | absent
+locate --model model rec --out pad.toml/p.csv   | pad.toml/p.csv: cannot be written
+locate --model model rec --out model            | directory
+locate --model model rec --mask 0 --out p.csv   | padforge: fibre 0: no such fibre, allowed are 1 to 4
+locate --model model rec --mask 5 --out p.csv   | padforge: fibre 5: no such fibre, allowed are 1 to 4
+locate --model model rec --mask -1 --out p.csv  | padforge: fibre -1: no such fibre, allowed are 1 to 4
+locate --model model rec --mask 1,0 --out p.csv | padforge: fibre 0: no such fibre, allowed are 1 to 4
+locate --model model rec --mask {huge}          | fibre {huge}: no such fibre
+health --model model rec                        | health
+calibrate rec --seed 5 --out studied            | localizer.json: fibre_loss.json was made from it; choose another
+calibrate rec --features early --out studied    | localizer.json: fibre_loss.json was made from it; choose another
+recalibrate --model model rec --out studied     | localizer.json: fibre_loss.json was made from it; choose another
+identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
+recalibrate --model empty/../model model/recording | padforge: model: holds the old model; name a folder
+deploy --model model localizer.tflite           | localizer.tflite: cannot be written, expected a name that ends in
+deploy --model model rec none/l.h               | none/l.h: cannot be written, there is no folder none
+deploy --model model l.h                        | l.h: a .h learns from a recording, which is not given
+deploy --model model rec rec l.h                | rec: one argument too many, expected [RECORDING] OUT
+deploy --model model none l.h                   | none: no recording
+deploy --model model rec there.h                | there.h: cannot be written, it is there and no file
+deploy --model model other l.h                  | readings are of 6 fibres, the localizer was learnt from 4
+deploy --model model other l.onnx               | readings are of 6 fibres, the localizer was learnt from 4
+deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the least localizer of 4 fibres takes
+deploy --model model rec l.h --ram 512          | --ram is 512 bytes: the least localizer of 4 fibres takes
+deploy --model model rec l.h --ram much         | '--ram': got 'much', expected bytes, as 65536, 64k or 1M
+deploy --model rec rec l.h                      | rec/localizer.json: cannot be read
+record --presses 0 --out r                      | [rig] presses
+record --out pad.toml/rec                       | pad.toml is a file, expected a folder
+record --seed 9 --out rec                       | never written over
+record --resume                                 | --resume, --dry-run and --model need --through-drivers or a real rig
+record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
+record --twin twin.json --through-drivers       | --twin is of the simulated pad
+record --twin torn.json                         | torn.json:
+record --twin straight.json                     | straight.json:
+record --twin dead.json                         | twin: none of its channels reads a fibre
+record --twin absent.json                       | absent.json:
+record --twin twin.json --morphology large.json | [pad] grid: got 270, input should be less
+record --rig mine --through-drivers             | --through-drivers: got --rig mine, allowed are simulated, ur5, printer
+record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
+record --rig ur5 --spec none.toml               | --morphology is needed, of the pad under the arm: there is none at
+record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, the pad has 4 fibres
+record --rig ur5 --spec 3.toml --out mine       | --morphology is needed
+record --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
+record --rig ur5 --spec none.toml {seven}       | fibre 13 is on input 12, an Arduino Due has 0 to 11
+record --rig ur5 {straight} --plan serpentine   | [rig] plan: got 'serpentine', expected uniform, grid, boustrophedon,
+record --rig ur5 {unread} --plan absent.csv     | absent.csv: cannot be read
+record --rig ur5 {unread} --plan adaptive       | [rig] plan is adaptive, which needs --model
+record --rig hand {straight} --dry-run          | --dry-run and --model need an arm
+record --rig hand {straight} --model model      | --dry-run and --model need an arm
+record --rig hand {straight} --resume           | no board is found
+doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
+doctor --rig hand                               | no board is found
+doctor --rig crane                              | arms: got 'crane', allowed are
+{live} --model model --port {taken}             | port {taken} of 127.0.0.1: another program uses it
+{live} --model empty                            | localizer.json: cannot be read
+{live} --model model --replay absent            | no recording
+{live} --model model --replay other             | readings are of 6 fibres, the localizer was learnt from 4
+{live} --model model --rig ur5                  | no board is found
+{live} --model model --rig ur5 --spec 3.toml    | [rig] channels: got 3 inputs, the pad has 4 fibres
+{live} --model model --speed 0                  | --speed
+{live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines reach
+{live} --model model --replay rec --osc here    | --osc is 'here', expected HOST:PORT
+{live} --model model --replay rec --osc :9      | --osc is ':9', expected HOST:PORT
+{live} --model model --replay rec --osc a:0     | --osc is 'a:0', expected HOST:PORT
+{live} --model model --replay rec --osc a:x     | --osc is 'a:x', expected HOST:PORT
+{live} --model model --replay rec --osc a:65536 | --osc is 'a:65536', expected HOST:PORT
+{live} --model model --replay rec --osc a..b:9  | --osc is 'a..b:9': no such host
+{live} --model model --osc 255.255.255.255:9    | nothing can be sent there
+{live} --model model --host 203.0.113.1 {token} | expected an address of this machine
+{live} --model model --host no.invalid {token}  | expected an address of this machine
+{live} --model model --token ééééééééééééééééé  | token has 17 characters, allowed are 16 to 256, those of plain text
+{live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 to 256
+"""
+SHORT = {
+    "huge": "9" * 20,
+    "live": "live --port 0",
+    "token": "--token 'a word of sixteen'",
+    **{name: f"--morphology {name}.json" for name in ("straight", "five", "seven")},
+    "unread": "--morphology straight.json --spec none.toml",
+}
+
+
+@pytest.fixture(scope="module")
+def workshop(few_made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `few` has, and things that are not what they should be."""
+    folder = shutil.copytree(few_made, tmp_path_factory.mktemp("refused") / "workshop")
+    (folder / "noise.mat").write_bytes(b"no matlab" * 100)
+    (folder / "noise.csv").write_text("a,b\n1,2\n")
+    (folder / "noise.txt").write_text("hello")
+    for name in ("empty", "there.h", "mine", "designed"):
+        (folder / name).mkdir()
+    for name, grid in (("straight", 2), ("five", 5), ("seven", 7), ("large", 270), ("mine/morphology", 2)):
+        Morphology.straight(grid).save(folder / f"{name}.json")
+    (folder / "none.toml").write_text('[rig]\nport = "none"\n')
+    (folder / "3.toml").write_text('[rig]\nport = "none"\nchannels = [4, 0, 7]\n')
+    simulate(Morphology.straight(3), RigSettings(presses=30)).save(folder / "other", {})
+    shutil.copytree(folder / "model", folder / "studied")
+    made_by = json.loads((folder / "model/localizer.json").read_text())["provenance"]
+    (folder / "studied/fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": made_by}}}))
+    Recording.open(folder / "rec").save(folder / "model/recording", {})
+    designed = folder / "designed"
+    (designed / "twin.json").write_text('{"provenance": {"seed": 1}}')
+    of_twin = {"provenance": {"inputs": {"twin.json": sha256(designed / "twin.json")}}}
+    (designed / "design.json").write_text(json.dumps(of_twin))
+    twin = printed_pad(Morphology.random(2, 3, 5), np.random.default_rng(3))
+    twin.save(folder / "twin.json")
+    (folder / "torn.json").write_text((folder / "twin.json").read_text()[:500])
+    replace(twin, channels=(TwinChannel(0, None, 0.0, 0.0, 0.0),)).save(folder / "dead.json")
+    return folder
+
+
+def files_of(folder: Path) -> dict[Path, int]:
+    """When each was written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(("words", "said"), [row.split(" | ", 1) for row in ROWS.strip().splitlines()])
+def test_what_cannot_be_done_is_one_line(
+    padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
+) -> None:
+    monkeypatch.setattr("sense.localizer.calibration.fine_tuning.STEPS", 15)
+    monkeypatch.setattr("sense.rig.boards.due.serial_link.find_ports", list)
+    monkeypatch.chdir(workshop)
+    before = files_of(workshop)
+    with LivePage(0) as page:
+        meant = SHORT | {"taken": page.url.rstrip("/").rsplit(":", 1)[1]}
+        code, out, err = padforge_sense(*shlex.split(words.format(**meant)))
+    *notes, last = err.splitlines()
+    assert (code, out) == (2, "")
+    assert last.startswith("padforge: ")
+    assert said.format(**meant) in last
+    assert notes == [] or words.startswith(("{live}", "calibrate")) or "--resume" in words
+    assert files_of(workshop) == before
+    assert not {"out", "r", "recording", "m", "set"} & {path.name for path in workshop.iterdir()}

@@ -1,3 +1,0 @@
-from .hands import hands
-
-__all__ = ["hands"]
