@@ -7,7 +7,7 @@ import pytest
 
 from design import Morphology, Spec
 from design.report import comparison
-from tests.padforge.program import called
+from tests.helpers.door import called
 
 
 def test_pads_that_are_there_are_judged_as_they_are(tmp_path):

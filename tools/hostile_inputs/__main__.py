@@ -205,7 +205,8 @@ def main(where: Path, seconds: float, seed: int, first: int | None = None) -> in
         print(f"{kind:<28} {tally}")
     fresh_mib = max(campaign.fresh, default=0) / MIB
     print(f"{len(campaign.fresh)} of them in a process that began with nothing: at most {fresh_mib:.0f} MiB")
-    print(f"{number - (first or 0) + 1} inputs, {failed} violations")
+    tried = sum(tally.outcomes.total() for tally in campaign.tallies.values())
+    print(f"{tried} inputs, {failed} violations")
     return failed
 
 

@@ -235,7 +235,7 @@ def test_osc_goes_on_while_its_network_is_away(monkeypatch: pytest.MonkeyPatch) 
     from pythonosc.udp_client import UDPClient
 
     def away(client: UDPClient, content: object) -> None:
-        sent_to.append(client._address)  # pyright: ignore[reportPrivateUsage]
+        sent_to.append(client._address)  # noqa: SLF001
         raise OSError(errno.ENETUNREACH, "Network is unreachable")
 
     sent_to: list[str] = []
