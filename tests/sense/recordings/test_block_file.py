@@ -137,21 +137,3 @@ def test_writes_that_fail_half_done_are_set_right_by_the_next(tmp_path_factory, 
     found, torn = read_blocks(path, 6)
     assert np.array_equal(found, rows)
     assert not torn
-
-
-@pytest.mark.parametrize("other", [7, 8, 40])
-def test_a_stream_of_other_fibres_is_no_torn_end(tmp_path: Path, other: int) -> None:
-    """Beside the `start.json` of another recording it would be cut off to nothing where one goes on with it."""
-    write(tmp_path / "s", some_rows(40, 6))
-    before = (tmp_path / "s").read_bytes()
-    with pytest.raises(InputError, match=rf"block \d+ is whole, but not of {other} fibres"):
-        BlockWriter.resume(tmp_path / "s", other)
-    assert (tmp_path / "s").read_bytes() == before
-
-
-def test_what_a_link_leads_to_is_neither_cut_nor_written(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("of the day")
-    (tmp_path / "s").symlink_to(tmp_path / "mine")
-    with pytest.raises(InputError, match="s: is a link"):
-        BlockWriter.resume(tmp_path / "s", 6)
-    assert (tmp_path / "mine").read_text() == "of the day"

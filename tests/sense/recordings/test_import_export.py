@@ -77,16 +77,6 @@ def test_files_of_another_kind_are_one_line_and_no_recording(tmp_path: Path, end
         assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("end", ["h5", "csv"])
-def test_export_and_import_by_command(brief: Recording, tmp_path: Path, end: str) -> None:
-    brief.save(tmp_path / "run", {})
-    for arguments in (("export", "run", f"out.{end}"), ("import", f"out.{end}", "--out", "again")):
-        told = [str(tmp_path / each) if each in ("run", f"out.{end}", "again") else each for each in arguments]
-        result = CliRunner().invoke(sense, told)
-        assert result.exit_code == 0, result.output
-    assert open_recording(tmp_path / "again") == brief
-
-
 def test_a_folder_for_a_file_and_a_file_for_a_folder_are_one_line(brief: Recording, tmp_path: Path) -> None:
     for read, end in ((import_csv, "csv"), (import_mat, "mat"), (import_hdf5, "h5"), (import_bag, "mcap")):
         (tmp_path / f"folder.{end}").mkdir()

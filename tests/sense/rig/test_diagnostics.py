@@ -74,18 +74,15 @@ def test_lost_samples_and_a_rate_that_is_not_kept_fail():
     assert (looked["rate"].status, looked["board"].status) == ("fail", "warn")
 
 
-def test_devices_that_are_not_there_fail():
+def test_devices_that_are_not_there_and_an_arm_that_was_stopped_fail():
     rig = Rig()
     rig.converter.lost = rig.arm.lost = True
     assert [each.status for each in (*rig.board().values(), *rig.robot().values())] == ["fail", "fail"]
-
-
-@pytest.mark.parametrize("kind", ["protective", "emergency"])
-def test_an_arm_that_was_stopped_fails(kind):
-    rig = Rig()
-    setattr(rig.arm, f"{kind}_stop", True)
-    safety = rig.robot()["safety"]
-    assert (safety.status, safety.found) == ("fail", f"{kind} stop")
+    for kind in ("protective", "emergency"):
+        rig = Rig()
+        setattr(rig.arm, f"{kind}_stop", True)
+        safety = rig.robot()["safety"]
+        assert (safety.status, safety.found) == ("fail", f"{kind} stop")
 
 
 @pytest.mark.parametrize(

@@ -50,12 +50,6 @@ def test_what_gets_through_is_within_every_limit(pose: list[float], speed: float
     assert "speed" in refused(SAFE, speed)
 
 
-def test_targets_on_the_limits_are_safe() -> None:
-    for place in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
-        require_safe((*place, *TOOL), 250, 1200, LIMITS)
-    require_safe((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
-
-
 @pytest.mark.parametrize(
     ("pose", "speeds", "said"),
     [
@@ -80,6 +74,13 @@ def test_a_hair_beyond_a_limit_is_refused_by_its_name(pose: tuple, speeds: tuple
     assert said in refused(pose, *speeds)
 
 
+def test_targets_on_the_limits_are_safe_and_without_a_surface_none_is() -> None:
+    for place in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
+        require_safe((*place, *TOOL), 250, 1200, LIMITS)
+    require_safe((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
+    assert "surface unknown" in refused(SAFE, limits=replace(LIMITS, contact_mm=None))
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -99,12 +100,8 @@ def test_a_hair_beyond_a_limit_is_refused_by_its_name(pose: tuple, speeds: tuple
 def test_limits_that_limit_nothing_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(change)).split("_")[0]):
         replace(LIMITS, **change)  # pyright: ignore[reportArgumentType]
-
-
-def test_limits_that_just_limit_are_taken_and_without_a_surface_no_target_is_safe() -> None:
-    for change in ({"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}):
-        replace(LIMITS, **change)
-    assert "surface unknown" in refused(SAFE, limits=replace(LIMITS, contact_mm=None))
+    for just in ({"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}):
+        replace(LIMITS, **just)
 
 
 def test_limits_are_those_of_the_settings() -> None:
@@ -207,14 +204,11 @@ def test_a_move_goes_on_in_sound_states_and_ends_in_others(change: dict[str, obj
         assert "\n" not in str(caught.value)
 
 
-def test_a_force_that_nobody_watches_stops_nothing() -> None:
+def test_a_force_that_nobody_watches_stops_nothing_and_a_move_takes_as_long_as_it_may() -> None:
     watch(replace(REST, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
     safety.require_ready(REST, replace(LIMITS, max_force_n=None))
     with pytest.raises(RigFault, match='allowed "unwatched"'):
         safety.require_ready(REST, LIMITS)
-
-
-def test_a_move_may_take_as_long_as_it_may() -> None:
     with pytest.raises(RigFault, match="30 s") as caught:
         watch(REST, LIMITS, 10.4, until_s=10.3)
     assert caught.value.cause == "deadline"

@@ -22,19 +22,12 @@ def lines(rows: list[str], header: str = "time_s,a,b,x_mm,y_mm") -> str:
 FINE = ["0,1,2,,", "1,1,2,3,4", "2,1,2,3,4", "3,1,2,,", "4,1,2,-1,0", "5,1,2,,"]
 
 
-def test_a_press_lasts_while_its_place_stands_on_the_line(tmp_path: Path) -> None:
-    (tmp_path / "r.csv").write_text(lines(FINE))
-    recording = import_csv(tmp_path / "r.csv")
-    assert recording.presses_mm.tolist() == [[3, 4], [-1, 0]]
-    assert recording.begun.tolist() == [1, 4]
-    assert recording.lifted.tolist() == [3, 5]
-
-
 def test_unknown_places_and_missing_readings_are_told_by_their_cells(tmp_path: Path) -> None:
+    """A press lasts while its place stands on the line."""
     rows = ["0,1,2,,", "1,,2,?,?", "2,nan,2,?,?", "3,1,2,,", "4,1,2,-1,0", "5,1,,,", "6,1,2,?,?", "7,1,2,,", ""]
     (tmp_path / "r.csv").write_text(lines(rows))
     recording = import_csv(tmp_path / "r.csv")
-    assert recording.known.tolist() == [False, True, False]
+    np.testing.assert_array_equal(recording.presses_mm, [[np.nan] * 2, [-1, 0], [np.nan] * 2])
     assert recording.begun.tolist() == [1, 4, 6]
     assert recording.lifted.tolist() == [3, 5, 7]
     assert np.argwhere(np.isnan(recording.readings)).tolist() == [[1, 0], [2, 0], [5, 1]]
@@ -66,23 +59,14 @@ def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_p
         (lines([*FINE, "6,1,two,,"]), "line 8 holds no numbers"),
         (lines([*FINE, "6,1,2,3,"]), "line 8 has one of x_mm and y_mm"),
         (lines([*FINE, "# here", "6,1,2,3,"]), "line 9 has one of x_mm and y_mm"),
-        (lines([*FINE, "6,1,-inf,,"]), r"readings hold infinity.*row 6"),
         (lines([*FINE, "2,1,2,,"]), "do not ascend at reading 6"),
-        (lines(FINE[1:]), "press 0 goes from reading 0"),
         (lines([*FINE, "6,1,2,8,8", "7,1,2,9,9"]), "press 3 goes from"),
-        (lines([*FINE, "6,1,2,inf,8"]), "presses hold infinity"),
-        (lines([*FINE, "6,1,2,?,8"]), "press 2 has one of x and y"),
         (lines([*FINE, "6,?,2,,"]), "line 8 holds no numbers"),
         (lines([*FINE, ",1,2,,"]), r"times hold NaN.*row 6"),
         (lines([*FINE, "6,1,1e999,,"]), r"readings hold infinity.*row 6"),
         (lines([*FINE, "", "6,1,2,,"]), "line 8 has 0 values, expected 5"),
         (lines(["0,1", "1,1"], "time_s,a"), "has no press: no place or number tells one, and none is found"),
-        (lines(["0,1", "0,1"], "time_s,a"), "do not ascend at reading 1"),
-        (lines(["0,,", "1,,"], "time_s,a,b"), "readings are all missing"),
         (lines(["0,1,,1"], "time_s,x_mm,y_mm,a"), "line 2 has one of x_mm and y_mm"),
-        (lines([*FINE, "6,1,1e30,,"]), "readings hold 1e.*allowed is"),
-        (lines([*FINE, "6,1,2,1e200,8"]), "presses hold 1e.*allowed is"),
-        (lines([*FINE, "1e300,1,2,,"]), "times hold 1e.*allowed is"),
         (lines(FINE, "\x00" * 500), r"header is '\\x00.{0,40}', expected time_s"),
     ],
 )
@@ -111,8 +95,7 @@ def test_a_mapping_tells_what_other_columns_hold(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.times_s, np.arange(6) / 10)
     np.testing.assert_allclose(recording.readings[:, 0], [1.0005, 1.001, np.nan, 1, 1, 1])
     assert recording.presses_mm.tolist() == [[15, 20], [-5, 20]]
-    assert recording.begun.tolist() == [1, 4]
-    assert recording.lifted.tolist() == [3, 5]
+    assert (recording.begun.tolist(), recording.lifted.tolist()) == ([1, 4], [3, 5])
     assert recording.source == {"kind": "csv", "file": "lab.csv", "mapping": mapping}
 
 
@@ -121,10 +104,7 @@ def test_a_mapping_tells_what_other_columns_hold(tmp_path: Path) -> None:
     [
         ("time=t,fibres=ch*", "time is 't', expected one of 't_ms', 'ch1', 'ch2', 'note', 'px', 'py', 'contact'"),
         ("time=note,fibres=ch*", "line 3 holds no numbers .could not convert string to float: 'begin'"),
-        (
-            "time=t_ms,fibres=ch*,begun=px,lifted=py",
-            "mapping has 'begun=px'.* one of time, fibres, x, y, depth",
-        ),
+        ("time=t_ms,fibres=ch*,begun=px,lifted=py", "mapping has 'begun=px'.* one of time, fibres, x, y, depth"),
         ("time=px,fibres=ch*:mV", "times do not ascend"),
         ("time=t_ms,fibres=c*:mV,press=ch2", "press is nowhere 0"),
     ],
@@ -235,14 +215,7 @@ def test_what_is_no_table_is_one_line(tmp_path: Path, content: bytes, message: s
     assert len(str(refused.value)) < 300 + len(str(tmp_path))
 
 
-def test_more_than_is_allowed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_table, "MOST_VALUES", 100)
-    (tmp_path / "t.csv").write_text("x_mm,y_mm\n" + "1,2\n" * 51)
-    with pytest.raises(InputError, match="more than 100 values"):
-        read_plan(tmp_path / "t.csv", 1.0)
-
-
-def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path) -> None:
+def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 10 MB most are notes; a line that is no number is named by its number wherever it stands."""
     rows = [f"{at},{at % 7},{at % 40 // 20},{'n' * 1000}" for at in range(10_000)]
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
@@ -251,6 +224,9 @@ def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path) -> None:
     rows[9000] = rows[9000].replace("9000", "9OOO")
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
     with pytest.raises(InputError, match="line 9002 holds no numbers"):
+        import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
+    monkeypatch.setattr(csv_table, "MOST_VALUES", 100)
+    with pytest.raises(InputError, match="more than 100 values"):
         import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
 
 

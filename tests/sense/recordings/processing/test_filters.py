@@ -204,17 +204,15 @@ def test_very_many_readings(count):
 @pytest.mark.parametrize("fidelity", ["robust", "squares"])
 def test_shapes_and_kinds_of_arrays(fidelity):
     y = np.random.default_rng(2).normal(size=(2000, 6))
-    x = total_variation(y, 2, fidelity)
+    x, single = total_variation(y, 2, fidelity), y.astype(np.float32)
     assert x.shape == y.shape
-    np.testing.assert_array_equal(total_variation(np.asfortranarray(y), 2, fidelity), x)
-    np.testing.assert_array_equal(
-        total_variation(y[::2, ::-2], 2, fidelity), total_variation(y[::2, ::-2].copy(), 2, fidelity)
-    )
     np.testing.assert_array_equal(total_variation(y[:, 3], 2, fidelity), x[:, 3])
-    single = y.astype(np.float32)
-    np.testing.assert_array_equal(
-        total_variation(single, 2, fidelity), total_variation(single.astype(float), 2, fidelity)
-    )
+    for other, plain in (
+        (np.asfortranarray(y), y),
+        (y[::2, ::-2], y[::2, ::-2].copy()),
+        (single, single.astype(float)),
+    ):
+        np.testing.assert_array_equal(total_variation(other, 2, fidelity), total_variation(plain, 2, fidelity))
     assert total_variation(single, 2, fidelity).dtype == np.float64
     np.testing.assert_array_equal(single, y.astype(np.float32))  # readings are left as they are
     np.testing.assert_array_equal(total_variation([3, 1, 2], 50), [2, 2, 2])
@@ -251,20 +249,15 @@ def test_stretches_begin_after_long_intervals():
         (lambda: total_variation(np.zeros((2, 2, 2)), 4), r"shape \(2, 2, 2\), expected \(R,\) or \(R, C\)"),
         (lambda: total_variation(3.0, 4), r"shape \(\), expected"),
         (lambda: total_variation(["a"], 4), "readings are .* expected an array of real numbers"),
-        (lambda: total_variation([1j], 4), "expected an array of real numbers"),
         (lambda: total_variation([1], 0), "lam is 0, allowed is a number above 0"),
         (lambda: total_variation([1], np.nan), "lam is nan"),
-        (lambda: total_variation([1], np.inf), "lam is inf"),
         (lambda: total_variation([1], 4, "huber"), "fidelity is 'huber', allowed is robust or squares"),  # type: ignore[arg-type]
         (lambda: total_variation([1, 2], 4, starts=[2]), "starts are .*, allowed are ascending indices of 2 readings"),
-        (lambda: total_variation([1, 2], 4, starts=[1, 1]), "ascending"),
         (lambda: total_variation([1, 2], 4, starts=[0.5]), "starts are .* whole numbers"),
         (lambda: running_median([1], 4), "width is 4, allowed is an odd whole number above 0"),
         (lambda: running_median([1], 3.0), "width is 3.0"),  # type: ignore[arg-type]
-        (lambda: running_median([1], -1), "width is -1"),
         (lambda: running_median([-np.inf], 3), "readings hold -inf"),
         (lambda: stretches([0, 2, 1], 1), "times_s are .*, expected finite numbers that ascend"),
-        (lambda: stretches([np.inf, np.inf], 1), "finite"),
         (lambda: stretches([[0]], 1), "shape"),
         (lambda: stretches(np.broadcast_to(1.0, 2**40), 1), "times_s are 1099511627776 numbers, allowed are"),
         (lambda: stretches([0], 0), "longest_s is 0, allowed is a number above 0"),

@@ -58,7 +58,6 @@ def test_presses_of_the_published_recording_are_found(published: Path) -> None:
     ("grid", "rig"),
     [
         (4, RigSettings(presses=150)),
-        (4, RigSettings(presses=150, noise_mv=0)),
         (4, RigSettings(presses=150, noise_mv=5)),
         (4, RigSettings(presses=150, drift_mv=150)),
         (4, RigSettings(presses=150, hysteresis=0.5, creep=0.4)),
@@ -149,12 +148,8 @@ COUNT = 3.3 / 1023
 def test_noise_is_no_press(fibres: int, sd: float, step: float, rate_hz: float, seed: int) -> None:
     readings = 2 + sd * np.random.default_rng(seed).standard_normal((5000, fibres))
     readings = np.rint(readings / step) * step if step else readings
-    assert len(find_presses(readings, np.arange(5000) / rate_hz).touched) == 0
-
-
-@pytest.mark.parametrize("readings", [np.full((300, 3), np.nan), np.zeros((1, 3))])
-def test_where_nothing_happens_nothing_is_found(readings: np.ndarray) -> None:
-    assert len(find_presses(readings, np.arange(len(readings)) / RATE_HZ).touched) == 0
+    for nothing in (readings, np.full((300, 3), np.nan), np.zeros((1, 3))):
+        assert len(find_presses(nothing, np.arange(len(nothing)) / rate_hz).touched) == 0
 
 
 def spoilt(kind: str, readings: np.ndarray) -> np.ndarray:
@@ -317,12 +312,8 @@ SCENES = {
     (2, 5.0, 60): (40, 21532, 22152),
     (3, 100.0, 40): (36, 218694, 224817),
     (4, 300.0, 25): (23, 374517, 393217),
-    (5, 30.0, 60): (59, 170815, 173827),
-    (6, 14.0, 120): (105, 310988, 313704),
     (7, 14.0, 120): (98, 294192, 297817),
     (8, 14.0, 120): (87, 249420, 253232),
-    (9, 14.0, 120): (87, 248623, 252247),
-    (10, 30.0, 100): (65, 321638, 329859),
     (11, 8.0, 120): (60, 100596, 102451),
     (12, 14.0, 200): (121, 527170, 533804),
 }

@@ -49,18 +49,17 @@ def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
     assert rig.box_mm == pytest.approx((100 - HALF, 100 + HALF, 90 - HALF, 90 + HALF, 3.0, 130.0), abs=1e-5)
     require_safe_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
+    box = on_bed(
+        RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder
+    ).box_mm  # it ends where the nozzle does
+    assert box is not None
+    assert (box[0], box[3]) == (95, 90)
 
 
 @pytest.mark.parametrize(("place", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
 def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, depth):
     with pytest.raises(RigFault, match="no move"):
         require_safe_plan(PressPlan(np.array([place]), np.array([depth])), on_bed(RIG, folder))
-
-
-def test_the_workspace_ends_where_the_nozzle_does(folder):
-    box = on_bed(RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder).box_mm
-    assert box is not None
-    assert (box[0], box[3]) == (95, 90)
 
 
 def test_what_rig_says_counts_more(folder):

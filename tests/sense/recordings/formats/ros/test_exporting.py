@@ -95,26 +95,21 @@ def test_an_export_reads_back_the_same_and_is_reproducible(eight: Recording, bag
     assert [file.name for file in tmp_path.iterdir()] == ["eight.mcap"]
 
 
-@pytest.mark.parametrize("shift", [-1e3, 1.7e9, 5e9, 0.1234567890123])
-def test_times_of_any_clock_come_back(eight: Recording, tmp_path: Path, shift: float) -> None:
-    shifted = replace(eight, times_s=eight.times_s + shift)
-    export_bag(shifted, tmp_path / "r.mcap")
-    assert import_bag(tmp_path / "r.mcap").digest == shifted.digest
-
-
-def test_presses_on_end_and_one_that_is_never_lifted_come_back(eight: Recording, tmp_path: Path) -> None:
-    begun = np.array([10, 21, 200])
-    packed = Recording(eight.readings, eight.times_s, np.eye(3, 2), begun, np.array([20, 30, len(eight.readings)]))
-    export_bag(packed, tmp_path / "r.mcap")
-    assert import_bag(tmp_path / "r.mcap") == packed
+def test_times_of_any_clock_presses_on_end_and_one_that_is_never_lifted_come_back(
+    eight: Recording, tmp_path: Path
+) -> None:
+    edges = np.array([10, 21, 200]), np.array([20, 30, len(eight.readings)])
+    others = [replace(eight, times_s=eight.times_s + shift) for shift in (-1e3, 1.7e9, 5e9, 0.1234567890123)]
+    for other in (*others, Recording(eight.readings, eight.times_s, np.eye(3, 2), *edges)):
+        export_bag(other, tmp_path / "r.mcap")
+        assert (found := import_bag(tmp_path / "r.mcap")) == other
+        assert found.digest == other.digest
 
 
 def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: Path) -> None:
     depth = np.where(np.arange(8) < 4, 2.0, np.nan)
-    places, faults = (
-        (np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])),
-        [FaultFound(5, (1,), "open", "fibre 2 is open")],
-    )
+    places = np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])
+    faults = [FaultFound(5, (1,), "open", "fibre 2 is open")]
     findings = ModelFindings(*places, np.ones(8), depth, depth / 4, faults, (3,))
     export_bag(eight, tmp_path / "r.mcap", findings)
     found, kinds = others_read(tmp_path / "r.mcap")
@@ -122,15 +117,12 @@ def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: 
     stamp, first = found["/pad/touches"][0]
     assert stamp == found["/pad/readings"][eight.lifted[0]][0]
     np.testing.assert_allclose(xyz(first.pose.pose.position), [0.003, 0.003, -0.002])
-    np.testing.assert_allclose(
-        [first.pose.covariance[at] for at in (0, 7, 14)], np.square([5e-4, 2.5e-4, 5e-4 / 1.6449])
-    )
+    spread = np.sqrt([first.pose.covariance[at] for at in (0, 7, 14)])
+    np.testing.assert_allclose(spread, [5e-4, 2.5e-4, 5e-4 / 1.6449])
     assert found["/pad/touches"][7][1].pose.covariance[14] == -1
     levels = [[status.level for status in content.status] for _, content in found["/pad/health"]]
-    assert [[int(bytes([level])[0]) if isinstance(level, int) else level[0] for level in each] for each in levels] == [
-        [0, 0, 0, 2],
-        [0, 2, 0, 2],
-    ]
+    numbers = [[level if isinstance(level, int) else level[0] for level in each] for each in levels]
+    assert numbers == [[0, 0, 0, 2], [0, 2, 0, 2]]
     told = found["/pad/health"][1][1].status[1]
     assert (told.name, told.message, told.values[0].value) == ("pad: fibre 2", "fibre 2 is open", "open")
     assert import_bag(tmp_path / "r.mcap") == eight
@@ -158,9 +150,7 @@ def test_what_import_would_not_take_is_not_written(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exporting, "MOST_MESSAGES", 100)
-    with pytest.raises(
-        InputError, match=r"would be \d+ messages of \d+ bytes and 0 of an arm or a model, allowed in a bag are 100"
-    ):
+    with pytest.raises(InputError, match=r"would be \d+ messages .* allowed in a bag are 100"):
         export_bag(eight, tmp_path / "r.mcap")
     monkeypatch.undo()
     with pytest.raises(InputError, match=r"too long for a bag: \d+ characters of times, presses and source"):

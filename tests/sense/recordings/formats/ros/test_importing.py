@@ -10,14 +10,14 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from design.common.errors import InputError
-from sense import Recording, import_mat, open_recording
+from sense import Recording, open_recording
 from sense.recordings.formats.ros.exporting import export_bag
 from sense.recordings.formats.ros.importing import import_bag
 from sense.recordings.import_export import import_file
 
 from .foreign import STORE, Message, array, make, pose, wrench, write_bag
 
-READINGS, PRESSED, PLACE, FORCE = "/pad/readings", "/pad/pressed", "/pad/place", "/pad/force"
+READINGS, PLACE = "/pad/readings", "/pad/place"
 
 
 def changed(bag: Path, folder: Path, change: Callable[[str, float, Any], bool]) -> Path:
@@ -207,10 +207,3 @@ def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
     expected = import_file(write_bag(tmp_path / "lab", messages), ALL)
     assert import_file(tmp_path / "bag", ALL) == expected
     assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected
-
-
-@pytest.mark.slow
-def test_the_published_recording_comes_back_to_the_bit(published: Path, tmp_path: Path) -> None:
-    recording = import_mat(published / "para5_long_first4500.mat")
-    export_bag(recording, tmp_path / "r.mcap")
-    assert import_bag(tmp_path / "r.mcap").digest == recording.digest

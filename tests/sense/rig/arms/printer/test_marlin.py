@@ -10,10 +10,7 @@ from sense.rig.arms.printer.motion import StraightMove
 M115 = [
     "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"
     " PROTOCOL_VERSION:1.0 MACHINE_TYPE:Ender-3 Pro EXTRUDER_COUNT:1 UUID:cede2a2f-41a2-4748-9b12-c55c62f367ff",
-    "Cap:SERIAL_XON_XOFF:0",
-    "Cap:EEPROM:1",
-    "Cap:EMERGENCY_PARSER:1",
-    "Cap:AUTOREPORT_POS:0",
+    *("Cap:SERIAL_XON_XOFF:0", "Cap:EEPROM:1", "Cap:EMERGENCY_PARSER:1", "Cap:AUTOREPORT_POS:0"),
 ]
 M503 = [
     "echo:; Maximum feedrates (units/s):",
@@ -35,21 +32,14 @@ def test_lines_are_written_as_marlin_reads_them():
 @pytest.mark.parametrize(
     ("read", "line", "expected"),
     [
-        (marlin.resend, "Resend: 42", 42),
-        (marlin.resend, "Resend:7", 7),
-        (marlin.resend, "rs N12", 12),
-        (marlin.resend, "Resend: ", None),
-        (marlin.resend, "ok", None),
-        (marlin.resend, "Resend: 4x", None),
+        *((marlin.resend, line, number) for line, number in (("Resend: 42", 42), ("Resend:7", 7), ("rs N12", 12))),
+        *((marlin.resend, line, None) for line in ("Resend: ", "ok", "Resend: 4x")),
         (marlin.place, "X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
         (marlin.place, "X:1.00 Y:2.00 Z:3.00", (1.0, 2.0, 3.0)),
-        (marlin.place, "X:1.00 Y:2.00 Z:3.0o E:0.00", None),
-        (marlin.place, "X:1.00 Y:2.00", None),
-        (marlin.place, "T:20.1 /0.0 B:20.0 /0.0", None),
+        *((marlin.place, line, None) for line in ("X:1.00 Y:2.00 Z:3.0o E:0.00", "X:1.00 Y:2.00", "T:20.1 /0.0")),
         (marlin.halts, "Error:Printer halted. kill() called!", True),
         (marlin.halts, "Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
-        (marlin.halts, "Error:checksum mismatch, Last Line: 41", False),
-        (marlin.halts, "echo:Printer halted", False),
+        *((marlin.halts, line, False) for line in ("Error:checksum mismatch, Last Line: 41", "echo:Printer halted")),
     ],
 )
 def test_a_line_is_read_whole_or_not_at_all(read, line, expected):

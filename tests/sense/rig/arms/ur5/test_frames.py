@@ -2,6 +2,7 @@
 
 import json
 import struct
+from itertools import chain, repeat
 from unittest import mock
 
 import numpy as np
@@ -63,22 +64,6 @@ def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
     assert (np.diff(times) > 0).all()
 
 
-class Link:
-    """A socket that hands out what a controller sends, frame by frame."""
-
-    def __init__(self, sent: list[bytes]) -> None:
-        self._sent = iter(sent)
-
-    def recv(self, most: int) -> bytes:
-        return next(self._sent, b"")
-
-    def settimeout(self, seconds: float) -> None: ...
-
-    def setsockopt(self, *option: int) -> None: ...
-
-    def sendall(self, data: bytes) -> None: ...
-
-
 def state(*values: float) -> bytes:
     return frames.frame(frames.DATA, b"\x01" + frames.layout(TYPES).pack(*values))
 
@@ -95,7 +80,9 @@ def stream(*states: bytes, major: int = 5, version: bytes = b"\x01", types: list
 
 
 def reader(sent: list[bytes]) -> RtdeReader:
-    with mock.patch("socket.create_connection", return_value=Link(sent)):
+    """One that connects to a controller which sends that, frame by frame, and then no more."""
+    link = mock.Mock(recv=mock.Mock(side_effect=chain(sent, repeat(b""))))
+    with mock.patch("socket.create_connection", return_value=link):
         return RtdeReader("arm", 1.0)
 
 
