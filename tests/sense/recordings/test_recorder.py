@@ -263,16 +263,13 @@ def test_what_would_spoil_a_recording_is_refused_and_leaves_it_as_it_was(tmp_pat
 def test_presses_without_a_number_count_on_from_the_last(tmp_path):
     """One that was aborted is made again under its number; after a break the count goes on."""
     with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
-        for number in range(2):
-            recorder.append(np.arange(5) / 10 + number, np.zeros((5, FIBRES)))
-            recorder.begin((0, 0), recorder.readings)
-            recorder.finish(recorder.readings)
-        recorder.begin((0, 0), recorder.readings)
-        recorder.abort("the arm stopped")
-        recorder.begin((0, 0), recorder.readings)
-        recorder.finish(recorder.readings)
-        recorder.begin((0, 0), recorder.readings, press=7)
-        recorder.finish(recorder.readings)
+        recorder.append(np.arange(5) / 10, np.zeros((5, FIBRES)))
+        for press in (None, None, "aborted", None, 7):
+            recorder.begin((0, 0), recorder.readings, press=None if press == "aborted" else press)
+            if press == "aborted":
+                recorder.abort("the arm stopped")
+            else:
+                recorder.finish(recorder.readings)
         assert recorder.done == {0, 1, 2, 7}
         with pytest.raises(InputError, match="press 8 was not begun"):
             recorder.finish(recorder.readings)

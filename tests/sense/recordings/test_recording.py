@@ -140,21 +140,16 @@ def test_one_missing_reading_is_as_another(recording: Recording) -> None:
     assert one.known.tolist() == [press != 3 for press in range(300)]
 
 
-def test_uneven_times_and_a_recording_of_one_press_and_two_readings_are_fine(
-    recording: Recording, tmp_path: Path
-) -> None:
+def test_what_is_uneven_little_or_at_the_ends_of_what_is_allowed_is_fine(recording: Recording, tmp_path: Path) -> None:
+    assert replace(recording, begun=recording.begun.astype(float)) == recording
+    for name, index, most in (("readings", (7, 0), 1e3), ("presses_mm", (3, 1), 1e5), ("times_s", -1, 1e10)):
+        for value in {most, -most if name != "times_s" else most}:
+            assert getattr(replace(recording, **{name: spoiled(getattr(recording, name), index, value)}), name).size
     uneven = np.cumsum(np.random.default_rng(0).exponential(0.07, len(recording.times_s)))
     assert replace(recording, times_s=uneven).rate_hz == pytest.approx(1 / 0.07 / np.log(2), rel=0.1)
     least = Recording(np.ones((2, 1)), np.arange(2.0), np.full((1, 2), np.nan), np.array([1]), np.array([2]))
     least.save(tmp_path / "run", {})
     assert Recording.open(tmp_path / "run") == least
-
-
-def test_indices_may_be_whole_floats_and_values_at_the_ends_of_what_is_allowed(recording: Recording) -> None:
-    assert replace(recording, begun=recording.begun.astype(float)) == recording
-    for name, index, most in (("readings", (7, 0), 1e3), ("presses_mm", (3, 1), 1e5), ("times_s", -1, 1e10)):
-        for value in {most, -most if name != "times_s" else most}:
-            assert getattr(replace(recording, **{name: spoiled(getattr(recording, name), index, value)}), name).size
 
 
 def test_a_folder_that_is_no_recording_is_said_to_be_none(folder: Path, tmp_path: Path) -> None:

@@ -1,13 +1,10 @@
 """Recordings as CSV, of padforge and of other programs: every number comes back, and other tables are refused."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from design.common.errors import InputError
 from sense import Recording, export_csv, import_csv
@@ -228,33 +225,3 @@ def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(csv_table, "MOST_VALUES", 100)
     with pytest.raises(InputError, match="more than 100 values"):
         import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
-
-
-PLAIN = st.one_of(
-    st.floats(-1e3, 1e3).map(repr),
-    st.sampled_from(["", "nan", "inf", "-Infinity", " 1", "2 ", "1e5", ".5", "5.", "+1", "1_0", '"1"', "a", "?"]),
-    st.text(max_size=4),
-)
-
-
-@settings(max_examples=40)
-@given(
-    rows=st.lists(st.lists(PLAIN, min_size=2, max_size=2), min_size=1, max_size=8),
-    separator=st.sampled_from(",;\t"),
-    end=st.sampled_from(["\n", "\r\n"]),
-)
-def test_a_comment_makes_no_difference_to_what_is_read(tmp_path_factory, rows, separator, end) -> None:
-    """Lines as plain as those of most files are read at once, others one by one."""
-
-    def results(comment: str) -> Iterator[str]:
-        path = tmp_path_factory.getbasetemp() / "t.csv"
-        told = [separator.join(("time_s", "a", "x_mm", "y_mm")), *(separator.join(["1", "1", *row]) for row in rows)]
-        text = end.join([*told, *comment.split()])
-        path.write_text(text.encode("utf-8", "replace").decode(), encoding="utf-8", newline="")
-        table = csv_table.CsvTable(path)
-        try:
-            yield repr(table.columns([0, 1, 2, 3], unknown=[2, 3]).tolist())
-        except InputError as error:
-            yield str(error)
-
-    assert [*results("")] == [*results("#comment")]

@@ -23,15 +23,10 @@ def streamed(stream, readings, cuts=()):
 
 
 @settings(max_examples=50)
-@given(RECORDINGS, CUTS, LAMS, FIDELITY)
-def test_total_variation_of_blocks_is_that_of_the_whole(y, cuts, lam, fidelity):
+@given(RECORDINGS, CUTS, LAMS, FIDELITY, st.sampled_from([1, 3, 7, 99]), st.booleans())
+def test_what_comes_of_blocks_is_that_of_the_whole(y, cuts, lam, fidelity, width, causal):
     x = streamed(TotalVariation(y.shape[1], lam, fidelity), y, cuts)
     np.testing.assert_array_equal(x, total_variation(y, lam, fidelity))
-
-
-@settings(max_examples=50)
-@given(RECORDINGS, CUTS, st.sampled_from([1, 3, 7, 99]), st.booleans())
-def test_running_median_of_blocks_is_that_of_the_whole(y, cuts, width, causal):
     x = streamed(RunningMedian(y.shape[1], width, causal), y, cuts)
     np.testing.assert_array_equal(x, running_median(y, width, causal=causal))
 

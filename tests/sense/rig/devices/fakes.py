@@ -19,10 +19,10 @@ from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
 FIBRES = 4
-RIG = RigSettings(
-    **{"presses": 6, "rate_hz": 100, "converter_rate_hz": 1000, "readings_per_press": 40},
-    **{"pad_mm": (0.0, -400.0), "contact_mm": 50.0, "box_mm": (-100, 100, -500, -300, 40, 120)},
-    **{"travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 2000},
+RIG = RigSettings.model_validate(
+    {"presses": 6, "rate_hz": 100, "converter_rate_hz": 1000, "readings_per_press": 40}
+    | {"pad_mm": (0.0, -400.0), "contact_mm": 50.0, "box_mm": (-100, 100, -500, -300, 40, 120)}
+    | {"travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 2000}
 )
 
 

@@ -165,8 +165,8 @@ def test_other_firmware_is_refused(monkeypatch):
         fault_of(arm.connect, "refused", "only once it stands; allowed is Marlin 2")
 
 
-def test_orders_that_are_none_are_refused_and_break_nothing():
-    with connected() as (arm, _):
+def test_orders_that_are_none_and_a_second_program_are_refused_and_break_nothing():
+    with connected() as (arm, printer), closing(driven(printer)) as second:
         for order, match in (
             ((110, 110, 40, 0.0, 3.0, 0.0), "a printer cannot turn it"),
             (pose(float("nan"), 110, 40), "finite numbers"),
@@ -176,17 +176,11 @@ def test_orders_that_are_none_are_refused_and_break_nothing():
         arm.move(pose(110, 110, 39.5), 10.0, 1000.0)
         with pytest.raises(RigFault, match="under way"):
             arm.move(pose(110, 110, 40), 10.0, 100.0)
-        assert to_rest(arm).pose[2] == pytest.approx(39.5)
-
-
-def test_a_port_in_use_is_refused_and_free_again_after_close():
-    with connected() as (arm, printer):
-        second = driven(printer)
         fault_of(second.connect, "refused", "another program uses it")
+        assert to_rest(arm).pose[2] == pytest.approx(39.5)
         arm.close()
         arm.close()
         second.connect()
-        second.close()
 
 
 def test_every_line_is_executed_once_and_in_its_turn_whatever_noise_there_is():
@@ -204,7 +198,7 @@ def test_every_line_is_executed_once_and_in_its_turn_whatever_noise_there_is():
         assert np.array([made.move.end for made in printer.firmware.made[1:]]) == pytest.approx(ends)
 
 
-def test_what_is_silent_is_no_printer():
+def test_what_is_silent_is_no_printer_and_a_board_that_restarts_as_its_port_is_opened_does_so_once():
     with EmulatedPrinter(AT) as printer, closing(MarlinLink(printer.port, BAUD)) as link:
         printer.busy(60)
         fault_of(lambda: link.begin(0.2), "refused", "no printer answers; check .* printer_baud")
@@ -212,6 +206,11 @@ def test_what_is_silent_is_no_printer():
         link.begin(2.0)
         printer.busy(60)
         fault_of(lambda: link.ask("M114", 0.3), "stale", r"not answered for 0\.3 s; it may be busy")
+    with EmulatedPrinter(AT, restarts=True) as printer:
+        with closing(MarlinLink(printer.port, BAUD)) as link:
+            fault_of(lambda: link.begin(2.0), "refused", "restarted")
+        with closing(MarlinLink(printer.port, BAUD)) as link:
+            link.begin(2.0)
 
 
 @pytest.mark.slow
@@ -220,11 +219,3 @@ def test_what_never_falls_silent_is_no_printer():
     board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4))
     with board, closing(MarlinLink(board.port, BAUD)) as link:
         assert fault_of(lambda: link.begin(0.5), "refused", "no printer answers") < 5
-
-
-def test_a_board_that_restarts_as_its_port_is_opened_does_so_once():
-    with EmulatedPrinter(AT, restarts=True) as printer:
-        with closing(MarlinLink(printer.port, BAUD)) as link:
-            fault_of(lambda: link.begin(2.0), "refused", "restarted")
-        with closing(MarlinLink(printer.port, BAUD)) as link:
-            link.begin(2.0)

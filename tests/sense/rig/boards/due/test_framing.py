@@ -263,12 +263,3 @@ def test_a_block_that_cannot_follow_is_a_fault(second: Block) -> None:
 def test_blocks_of_other_channels_are_a_fault(assembles: Assembler) -> None:
     with pytest.raises(RigFault, match="other channels"):
         assembles.samples([(1.0, block(0))])
-
-
-def test_columns_are_volts_in_the_order_of_the_fibres_and_nothing_new_is_an_empty_reading() -> None:
-    assembles = assembler((7, 1, 3), 2)
-    empty = assembles.samples([])
-    assert (empty.times_s.shape, empty.volts.shape, empty.missing.shape) == ((0,), (0, 3), (0,))
-    assert empty.missing.dtype == np.int64
-    samples = assembles.samples([(1.0, Block(np.array([[10, 30, 70]], np.uint16), 2, 0b1000_1010, 0, 0, 1000, 0))])
-    assert samples.volts / STEP_V == pytest.approx(np.array([[35, 5, 15]]))

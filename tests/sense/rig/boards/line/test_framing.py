@@ -74,19 +74,6 @@ def test_any_bit_byte_or_newline_that_is_wrong_costs_its_lines_and_gives_no_othe
             assert found[0] == SAMPLES[0]
 
 
-@settings(max_examples=20)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_noise_gives_nothing_that_was_not_sent(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    samples = [Sample(k * 2000, tuple(rng.integers(4096, size=4).tolist())) for k in range(300)]
-    stream = bytearray(b"".join(sample_line(each.time_us, each.counts, True) for each in samples))
-    for at in np.flatnonzero(rng.random(len(stream)) < 3e-3)[::-1].tolist():
-        stream[at : at + 1] = rng.bytes(int(rng.integers(4)))
-    found, decoder = decoded(bytes(stream))
-    assert set(found) <= set(samples)
-    assert len(found) + decoder.damaged >= 250
-
-
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
@@ -160,16 +147,6 @@ def read(times_us: list[int] | np.ndarray, assembler: Assembler | None = None) -
     assembler = assembler or Assembler(THREE, (0, 1, 2))
     counts = [(k, 10, 1023) for k in range(len(times_us))]
     return assembler.samples([(1.0, Lines([int(time_us) for time_us in times_us], counts))])
-
-
-def test_counts_become_volts_in_the_order_of_the_fibres_and_nothing_new_is_an_empty_reading() -> None:
-    assembler = Assembler(THREE, (2, 0))
-    empty = assembler.samples([])
-    assert (empty.times_s.shape, empty.volts.shape, empty.missing.shape) == ((0,), (0, 2), (0,))
-    assert empty.missing.dtype == np.int64
-    samples = read([1000, 2000], assembler)
-    assert samples.volts == pytest.approx(np.array([[5, 0], [5, 5 / 1023]]))
-    assert np.diff(samples.times_s) == pytest.approx([1e-3])
 
 
 WRAPPED = ((2**32 - 3000 + 1000 * np.array([0, 1, 4, 5, 25])) % 2**32).tolist()
