@@ -28,14 +28,6 @@ def test_a_plan_survives_json():
     assert set(made(presses=30).depths_mm) == {5.0}
 
 
-def test_a_serpentine_takes_short_steps():
-    serpentine, grid = made(presses=36, plan="boustrophedon"), made(presses=36, plan="grid")
-    step = 45 / 5
-    assert np.linalg.norm(np.diff(serpentine.places_mm, axis=0), axis=1) == pytest.approx(step)
-    assert np.linalg.norm(np.diff(grid.places_mm, axis=0), axis=1).max() > 4 * step
-    assert {*map(tuple, serpentine.places_mm.round(6))} == {*map(tuple, grid.places_mm.round(6))}
-
-
 def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row():
     line = [-22.5, 0.0, 22.5]
     rows = [(x, y) for y in line for x in line]

@@ -223,8 +223,8 @@ def test_two_programs_cannot_record_into_one_folder(tmp_path):
     assert len(Recording.open(path).begun) == 7
 
 
-def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
-    def full():
+def test_a_full_disk_leaves_nothing_of_a_birth_and_on_closing_does_not_hide_what_went_wrong(tmp_path, monkeypatch):
+    def full(*_):
         raise OSError(28, "No space left on device")
 
     def broken():
@@ -234,6 +234,12 @@ def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
 
     with pytest.raises(RuntimeError, match="the first thing"):
         broken()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(InputError, match="No space left"):
+            Recorder(tmp_path / "born" / "run", FIBRES, {}, {})
+    assert list((tmp_path / "born" / "run").iterdir()) == []
+    made(tmp_path / "born")
 
 
 @pytest.mark.parametrize(
@@ -314,18 +320,6 @@ def test_what_another_left_is_in_the_way_and_stays(tmp_path, name):
     with pytest.raises(InputError, match="exists and is not empty"):
         Recorder(tmp_path, FIBRES, {}, {})
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "mine", JOURNAL: ""}
-
-
-def test_a_birth_that_fails_leaves_nothing(tmp_path, monkeypatch):
-    def full(file):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(InputError, match="No space left"):
-            Recorder(tmp_path / "run", FIBRES, {}, {})
-    assert list((tmp_path / "run").iterdir()) == []
-    made(tmp_path)
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="what is open is told on Linux")

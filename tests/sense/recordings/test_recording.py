@@ -38,7 +38,9 @@ def test_a_torn_stream_loses_the_presses_it_had(recording: Recording, folder: Pa
     assert np.array_equal(found.readings, recording.readings[: len(found.readings)])
 
 
-def test_a_recording_is_never_written_over(recording: Recording, folder: Path, tmp_path: Path) -> None:
+def test_a_recording_is_never_written_over_nor_where_it_cannot_be(
+    recording: Recording, folder: Path, tmp_path: Path
+) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(InputError, match="never written over"):
         recording.save(folder, {})
@@ -46,6 +48,15 @@ def test_a_recording_is_never_written_over(recording: Recording, folder: Path, t
     (tmp_path / "empty").mkdir()
     recording.save(tmp_path / "empty", {})
     assert Recording.open(tmp_path / "empty") == recording
+    (tmp_path / "file").write_text("kept")
+    for path in (tmp_path / "file", tmp_path / "file" / "below" / "run"):
+        for write in (lambda path: recording.save(path, {}), lambda path: Recorder(path, 3, {}, {})):
+            with pytest.raises(InputError, match="file is a file, expected a folder"):
+                write(path)
+    with pytest.raises(InputError, match=r"cannot be written \(File name too long\)"):
+        recording.save(tmp_path / ("n" * 300), {})
+    assert (tmp_path / "file").read_text() == "kept"
+    assert {found.name for found in tmp_path.iterdir()} == {"run", "empty", "file"}
 
 
 @pytest.mark.parametrize(
@@ -182,19 +193,6 @@ def test_of_two_saves_into_one_folder_the_first_stays_and_the_second_is_told(
         late.save(path, {})
     assert Recording.open(path) == recording
     assert [found.name for found in tmp_path.iterdir()] == ["run"]
-
-
-def test_a_place_that_cannot_be_written_is_one_clear_line(recording: Recording, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("kept")
-    for path in (tmp_path / "file", tmp_path / "file" / "below" / "run"):
-        with pytest.raises(InputError, match="file is a file, expected a folder"):
-            recording.save(path, {})
-        with pytest.raises(InputError, match="file is a file, expected a folder"):
-            Recorder(path, 3, {}, {})
-    with pytest.raises(InputError, match=r"cannot be written \(File name too long\)"):
-        recording.save(tmp_path / ("n" * 300), {})
-    assert (tmp_path / "file").read_text() == "kept"
-    assert [found.name for found in tmp_path.iterdir()] == ["file"]
 
 
 def test_depth_and_force_belong_to_a_press_but_not_to_the_digest(recording: Recording, tmp_path: Path) -> None:

@@ -53,16 +53,13 @@ def test_presses_are_told_in_many_ways(arrays: dict[str, np.ndarray]) -> None:
     assert recording.presses_mm.tolist() == (PLACES.T if arrays.get("places", AT).dtype == "f4" else PLACES).tolist()
 
 
-def test_readings_lie_one_way_or_the_other() -> None:
+def test_readings_lie_one_way_or_the_other_and_units_are_put_right() -> None:
     assert np.array_equal(made(EDGES | {"fibres": VOLTS.T}).readings, VOLTS)
     one = made(EDGES | {"fibres": VOLTS[:, 0], "time": TIMES[None]})
     assert np.array_equal(one.readings, VOLTS[:, :1])
     parts = [(Part("time", ""), TIMES), (Part("fibres", ""), VOLTS[:, 1]), (Part("fibres", "", 2.0), VOLTS.T)]
     several = assembled(Path("f"), [*parts, *((Part(name, ""), EDGES[name]) for name in EDGES)], {})
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
-
-
-def test_units_are_put_right() -> None:
     told = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "places": PLACES / 10}
     edges = {"begun": np.array([150, 601]), "lifted": np.array([500, 801])}
     recording = made(told | edges, **dict.fromkeys(("time", "fibres", "begun", "lifted"), 1e-3), places=10)

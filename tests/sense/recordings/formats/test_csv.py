@@ -99,7 +99,6 @@ def test_a_mapping_tells_what_other_columns_hold(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ("time=t,fibres=ch*", "time is 't', expected one of 't_ms', 'ch1', 'ch2', 'note', 'px', 'py', 'contact'"),
         ("time=note,fibres=ch*", "line 3 holds no numbers .could not convert string to float: 'begin'"),
         ("time=t_ms,fibres=ch*,begun=px,lifted=py", "mapping has 'begun=px'.* one of time, fibres, x, y, depth"),
         ("time=px,fibres=ch*:mV", "times do not ascend"),
@@ -132,7 +131,12 @@ def test_every_number_comes_back_and_measures_have_columns_where_they_are_known(
         assert import_csv(tmp_path / "r.csv") == changed
 
 
-def test_a_mapping_names_depth_and_force(tmp_path: Path) -> None:
+def test_a_mapping_names_depth_force_places_in_any_unit_and_names_with_separators_in_quotes(tmp_path: Path) -> None:
+    rows = ["0,1,,,12:30", "1,1,?,?,1_0", "2,1,,,?", "3,1,2,-1,", "4,1,,,"]
+    (tmp_path / "lab.csv").write_text("\n".join(['"t;s;x","a;b",px,py,note', *rows]) + "\n")
+    for unit, value in (("cm", 10.0), ("um", 1e-3)):
+        recording = import_csv(tmp_path / "lab.csv", f"time=t;s;x,fibres=a;b,x=px:{unit},y=py:{unit}")
+        np.testing.assert_allclose(recording.presses_mm, [[np.nan, np.nan], [2 * value, -value]])
     rows = [f"{0.1 * i},{1 + (i // 10 % 2)},{i // 10 % 2},{250 * (i // 20)},{0.1 * (i // 20)}" for i in range(60)]
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,force_mN,deep_cm", *rows]))
     mapping = "time=t,fibres=a,press=down,force=force_mN:mN,reached=deep_cm:cm"
@@ -140,14 +144,6 @@ def test_a_mapping_names_depth_and_force(tmp_path: Path) -> None:
     assert found.forces_n.tolist() == [0, 0.25, 0.5]
     assert found.reached_mm == pytest.approx([0, 1, 2])
     assert np.isnan(found.depths_mm).all()
-
-
-@pytest.mark.parametrize(("unit", "value"), [("cm", 10.0), ("um", 1e-3)])
-def test_an_unknown_place_is_unknown_in_any_unit(tmp_path: Path, unit: str, value: float) -> None:
-    rows = ["0,1,,", "1,1,?,?", "2,1,,", "3,1,2,-1", "4,1,,"]
-    (tmp_path / "lab.csv").write_text("\n".join(["t,a,px,py", *rows]) + "\n")
-    recording = import_csv(tmp_path / "lab.csv", f"time=t,fibres=a,x=px:{unit},y=py:{unit}")
-    np.testing.assert_allclose(recording.presses_mm, [[np.nan, np.nan], [2 * value, -value]])
 
 
 @pytest.mark.parametrize(
@@ -169,13 +165,6 @@ def test_programs_write_the_same_table_in_many_ways(tmp_path: Path, change) -> N
     (tmp_path / "plain.csv").write_text(lines(FINE))
     (tmp_path / "r.csv").write_text(change(lines(FINE)), encoding="utf-8", newline="")
     assert import_csv(tmp_path / "r.csv") == import_csv(tmp_path / "plain.csv")
-
-
-def test_names_may_hold_separators_in_quotes_and_other_columns_anything(tmp_path: Path) -> None:
-    rows = ["0,12:30,1,0", "1,1_0,2,1", "2,,2,1", "3,?,1,0"]
-    (tmp_path / "r.csv").write_text("\n".join(['"t;s;x",note,"a;b",down', *rows]))
-    found = import_csv(tmp_path / "r.csv", "time=t;s;x,fibres=a;b,press=down")
-    assert found.readings.tolist() == [[1], [2], [2], [1]]
 
 
 CELLS = ["1_0", "\u0661", "\uff11", "0x10", "1 2", '"1,5"', "two", "1e", "--1", "?", "1d5", "?5", "5?"]

@@ -111,7 +111,7 @@ def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
     return content
 
 
-def test_a_mapping_tells_what_other_datasets_hold(tmp_path: Path) -> None:
+def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_path: Path) -> None:
     content = lab(tmp_path)
     mapping = "time=/t:ms,fibres=/data/volts:mV,places=/xy:cm,begun=/on,lifted=off"
     recording = import_hdf5(tmp_path / "lab.h5", mapping)
@@ -124,9 +124,6 @@ def test_a_mapping_tells_what_other_datasets_hold(tmp_path: Path) -> None:
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
     lab(tmp_path, **{"data/volts": None, "data/ch0": content["data/volts"][0], "data/ch1": content["data/volts"][1]})
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("volts", "ch*")).fibres == 2
-
-
-def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path: Path) -> None:
     lab(tmp_path)
     there = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     for mapping, reason in (

@@ -27,7 +27,7 @@ CYCLE = Cycle(40, 13.3)
 STILL: dict[str, Any] = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
 
 
-def test_it_has_the_published_form() -> None:
+def test_it_has_the_published_form_and_presses_no_more_than_is_sensed() -> None:
     recording = simulate(PAD, RigSettings(presses=400))
     assert recording.readings.shape == (16_000, 8)
     assert np.array_equal(recording.begun, 40 * np.arange(400) + 20)
@@ -35,9 +35,6 @@ def test_it_has_the_published_form() -> None:
     assert np.abs(recording.presses_mm).max() <= 22.5
     assert np.abs(recording.presses_mm).max(axis=0).min() > 21
     assert recording.rate_hz == pytest.approx(13.3, rel=0.02)
-
-
-def test_a_recording_says_what_is_sensed_of_the_pad_and_presses_no_more() -> None:
     assert simulate(PAD, RigSettings(presses=1)).source["sensed_mm"] == "beyond"
     strip = simulate(PAD, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8)))
     assert strip.source["sensed_mm"] == [50, 8]
@@ -77,13 +74,10 @@ def test_the_divider_rests_where_it_should_and_the_adc_gives_whole_steps_within_
     assert np.abs(digitised(volts) - np.clip(volts, 0, SUPPLY_V)).max() <= SUPPLY_V / ADC_STEPS / 2 * (1 + 1e-9)
 
 
-def test_the_rest_wanders_slowly_about_its_place() -> None:
-    drift = Wander(200, 13.3, np.random.default_rng(0))(10_000)
-    assert drift.std() == pytest.approx(1, rel=0.05)
-    assert np.diff(drift, axis=0).std() == pytest.approx(np.sqrt(2 / (13.3 * 600)), rel=0.02)
-
-
-def test_asked_bit_by_bit_the_model_gives_the_same() -> None:
+def test_the_rest_wanders_slowly_about_its_place_and_asked_bit_by_bit_the_model_gives_the_same() -> None:
+    wander = Wander(200, 13.3, np.random.default_rng(0))(10_000)
+    assert wander.std() == pytest.approx(1, rel=0.05)
+    assert np.diff(wander, axis=0).std() == pytest.approx(np.sqrt(2 / (13.3 * 600)), rel=0.02)
     pieces = [1, 7, 1, 40, 3]
     strained = np.random.default_rng(0).uniform(0, 2, (sum(pieces), 3))
     model = Answer(13.3, 0.2, 0.3, 2.5)

@@ -54,11 +54,19 @@ def test_a_dead_channel_shows_the_noise_of_readings_alone_and_a_seed_tells_it_al
     assert live.std() > 5 * dead.std()
 
 
-def test_a_mirrored_pad_answers_as_at_the_mirrored_place() -> None:
+def test_a_mirrored_pad_answers_as_at_the_mirrored_place_and_is_pressed_where_it_was_printed() -> None:
     places = np.array([[4.0, 3.0], [-7.0, 1.0], [2.0, -9.0]])
     plain, mirrored = (measured(twin_of(Frame(mirrored=mirrored))) for mirrored in (False, True))
     assert mirrored.answers(places * [-1, 1]) == pytest.approx(plain.answers(places))
     assert np.abs(mirrored.answers(places) - plain.answers(places)).max() > 0.01
+    twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
+    for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
+        recording = simulate(replace(twin, frame=Frame(turn_deg=turn_deg)), RigSettings(presses=400))
+        assert np.ptp(recording.presses_mm, axis=0) == pytest.approx(sides, rel=0.02)
+    askew = replace(twin, frame=Frame(turn_deg=10, scale=0.8))
+    half = np.array(measured(askew).pressed_mm[1])
+    spans = np.ptp(askew.frame.to_plan(half * [[-1, -1], [-1, 1], [1, 1], [1, -1]]), axis=0)
+    assert spans == pytest.approx((20, 10))
 
 
 @pytest.mark.parametrize(("looks", "rig"), [(1.0, {}), (4.0, {}), (1.0, {"drift_mv": 100.0, "noise_mv": 5.0})])
@@ -70,17 +78,6 @@ def test_responses_scatter_as_the_twin_says(looks: float, rig: dict) -> None:
     assert recording.source["rig"].items() >= (measures | {"creep": 0}).items()
     scatter = responses(recording) - measured(twin).answers(recording.presses_mm)
     assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / looks**0.5, rel=0.08)
-
-
-def test_it_is_pressed_where_the_printed_pad_was() -> None:
-    twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
-    for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
-        recording = simulate(replace(twin, frame=Frame(turn_deg=turn_deg)), RigSettings(presses=400))
-        assert np.ptp(recording.presses_mm, axis=0) == pytest.approx(sides, rel=0.02)
-    askew = replace(twin, frame=Frame(turn_deg=10, scale=0.8))
-    half = np.array(measured(askew).pressed_mm[1])
-    spans = np.ptp(askew.frame.to_plan(half * [[-1, -1], [-1, 1], [1, 1], [1, -1]]), axis=0)
-    assert spans == pytest.approx((20, 10))
 
 
 def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin() -> None:

@@ -80,16 +80,13 @@ def test_other_settings_are_refused(begun, key, value):
         plan_of(setup(begun), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
 
 
-def test_another_pad_is_refused_and_other_limits_and_addresses_are_not(begun):
+def test_another_pad_is_refused_and_other_limits_addresses_and_sides_that_nobody_named_are_not(begun, tmp_path):
     limits = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1)}
     resumed(begun, **limits, host="arm", port="COM3")
     with pytest.raises(InputError, match="another pad"):
         resumed(begun, Morphology.random(2, 3, 1))
     with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
         resumed(begun, Morphology.straight(3), channels=())
-
-
-def test_a_recording_of_before_there_was_a_side_to_name_counts_as_not_mirrored(begun, tmp_path):
     document = json.loads((begun / START).read_text())
     assert document["source"]["rig"].pop("mirrored") is False
     (tmp_path / START).write_text(json.dumps(document))

@@ -37,11 +37,15 @@ def retreated(arm: FakeArm) -> FakeArm:
     return arm
 
 
-def test_a_force_that_falls_lets_the_tool_off() -> None:
+def test_a_force_that_falls_lets_the_tool_off_and_above_the_pad_it_is_lifted_off_what_it_presses() -> None:
     arm = retreated(pressed(DEEP_MM, lambda arm: 25 * max(0.0, 50 - arm.pose[2])))
     assert arm.pose[2] == pytest.approx(50 + HEIGHT_MM)
     assert arm.stops == 0
     assert arm.time() - 100 == pytest.approx((4 + HEIGHT_MM) / SPEED_MM_S, abs=0.1)
+    assert retreated(pressed(75.0, lambda arm: 0.0)).moves == []
+    arm = retreated(pressed(75.0, lambda arm: 80.0 if arm.pose[2] < 76 else 0.0))
+    assert arm.pose[2] == pytest.approx(75 + HEIGHT_MM)
+    assert retreated(pressed(115.0, lambda arm: 80.0 if arm.pose[2] < 116 else 0.0)).pose[2] == LIMITS.box_mm[2][1]
 
 
 @pytest.mark.parametrize(
@@ -82,13 +86,6 @@ def test_a_tool_too_deep_or_at_the_edge_of_the_box_comes_up(x: float, y: float, 
     arm = pressed(z, lambda arm: 0.0)
     arm.pose = (x, y, *arm.pose[2:])
     assert retreated(arm).pose[:3] == (x, y, pytest.approx(50 + HEIGHT_MM))
-
-
-def test_a_tool_above_the_pad_is_only_lifted_off_what_it_presses() -> None:
-    assert retreated(pressed(75.0, lambda arm: 0.0)).moves == []
-    arm = retreated(pressed(75.0, lambda arm: 80.0 if arm.pose[2] < 76 else 0.0))
-    assert arm.pose[2] == pytest.approx(75 + HEIGHT_MM)
-    assert retreated(pressed(115.0, lambda arm: 80.0 if arm.pose[2] < 116 else 0.0)).pose[2] == LIMITS.box_mm[2][1]
 
 
 @pytest.mark.slow

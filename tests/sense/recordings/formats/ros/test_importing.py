@@ -66,7 +66,9 @@ def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path:
     np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.known]) / 1000)
 
 
-def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, tmp_path: Path) -> None:
+def test_a_part_of_a_bag_is_what_its_messages_say_and_what_is_edited_counts(
+    eight: Recording, bag: Path, tmp_path: Path
+) -> None:
     first, end = (int(stamps) for stamps in (eight.begun[1] + 3, eight.begun[6] + 2))
     span = eight.times_s[[first, end]] + [-1e-6, 1e-6]
     kept = lambda topic, time, _: topic == "/pad/recording" or span[0] <= time <= span[1]  # noqa: E731
@@ -83,8 +85,6 @@ def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, t
     )
     close(found, part)
 
-
-def test_what_is_edited_counts(eight: Recording, bag: Path, tmp_path: Path) -> None:
     def edited(topic: str, _: float, message: Any) -> bool:
         if topic == PLACE:
             message.pose.pose.position.x += moved_m

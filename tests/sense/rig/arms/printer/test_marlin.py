@@ -22,11 +22,20 @@ M503 = [
 ]
 
 
-def test_lines_are_written_as_marlin_reads_them():
+def test_lines_are_written_as_marlin_reads_them_and_what_a_printer_says_of_itself_is_read():
     """A numbered line ends in the exclusive or of its bytes, a move is in mm/min."""
     assert marlin.numbered(0, "M110 N0") == b"N0 M110 N0*125\n"
     assert marlin.numbered(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
     assert marlin.move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
+    found = marlin.Firmware.of(M115)
+    assert found.name == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
+    assert found.machine == "Ender-3 Pro"
+    assert found.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
+    assert marlin.Firmware.of(["echo: hello"]) == marlin.Firmware()
+    assert marlin.limits(M503, "M203") == (500.0, 400.0, 5.0)
+    assert marlin.limits(M503, "M201") == (500.0, 500.0, 100.0)
+    assert marlin.limits(M503[2:], "M203") is None
+    assert marlin.limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
 
 
 @pytest.mark.parametrize(
@@ -46,22 +55,10 @@ def test_a_line_is_read_whole_or_not_at_all(read, line, expected):
     assert read(line) == expected
 
 
-def test_what_a_printer_says_of_itself_and_of_its_axes():
-    found = marlin.Firmware.of(M115)
-    assert found.name == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
-    assert found.machine == "Ender-3 Pro"
-    assert found.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
-    assert marlin.Firmware.of(["echo: hello"]) == marlin.Firmware()
-    assert marlin.limits(M503, "M203") == (500.0, 400.0, 5.0)
-    assert marlin.limits(M503, "M201") == (500.0, 500.0, 100.0)
-    assert marlin.limits(M503[2:], "M203") is None
-    assert marlin.limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
-
-
 LONG_WAY = StraightMove((0.0, 0.0, 0.0), (30.0, 40.0, 0.0), 10.0, 20.0)
 
 
-def test_a_long_move_has_a_trapezoid_of_speed_and_a_short_one_never_reaches_it():
+def test_moves_have_a_trapezoid_of_speed_and_no_axis_exceeds_its_limits():
     assert LONG_WAY.duration_s == pytest.approx(50 / 10 + 10 / 20)
     assert LONG_WAY.at(-1.0) == LONG_WAY.start
     assert LONG_WAY.at(0.5) == pytest.approx((1.5, 2.0, 0.0))  # 2.5 mm while it gains speed
@@ -74,9 +71,6 @@ def test_a_long_move_has_a_trapezoid_of_speed_and_a_short_one_never_reaches_it()
     nowhere = StraightMove((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 10.0, 10.0)
     assert nowhere.duration_s == 0
     assert nowhere.within((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)).at(0.0) == nowhere.end
-
-
-def test_no_axis_exceeds_its_limits():
     move = LONG_WAY.within((3.0, 100.0, 1.0), (100.0, 4.0, 1.0))  # z does not move, and limits nothing
     assert move.speed * 0.6 == pytest.approx(3.0)
     assert move.acceleration * 0.8 == pytest.approx(4.0)

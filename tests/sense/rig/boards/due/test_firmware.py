@@ -123,11 +123,15 @@ def test_start_twice_goes_on_and_settings_wait_for_stop(program: Path) -> None:
     assert [(block.first, block.mask) for block in blocks] == [(0, 0xFF), (16, 0xFF), (0, 3)]
 
 
-def test_a_host_too_slow_costs_whole_blocks_and_they_are_counted(program: Path) -> None:
+def test_a_host_too_slow_costs_whole_blocks_that_are_counted_and_one_that_closes_the_port_stops_it(
+    program: Path,
+) -> None:
     frames = run(program, START, f"trigger {16 * 70}", "loop 100", "trigger 16", "loop 2")
     blocks = [block for block in frames if isinstance(block, Block)]
     assert [block.first for block in blocks[:64]] == list(range(0, 1024, 16))
     assert [(block.first, block.overruns, block.sequence) for block in blocks[64:]] == [(1120, 96, 64)]
+    frames = run(program, START, "trigger 16", "loop 2", "close", "trigger 64", "loop 20")
+    assert sum(isinstance(frame, Block) for frame in frames) == 1
 
 
 @pytest.mark.parametrize("trouble", [["slip", "trigger 64"], ["masked 64"]])
@@ -136,11 +140,6 @@ def test_lost_conversions_stop_the_board_rather_than_give_wrong_values(program: 
     assert [block.first for block in frames if isinstance(block, Block)] == [0]
     assert isinstance(frames[-1], Ack)
     assert (frames[-1].command, frames[-1].status) == (Kind.STOP, Status.HALTED)
-
-
-def test_it_stops_when_the_host_closes_the_port(program: Path) -> None:
-    frames = run(program, START, "trigger 16", "loop 2", "close", "trigger 64", "loop 20")
-    assert sum(isinstance(frame, Block) for frame in frames) == 1
 
 
 def test_it_says_what_it_is_and_damaged_commands_are_passed_over(program: Path) -> None:

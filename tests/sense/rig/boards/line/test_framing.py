@@ -97,7 +97,7 @@ def test_a_line_that_is_no_sample_is_counted_and_said(line: bytes, complaint: st
     assert (decoder.damaged, decoder.in_a_row) == (1, 0)
 
 
-def test_what_is_wrong_with_most_lines_is_said_and_lines_for_people_are_passed_over() -> None:
+def test_lines_for_people_wrong_ones_and_those_without_a_header_are_passed_over_and_noise_does_not_grow() -> None:
     short = sample_line(2000, (1, 2, 3), True)
     found, decoder = decoded(b"# warming up\n", LINES[0], b"#\n\n")
     assert (found, decoder.damaged) == ([SAMPLES[0]], 0)
@@ -107,9 +107,6 @@ def test_what_is_wrong_with_most_lines_is_said_and_lines_for_people_are_passed_o
     header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"  # whose check may be left out
     found, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
     assert (found, decoder.damaged) == ([Sample(10, (1, 2))], 1)
-
-
-def test_without_a_header_nothing_is_a_sample_and_noise_without_an_end_does_not_grow() -> None:
     decoder = Decoder()
     assert decoder.feed(b"boot: 1,2,3\n" + LINES[0]) == []
     for _ in range(1000):
