@@ -12,22 +12,15 @@ from design.common.errors import InputError
 from sense import Recorder, Recording
 
 
-def test_a_run_directory_gives_back_the_recording(recording: Recording, folder: Path) -> None:
+def test_a_run_directory_gives_back_the_recording_and_a_torn_stream_loses_the_presses_it_had(
+    recording: Recording, folder: Path
+) -> None:
     found = Recording.open(folder)
     assert found == recording
     assert found.digest == recording.digest
     assert found.source == recording.source
     assert found.torn_presses == 0
     assert sorted(path.name for path in folder.parent.iterdir()) == ["run"]
-
-
-def test_which_side_was_up_is_as_rig_said(recording: Recording) -> None:
-    for source in ({}, {"rig": {}}, {"rig": {"mirrored": "unknown"}}):
-        assert replace(recording, source=source).mirrored is False
-    assert replace(recording, source={"rig": {"mirrored": True}}).mirrored is True
-
-
-def test_a_torn_stream_loses_the_presses_it_had(recording: Recording, folder: Path) -> None:
     stream = folder / "readings.bin"
     stream.write_bytes(stream.read_bytes()[: -10 * 256 - 3])
     found = Recording.open(folder)
@@ -36,6 +29,12 @@ def test_a_torn_stream_loses_the_presses_it_had(recording: Recording, folder: Pa
     assert left + found.torn_presses == len(recording.presses_mm)
     assert np.array_equal(found.presses_mm, recording.presses_mm[:left])
     assert np.array_equal(found.readings, recording.readings[: len(found.readings)])
+
+
+def test_which_side_was_up_is_as_rig_said(recording: Recording) -> None:
+    for source in ({}, {"rig": {}}, {"rig": {"mirrored": "unknown"}}):
+        assert replace(recording, source=source).mirrored is False
+    assert replace(recording, source={"rig": {"mirrored": True}}).mirrored is True
 
 
 def test_a_recording_is_never_written_over_nor_where_it_cannot_be(

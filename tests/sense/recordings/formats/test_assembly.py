@@ -34,11 +34,9 @@ MISSING = np.where(PRESSED, NUMBERED, np.nan)
     [
         EDGES | {"places": PLACES},
         EDGES | {"x": PLACES[:, 0], "y": PLACES[None, :, 1]},
-        EDGES | {"places": AT},
         EDGES | {"places": AT.T},
         {"press": PRESSED, "places": PLACES},
         {"press": PRESSED.astype(bool)[:, None], "places": AT},
-        {"press": NUMBERED, "x": AT[:, 0], "y": AT[:, 1]},
         {"press": MISSING, "places": AT},
         {"press": np.where(PRESSED, NUMBERED, -1), "places": PLACES.T.astype(np.float32)},
         {"places": np.where(PRESSED[:, None], AT, np.nan)},

@@ -125,7 +125,7 @@ def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value:
     assert "\n" not in str(caught.value)
 
 
-def test_a_mat_may_hold_what_real_rigs_give(tmp_path: Path) -> None:
+def test_a_mat_may_hold_what_real_rigs_give_and_no_places(tmp_path: Path) -> None:
     content = good()
     volts = content["voltage"]
     holed = volts.copy()
@@ -146,9 +146,6 @@ def test_a_mat_may_hold_what_real_rigs_give(tmp_path: Path) -> None:
         assert np.array_equal(recording.readings, (content | change)["voltage"], equal_nan=True)
         assert np.array_equal(recording.times_s, (content | change)["tim"].ravel())
         assert np.array_equal(recording.presses_mm, content["pos"].T)
-
-
-def test_a_mat_without_places_has_presses_of_unknown_place(tmp_path: Path) -> None:
     content = good()
     scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
     blind = import_mat(tmp_path / "blind.mat")

@@ -133,7 +133,8 @@ def test_nothing_is_coupled_across_starts_or_channels(y, starts, fidelity):
     np.testing.assert_array_equal(running_median(y, 5, starts), expected)
 
 
-def test_a_press_is_kept_or_cut_by_its_length_and_of_several_minimisers_it_is_the_middle_one():
+def test_a_press_is_kept_or_cut_by_its_length_and_stretches_begin_after_long_intervals():
+    # of several minimisers it is the middle one
     y = np.zeros(60)
     y[20:27], y[40:49] = 1, 1  # lam = 4 cuts bumps of fewer than 8 readings, and an end of fewer than 4
     x = total_variation(y, 4)
@@ -149,6 +150,12 @@ def test_a_press_is_kept_or_cut_by_its_length_and_of_several_minimisers_it_is_th
     levels = [np.append(np.full(4, level), y[4:]) for level in (-0.1, 0.0, 1.0, 1.1)]
     below, lowest, highest, above = (objective(y, other, 2) for other in levels)
     assert below > lowest == objective(y, x, 2) == highest < above
+    times = np.array([0, 0.1, 0.2, 5.2, 5.3, 99])
+    np.testing.assert_array_equal(stretches(times, 1), [3, 5])
+    np.testing.assert_array_equal(stretches(times, 1000), [])
+    np.testing.assert_array_equal(stretches([], 1), [])
+    y = np.array([0, 0, 0, 1, 1, 0.0])
+    np.testing.assert_array_equal(total_variation(y, 4, starts=stretches(times, 1)), y)
 
 
 def hostile(count):
@@ -212,15 +219,6 @@ def test_running_median_is_numpys_of_each_window(y, width, causal):
     windows = [y[max(i - before, 0) : i + after + 1] for i in range(len(y))]
     expected = [np.median(w[~np.isnan(w)]) if (~np.isnan(w)).any() else np.nan for w in windows]
     np.testing.assert_allclose(running_median(y, width, causal=causal), expected, rtol=1e-15)
-
-
-def test_stretches_begin_after_long_intervals():
-    times = np.array([0, 0.1, 0.2, 5.2, 5.3, 99])
-    np.testing.assert_array_equal(stretches(times, 1), [3, 5])
-    np.testing.assert_array_equal(stretches(times, 1000), [])
-    np.testing.assert_array_equal(stretches([], 1), [])
-    y = np.array([0, 0, 0, 1, 1, 0.0])
-    np.testing.assert_array_equal(total_variation(y, 4, starts=stretches(times, 1)), y)
 
 
 @pytest.mark.parametrize(

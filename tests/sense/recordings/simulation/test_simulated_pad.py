@@ -34,7 +34,7 @@ def responses(recording: Recording) -> np.ndarray:
     return cycles[:, 25:40].mean(axis=1) - cycles[:, 8:20].mean(axis=1)
 
 
-def test_responses_have_the_sizes_and_signs_of_the_twin_on_the_channels_it_names() -> None:
+def test_channels_respond_as_the_twin_names_them_a_dead_one_by_noise_alone_and_a_seed_tells_it_all() -> None:
     twin = twin_of(Frame(turn_deg=5, shift_mm=(2, -1), scale=0.9))
     recording = simulate(twin, RigSettings(presses=200, hysteresis=0, **STILL))
     expected = np.zeros((200, 4))
@@ -43,9 +43,6 @@ def test_responses_have_the_sizes_and_signs_of_the_twin_on_the_channels_it_names
     assert found == pytest.approx(expected, abs=4e-3)  # creep of the press before, and steps of the converter
     assert np.corrcoef(found[:, 0], expected[:, 0])[0, 1] > 0.999
     assert found[:, [0, 2, 3]].min(axis=0) == pytest.approx(expected[:, [0, 2, 3]].min(axis=0), rel=0.05)
-
-
-def test_a_dead_channel_shows_the_noise_of_readings_alone_and_a_seed_tells_it_all() -> None:
     twin, rig = twin_of(noise_v=0.02), RigSettings(presses=200, drift_mv=0, noise_mv=2)
     recording = simulate(twin, rig)
     assert recording == simulate(twin, rig) != simulate(twin, rig.model_copy(update={"seed": 4}))

@@ -62,7 +62,7 @@ def test_a_chunk_that_unpacks_to_gigabytes_does_not(tmp_path: Path, form: str, c
     tracemalloc.stop()
 
 
-def test_what_chunks_say_of_themselves_has_to_be_so(tmp_path: Path) -> None:
+def test_what_chunks_and_messages_say_of_themselves_has_to_be_so(tmp_path: Path) -> None:
     content = channel(1, "/f", FLOATS)
     untold = record(4, struct.pack("<HH", 1, 9) + text("/f") + text("cdr") + bytes(4))
     for name, made, reason in (
@@ -80,13 +80,6 @@ def test_what_chunks_say_of_themselves_has_to_be_so(tmp_path: Path) -> None:
         ("long", record(3, bytes(2) + struct.pack("<I", 2**31)), "a record ends before its content"),
     ):
         assert reason in refused(mcap_file(tmp_path / f"{name}.mcap", [made]))
-
-
-def cdr(*parts: bytes) -> bytes:
-    return b"\0\1\0\0" + b"".join(parts)
-
-
-def test_messages_that_lie_are_one_line(tmp_path: Path) -> None:
     for body, reason in (
         (cdr(struct.pack("<III", 0, 0, 2**32 - 1), bytes(8)), "ends before data does"),
         (cdr(struct.pack("<I", 2**32 - 1), bytes(400)), "ends before"),
@@ -106,6 +99,10 @@ def test_messages_that_lie_are_one_line(tmp_path: Path) -> None:
     ]
     path = mcap_file(tmp_path / "shapes.mcap", [channel(1, "/f", FLOATS), chunk(b"".join(shapes))])
     assert "messages are of more than 256 shapes" in refused(path)
+
+
+def cdr(*parts: bytes) -> bytes:
+    return b"\0\1\0\0" + b"".join(parts)
 
 
 def test_stamps_beyond_all_clocks_and_counts_beyond_all_bags_are_refused(

@@ -116,7 +116,7 @@ def test_faults_are_told_within_two_seconds(disturb, cause, match, under_way):
         assert fault_of(arm.state, cause, match) < 2
 
 
-def test_a_stop_that_is_not_confirmed_halts_the_printer():
+def test_a_stop_that_is_not_confirmed_halts_the_printer_and_a_place_beyond_its_reach_is_told_before():
     with connected() as (arm, printer):
         arm.move(pose(110, 110, 10), 10.0, 3000.0)
         time.sleep(0.3)
@@ -129,9 +129,6 @@ def test_a_stop_that_is_not_confirmed_halts_the_printer():
         time.sleep(0.05)
         assert printer.firmware.halted
         assert printer.nozzle_at(begun + 0.6)[0] == pytest.approx(printer.nozzle_at(begun + 5)[0])
-
-
-def test_a_place_beyond_the_printers_reach_is_told_before_it_goes_there():
     with connected() as (arm, printer):
         with pytest.raises(RigFault, match=r"is about to go to 220\.00, .* but was sent to 230\.00") as fault:
             arm.move(pose(260, 110, 40), 50.0, 3000.0)
