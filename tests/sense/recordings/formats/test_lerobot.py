@@ -177,9 +177,6 @@ def test_a_folder_appears_whole_or_not_at_all(
     unknown = replace(eight, presses_mm=np.full((8, 2), np.nan))
     with pytest.raises(InputError, match="no place of a press is known"):
         export_lerobot(unknown, tmp_path / "other")
-
-
-def test_without_pyarrow_it_is_one_line(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"set: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):
-        export_lerobot(eight, tmp_path / "set")
+    with pytest.raises(InputError, match=r"more: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):
+        export_lerobot(eight, tmp_path / "more")

@@ -114,7 +114,6 @@ def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
         ("pos", np.ones((2, 0)), "pos has shape"),
         ("pos", np.ones((2, 5)), "each of the 5 presses of pos, 200 in all; only the last may be cut off"),
         ("tim", np.where(np.arange(120) == 7, 6, np.arange(120)), "times do not ascend at reading 7"),
-        ("tim", np.arange(100.0), "times have shape"),
     ],
 )
 def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value: Any, message: str) -> None:

@@ -115,20 +115,7 @@ def test_presses_show_and_end_as_late_as_the_published_ones_and_creep_in_two_pac
     np.testing.assert_allclose(creeping, 1 - 0.1 * (np.exp(-steps / 4) + np.exp(-steps / 60)))
 
 
-def test_the_live_pad_answers_where_and_as_deep_as_the_tip_presses() -> None:
-    pad = Morphology.straight(2)
-    model = LivePad(pad, PUBLISHED_CONTACT, RigSettings(**STILL), 1000.0, np.random.default_rng(0))
-    depths = np.repeat([-5.0, 0.0, 2.5, 5.0], 20)
-    volts = model.volts(np.tile([-5.0, 7.0], (80, 1)), depths)
-    rest, above, half, full = (volts[20 * i + 10] for i in range(4))
-    assert np.array_equal(rest, above)
-    touched = signals(pad, pad.to_grid([[-5.0, 7.0]]), PUBLISHED_CONTACT)[0] > 0
-    assert touched.any()
-    assert ((full < half) & (half < rest))[touched].all()
-    assert np.array_equal(full[~touched], rest[~touched])
-
-
-def test_it_presses_as_deep_as_planned_and_answers_in_proportion() -> None:
+def test_a_pad_recorded_or_live_answers_where_and_in_proportion_to_how_deep_it_is_pressed() -> None:
     light, deep, mixed = (
         simulate(PAD, RigSettings(presses=40, depths_mm=depths, **STILL)) for depths in ((1.0,), (4.0,), (1.0, 4.0))
     )
@@ -141,3 +128,13 @@ def test_it_presses_as_deep_as_planned_and_answers_in_proportion() -> None:
     assert swing[1] / swing[0] == pytest.approx(4, rel=0.05)
     with pytest.raises(InputError, match="plan is adaptive"):
         simulate(PAD, RigSettings(plan="adaptive"))
+    pad = Morphology.straight(2)
+    model = LivePad(pad, PUBLISHED_CONTACT, RigSettings(**STILL), 1000.0, np.random.default_rng(0))
+    depths = np.repeat([-5.0, 0.0, 2.5, 5.0], 20)
+    volts = model.volts(np.tile([-5.0, 7.0], (80, 1)), depths)
+    rest, above, half, full = (volts[20 * i + 10] for i in range(4))
+    assert np.array_equal(rest, above)
+    touched = signals(pad, pad.to_grid([[-5.0, 7.0]]), PUBLISHED_CONTACT)[0] > 0
+    assert touched.any()
+    assert ((full < half) & (half < rest))[touched].all()
+    assert np.array_equal(full[~touched], rest[~touched])

@@ -77,7 +77,7 @@ def test_responses_scatter_as_the_twin_says(looks: float, rig: dict) -> None:
     assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / looks**0.5, rel=0.08)
 
 
-def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin() -> None:
+def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin_or_is_refused() -> None:
     twin, other = twin_of(Frame(mirrored=True, shift_mm=(3, 3))), Morphology.random(3, knots=2, seed=1, pitch_mm=9)
     recording = simulate(other, RigSettings(presses=100, hysteresis=0, creep=0, **STILL), like=twin)
     expected = -0.05 * relative_stretch(other, other.to_grid(recording.presses_mm), twin.contact())
@@ -85,9 +85,6 @@ def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_tw
     assert recording.source["contact"] == twin.contact().model_dump(mode="json")
     assert recording.source["twin"]["presses"] == 900
     assert np.abs(recording.presses_mm).max() == pytest.approx(13.5, rel=0.02)
-
-
-def test_twins_and_pads_that_cannot_be_simulated_are_refused() -> None:
     dead = replace(twin_of(), channels=tuple(TwinChannel(c, None, 0.0, 0.0, 0.0) for c in range(2)))
     for pad, like in ((dead, None), (PAD, dead)):
         with pytest.raises(InputError, match="twin: none of its channels reads a fibre"):

@@ -44,7 +44,7 @@ def changed(folder, tmp_path) -> Callable[..., Path]:
     return write
 
 
-def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
+def test_the_mould_tells_all_that_a_printer_has_to_know_and_what_rig_says_counts_more(folder, changed):
     rig = on_bed(RIG, folder)
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
     assert rig.box_mm == pytest.approx((100 - HALF, 100 + HALF, 90 - HALF, 90 + HALF, 3.0, 130.0), abs=1e-5)
@@ -54,15 +54,6 @@ def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
     ).box_mm  # it ends where the nozzle does
     assert box is not None
     assert (box[0], box[3]) == (95, 90)
-
-
-@pytest.mark.parametrize(("place", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
-def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, depth):
-    with pytest.raises(RigFault, match="no move"):
-        require_safe_plan(PressPlan(np.array([place]), np.array([depth])), on_bed(RIG, folder))
-
-
-def test_what_rig_says_counts_more_and_the_workspace_is_as_wide_and_high_as_a_rectangle(folder, changed):
     said = RIG.model_copy(update={"pad_mm": (50.0, 60.0), "contact_mm": 9.0, "pad_angle_deg": 90.0})
     rig = on_bed(said, folder)
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg) == ((50.0, 60.0), 9.0, 90.0)
@@ -74,6 +65,12 @@ def test_what_rig_says_counts_more_and_the_workspace_is_as_wide_and_high_as_a_re
         box = on_bed(RIG, changed(pad_mm=[60.0, 20.0], angle_deg=angle_deg)).box_mm
         assert box is not None
         assert box[:4] == (100 - right, 100 + right, 90 - top, 90 + top)
+
+
+@pytest.mark.parametrize(("place", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
+def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, depth):
+    with pytest.raises(RigFault, match="no move"):
+        require_safe_plan(PressPlan(np.array([place]), np.array([depth])), on_bed(RIG, folder))
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def finished(path):
     return len(read_journal(path / "journal.ndjson"))
 
 
-def test_every_press_of_the_plan_is_recorded(tmp_path):
+def test_every_press_of_the_plan_is_recorded_and_lost_samples_leave_a_gap_and_shift_nothing(tmp_path):
     run(tmp_path / "run", *rig())
     recording = Recording.open(tmp_path / "run")
     assert np.array_equal(recording.presses_mm, PLAN.places_mm)
@@ -61,6 +61,13 @@ def test_every_press_of_the_plan_is_recorded(tmp_path):
     journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in journal if event["event"] == "done"])
     assert reached == pytest.approx(np.column_stack([PLAN.places_mm, PLAN.depths_mm]), abs=0.1)
+    arm, converter, options = rig()
+    arm.hook = lambda arm: setattr(converter, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
+    run(tmp_path / "lost", arm, converter, options)
+    recording = Recording.open(tmp_path / "lost")
+    assert len(recording.presses_mm) == len(PLAN)
+    assert 0.02 < np.diff(recording.times_s).max() < 0.06
+    assert "lost" in (tmp_path / "lost" / "journal.ndjson").read_text()
 
 
 def test_a_press_begins_with_the_first_reading_after_the_command(tmp_path):
@@ -212,16 +219,6 @@ def test_a_tool_that_stays_on_the_pad_is_told_whatever_the_fault(tmp_path, troub
     arm.hook = lambda arm: trouble(arm, converter)
     with pytest.raises(error, match=said):
         run(tmp_path / "run", arm, converter, options)
-
-
-def test_lost_samples_leave_a_gap_and_shift_nothing(tmp_path):
-    arm, converter, options = rig()
-    arm.hook = lambda arm: setattr(converter, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
-    run(tmp_path / "run", arm, converter, options)
-    recording = Recording.open(tmp_path / "run")
-    assert len(recording.presses_mm) == len(PLAN)
-    assert 0.02 < np.diff(recording.times_s).max() < 0.06
-    assert "lost" in (tmp_path / "run" / "journal.ndjson").read_text()
 
 
 def test_a_full_disk_is_told_and_loses_nothing(tmp_path):

@@ -167,7 +167,9 @@ ENDLESS = (
 )
 
 
-def test_sqlite_files_that_compute_or_lie_are_refused(tmp_path: Path) -> None:
+def test_sqlite_files_that_compute_or_lie_are_refused_and_no_copy_is_kept_of_what_is_passed_over(
+    tmp_path: Path,
+) -> None:
     computed = PLAIN.replace("data BLOB", "data BLOB AS (zeroblob(1000000000))")
     value = "INSERT INTO messages VALUES (1, 1,"
     for name, script, reason in (
@@ -183,10 +185,7 @@ def test_sqlite_files_that_compute_or_lie_are_refused(tmp_path: Path) -> None:
             file.executescript(script)
         file.close()
         assert reason in refused(path)
-
-
-def test_sqlite_keeps_no_copy_of_what_is_read_or_passed_over(tmp_path: Path) -> None:
-    """Rows may lack a column whose default is long: a small file is hundreds of MB, which took as much disk to sort."""
+    # rows may lack a column whose default is long: a small file is hundreds of MB, which took as much disk to sort
     path = tmp_path / "long.db3"
     told = array("Float64MultiArray", np.arange(4.0))
     body = bytes(STORE.serialize_cdr(told, told.__msgtype__))

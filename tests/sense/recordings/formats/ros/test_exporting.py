@@ -132,7 +132,7 @@ def test_poses_of_an_arm_are_metres_and_quaternions(eight: Recording, tmp_path: 
     assert import_bag(tmp_path / "r.mcap") == eight
 
 
-def test_what_import_would_not_take_is_not_written(
+def test_what_import_would_not_take_or_nothing_can_write_is_not_written(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exporting, "MOST_MESSAGES", 100)
@@ -146,9 +146,6 @@ def test_what_import_would_not_take_is_not_written(
     with pytest.raises(InputError, match=r"there\.mcap: is a folder, expected a file or nothing"):
         export_bag(eight, tmp_path / "there.mcap")
     assert [file.name for file in tmp_path.iterdir()] == ["there.mcap"]
-
-
-def test_without_rosbags_it_is_one_line(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
     for run in (lambda: export_bag(eight, tmp_path / "r.mcap"), lambda: import_bag(tmp_path / "r.mcap")):
         with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[ros\]'"):

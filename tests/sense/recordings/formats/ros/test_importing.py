@@ -178,7 +178,9 @@ def test_arrays_that_change_their_length_and_topics_that_say_nothing_are_refused
             import_bag(bag, "fibres=/f,press=/down")
 
 
-def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -> None:
+def test_folders_are_bags_only_where_they_say_so_and_files_in_one_may_be_several_or_in_another_order(
+    tmp_path: Path, folder: Path
+) -> None:
     with pytest.raises(InputError, match=r"ends in '', allowed are \.mat, \.csv, .*or a rosbag2 folder"):
         import_file(tmp_path)
     assert open_recording(folder)
@@ -191,9 +193,6 @@ def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -
     bag.unlink()
     with pytest.raises(InputError, match=r"has metadata\.yaml, but no file that ends in \.mcap or \.db3"):
         import_file(bag.parent, ALL)
-
-
-def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
     messages = list(lab())
     mixed = [messages[at] for at in np.random.default_rng(0).permutation(len(messages))]
     for number, part in enumerate((messages[:400], messages[400:])):
@@ -201,6 +200,6 @@ def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
         (tmp_path / "bag").mkdir(exist_ok=True)
         bag.rename(tmp_path / "bag" / bag.name)
     (tmp_path / "bag" / "metadata.yaml").write_text("")
-    expected = import_file(write_bag(tmp_path / "lab", messages), ALL)
+    expected = import_file(write_bag(tmp_path / "whole", messages), ALL)
     assert import_file(tmp_path / "bag", ALL) == expected
     assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected

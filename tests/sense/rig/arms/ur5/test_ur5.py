@@ -137,7 +137,7 @@ def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure:
     cure()
 
 
-def test_arms_that_cannot_be_had(robots: Any, host: str) -> None:
+def test_arms_that_cannot_be_had(robots: Any, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     robots.free()
     with closing(UR5(host)) as arm:
         assert fault_of(arm.connect) == "refused"
@@ -148,6 +148,9 @@ def test_arms_that_cannot_be_had(robots: Any, host: str) -> None:
         refused_until_cured(arm, robot.protective_stop, "protective_stop", robot.clear)
         refused_until_cured(arm, robot.emergency_stop, "emergency_stop", robot.clear)
         arm.connect()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'"):
+        UR5(host).connect()
 
 
 @pytest.mark.slow
@@ -185,12 +188,6 @@ def test_an_arm_at_work_is_not_taken_over_from_another_computer(
     assert arm.state().moving
     assert wait_until_still(arm, LIMITS).pose == pytest.approx(LOW, abs=0.1)
     go(arm, HOME)
-
-
-def test_without_ur_rtde(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'"):
-        UR5(host).connect()
 
 
 def test_force_from_below_and_from_the_side_is_felt_and_limited_and_the_tip_told(robots: Any, host: str) -> None:
