@@ -11,16 +11,15 @@ from sense import Recording
 from sense.recordings.recorder import Recorder
 
 
-def test_a_torn_journal_line_loses_its_press_only(recording: Recording, folder: Path) -> None:
+def test_a_torn_journal_line_and_one_that_begins_again_lose_their_press_only(
+    recording: Recording, folder: Path
+) -> None:
     journal = folder / "journal.ndjson"
     journal.write_text(journal.read_text()[:-9])
     assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
-
-
-def test_a_press_that_was_begun_again_is_not_done(recording: Recording, folder: Path) -> None:
     with Recorder.resume(folder) as recorder:
         recorder.begin((0.0, 0.0), recorder.readings, press=7)
-    assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
+    assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 2
 
 
 @pytest.mark.parametrize(

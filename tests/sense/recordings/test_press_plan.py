@@ -20,27 +20,16 @@ def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
     return planned(pad, validated(RigSettings, settings, "rig"), np.random.default_rng(0), size)
 
 
-def test_a_plan_survives_json():
+def test_a_plan_survives_json_and_comes_from_a_file(tmp_path):
     plan = made(presses=7, depths_mm=[2.0, 4.0])
     again = PressPlan.of(plan.document())
     assert np.array_equal(again.places_mm, plan.places_mm)
     assert again.depths_mm.tolist() == [2, 4, 2, 4, 2, 4, 2]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_all_kinds_stay_on_the_pad(kind):
-    plan = made(presses=30, plan=kind)
-    assert len(plan) == 30
-    assert np.abs(plan.places_mm).max() <= 22.5
-    assert set(plan.depths_mm.tolist()) == {5.0}
-
-
-def test_a_serpentine_takes_short_steps():
-    serpentine, grid = made(presses=36, plan="boustrophedon"), made(presses=36, plan="grid")
-    step = 45 / 5
-    assert np.linalg.norm(np.diff(serpentine.places_mm, axis=0), axis=1) == pytest.approx(step)
-    assert np.linalg.norm(np.diff(grid.places_mm, axis=0), axis=1).max() > 4 * step
-    assert {*map(tuple, serpentine.places_mm.round(6))} == {*map(tuple, grid.places_mm.round(6))}
+    assert set(made(presses=30).depths_mm) == {5.0}
+    (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
+    assert read_plan(tmp_path / "gaps.csv", 2.5).document() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
+    (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,1.5\n")
+    assert read_plan(tmp_path / "deep.csv", 3.0).document() == [[1, 2, 1.5]]
 
 
 def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row():
@@ -131,15 +120,6 @@ def test_plans_that_no_probe_can_press_are_refused(rows, message: str) -> None:
     with pytest.raises(InputError, match=message):
         PressPlan.of(rows)
     assert len(PressPlan.of([[0, 0, 1e-3]])) == 1
-
-
-def test_a_plan_from_a_file(tmp_path):
-    (tmp_path / "plan.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n")
-    assert read_plan(tmp_path / "plan.csv", 3.0).document() == [[1, 2, 3], [-3.5, 4, 3]]
-    (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
-    assert read_plan(tmp_path / "gaps.csv", 2.5).document() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
-    (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,1.5\n")
-    assert read_plan(tmp_path / "deep.csv", 3.0).document() == [[1, 2, 1.5]]
 
 
 @pytest.mark.parametrize(

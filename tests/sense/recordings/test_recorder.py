@@ -223,8 +223,8 @@ def test_two_programs_cannot_record_into_one_folder(tmp_path):
     assert len(Recording.open(path).begun) == 7
 
 
-def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
-    def full():
+def test_a_full_disk_leaves_nothing_of_a_birth_and_on_closing_does_not_hide_what_went_wrong(tmp_path, monkeypatch):
+    def full(*_):
         raise OSError(28, "No space left on device")
 
     def broken():
@@ -234,6 +234,12 @@ def test_a_full_disk_on_closing_does_not_hide_what_went_wrong(tmp_path):
 
     with pytest.raises(RuntimeError, match="the first thing"):
         broken()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(InputError, match="No space left"):
+            Recorder(tmp_path / "born" / "run", FIBRES, {}, {})
+    assert list((tmp_path / "born" / "run").iterdir()) == []
+    made(tmp_path / "born")
 
 
 @pytest.mark.parametrize(
@@ -263,16 +269,13 @@ def test_what_would_spoil_a_recording_is_refused_and_leaves_it_as_it_was(tmp_pat
 def test_presses_without_a_number_count_on_from_the_last(tmp_path):
     """One that was aborted is made again under its number; after a break the count goes on."""
     with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
-        for number in range(2):
-            recorder.append(np.arange(5) / 10 + number, np.zeros((5, FIBRES)))
-            recorder.begin((0, 0), recorder.readings)
-            recorder.finish(recorder.readings)
-        recorder.begin((0, 0), recorder.readings)
-        recorder.abort("the arm stopped")
-        recorder.begin((0, 0), recorder.readings)
-        recorder.finish(recorder.readings)
-        recorder.begin((0, 0), recorder.readings, press=7)
-        recorder.finish(recorder.readings)
+        recorder.append(np.arange(5) / 10, np.zeros((5, FIBRES)))
+        for press in (None, None, "aborted", None, 7):
+            recorder.begin((0, 0), recorder.readings, press=None if press == "aborted" else press)
+            if press == "aborted":
+                recorder.abort("the arm stopped")
+            else:
+                recorder.finish(recorder.readings)
         assert recorder.done == {0, 1, 2, 7}
         with pytest.raises(InputError, match="press 8 was not begun"):
             recorder.finish(recorder.readings)
@@ -317,18 +320,6 @@ def test_what_another_left_is_in_the_way_and_stays(tmp_path, name):
     with pytest.raises(InputError, match="exists and is not empty"):
         Recorder(tmp_path, FIBRES, {}, {})
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "mine", JOURNAL: ""}
-
-
-def test_a_birth_that_fails_leaves_nothing(tmp_path, monkeypatch):
-    def full(file):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(InputError, match="No space left"):
-            Recorder(tmp_path / "run", FIBRES, {}, {})
-    assert list((tmp_path / "run").iterdir()) == []
-    made(tmp_path)
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="what is open is told on Linux")

@@ -63,7 +63,7 @@ def test_a_channel_without_a_sound_fibre_is_named(volts, status, word):
     assert looked["channel 2"].status == "ok"
 
 
-def test_lost_samples_and_a_rate_that_is_not_kept_fail():
+def test_lost_samples_another_rate_devices_that_are_not_there_and_a_stopped_arm_fail():
     rig = Rig()
     rig.converter.lose = 7
     found = rig.board()["samples"]
@@ -72,20 +72,14 @@ def test_lost_samples_and_a_rate_that_is_not_kept_fail():
     rig.converter.connect = lambda: said | {"rate_hz": 1020.0, "warning": "its lines have no check"}
     looked = rig.board()
     assert (looked["rate"].status, looked["board"].status) == ("fail", "warn")
-
-
-def test_devices_that_are_not_there_fail():
     rig = Rig()
     rig.converter.lost = rig.arm.lost = True
     assert [each.status for each in (*rig.board().values(), *rig.robot().values())] == ["fail", "fail"]
-
-
-@pytest.mark.parametrize("kind", ["protective", "emergency"])
-def test_an_arm_that_was_stopped_fails(kind):
-    rig = Rig()
-    setattr(rig.arm, f"{kind}_stop", True)
-    safety = rig.robot()["safety"]
-    assert (safety.status, safety.found) == ("fail", f"{kind} stop")
+    for kind in ("protective", "emergency"):
+        rig = Rig()
+        setattr(rig.arm, f"{kind}_stop", True)
+        safety = rig.robot()["safety"]
+        assert (safety.status, safety.found) == ("fail", f"{kind} stop")
 
 
 @pytest.mark.parametrize(

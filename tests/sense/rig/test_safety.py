@@ -3,6 +3,8 @@
 import contextlib
 import math
 from dataclasses import replace
+from itertools import chain, repeat
+from unittest import mock
 
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from sense.rig import safety
 from sense.rig.devices.protocols import ArmState, Pose, RigFault
 from sense.rig.safety import Limits, Vector, require_safe, tilt_deg, wait_until_still, watch
 from sense.settings import RigSettings
+from tests.sense.rig.devices.fakes import Time
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
 SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)
@@ -50,12 +53,6 @@ def test_what_gets_through_is_within_every_limit(pose: list[float], speed: float
     assert "speed" in refused(SAFE, speed)
 
 
-def test_targets_on_the_limits_are_safe() -> None:
-    for place in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
-        require_safe((*place, *TOOL), 250, 1200, LIMITS)
-    require_safe((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
-
-
 @pytest.mark.parametrize(
     ("pose", "speeds", "said"),
     [
@@ -80,6 +77,13 @@ def test_a_hair_beyond_a_limit_is_refused_by_its_name(pose: tuple, speeds: tuple
     assert said in refused(pose, *speeds)
 
 
+def test_targets_on_the_limits_are_safe_and_without_a_surface_none_is() -> None:
+    for place in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
+        require_safe((*place, *TOOL), 250, 1200, LIMITS)
+    require_safe((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
+    assert "surface unknown" in refused(SAFE, limits=replace(LIMITS, contact_mm=None))
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -99,12 +103,8 @@ def test_a_hair_beyond_a_limit_is_refused_by_its_name(pose: tuple, speeds: tuple
 def test_limits_that_limit_nothing_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(change)).split("_")[0]):
         replace(LIMITS, **change)  # pyright: ignore[reportArgumentType]
-
-
-def test_limits_that_just_limit_are_taken_and_without_a_surface_no_target_is_safe() -> None:
-    for change in ({"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}):
-        replace(LIMITS, **change)
-    assert "surface unknown" in refused(SAFE, limits=replace(LIMITS, contact_mm=None))
+    for just in ({"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}):
+        replace(LIMITS, **just)
 
 
 def test_limits_are_those_of_the_settings() -> None:
@@ -119,22 +119,18 @@ def test_limits_are_those_of_the_settings() -> None:
 
 
 @given(st.floats(-math.pi, math.pi), st.tuples(*[st.floats(-7, 7)] * 3), st.tuples(*[st.floats(-7, 7)] * 3))
-def test_tilt_is_an_angle_that_neither_a_turn_about_the_axis_nor_the_order_changes(
+def test_tilt_is_the_angle_between_axes_that_neither_a_turn_about_them_nor_the_order_changes(
     turn: float, a: tuple[float, ...], b: tuple[float, ...]
 ) -> None:
+    """A rotation about x by a takes the z axis to (0, -sin a, cos a); one about y to (sin b, 0, cos b)."""
     down = (math.pi * math.cos(turn), math.pi * math.sin(turn), 0.0)
     assert tilt_deg(down, LIMITS.tool) == pytest.approx(0, abs=1e-6)
     assert 0 <= tilt_deg(a, b) <= 180
     assert tilt_deg(a, b) == pytest.approx(tilt_deg(b, a), abs=1e-9)
-
-
-def test_tilt_is_the_angle_between_the_axes_of_two_tools() -> None:
-    """A rotation about x by a takes the z axis to (0, -sin a, cos a); one about y to (sin b, 0, cos b)."""
-    for a, b in ((0.3, 0.4), (2.0, -1.0), (math.pi, 3.0)):
-        cosine = math.cos(a) * math.cos(b)
-        assert tilt_deg((a, 0, 0), (0, b, 0)) == pytest.approx(math.degrees(math.acos(cosine)))
-    axis = (1 / math.sqrt(3),) * 3  # a third of a turn about the diagonal takes z to x
-    third = tuple(2 * math.pi / 3 * part for part in axis)
+    for x, y in ((0.3, 0.4), (2.0, -1.0), (math.pi, 3.0)):
+        cosine = math.cos(x) * math.cos(y)
+        assert tilt_deg((x, 0, 0), (0, y, 0)) == pytest.approx(math.degrees(math.acos(cosine)))
+    third = (2 * math.pi / 3 / math.sqrt(3),) * 3  # a third of a turn about the diagonal takes z to x
     assert tilt_deg(third, (0, math.pi / 2, 0)) == pytest.approx(0, abs=1e-9)
     assert tilt_deg(third, (0, 0, 0)) == pytest.approx(90)
 
@@ -207,50 +203,34 @@ def test_a_move_goes_on_in_sound_states_and_ends_in_others(change: dict[str, obj
         assert "\n" not in str(caught.value)
 
 
-def test_a_force_that_nobody_watches_stops_nothing() -> None:
+def test_a_force_that_nobody_watches_stops_nothing_and_a_move_takes_as_long_as_it_may() -> None:
     watch(replace(REST, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
     safety.require_ready(REST, replace(LIMITS, max_force_n=None))
     with pytest.raises(RigFault, match='allowed "unwatched"'):
         safety.require_ready(REST, LIMITS)
-
-
-def test_a_move_may_take_as_long_as_it_may() -> None:
     with pytest.raises(RigFault, match="30 s") as caught:
         watch(REST, LIMITS, 10.4, until_s=10.3)
     assert caught.value.cause == "deadline"
 
 
-class Actor:
-    """An arm that plays a list of states or raises what is in it, at its own pace; then it stays as it is."""
+def actor(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:
+    """An arm that plays states or raises what is among them, at its own pace, then stays as it is; and its clock."""
+    clock, left = Time(10.0, 0.0), chain(script, repeat(script[-1]))
 
-    def __init__(self, *script: ArmState | BaseException) -> None:
-        self.script, self.now, self.stops = list(script), 10.0, 0
-
-    def state(self) -> ArmState:
-        what = self.script.pop(0) if len(self.script) > 1 else self.script[0]
+    def state() -> ArmState:
+        what = next(left)
         if isinstance(what, BaseException):
             raise what
-        return replace(what, time_s=self.now)
+        return replace(what, time_s=clock())
 
-    def stop(self) -> None:
-        self.stops += 1
-        raise RigFault("lost", "no answer")
-
-    def clock(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-    def wait(self) -> ArmState:
-        return wait_until_still(self, LIMITS, self.clock, self.sleep)  # pyright: ignore[reportArgumentType]
+    return mock.Mock(state=state, stop=mock.Mock(side_effect=RigFault("lost", "no answer"))), clock
 
 
 def test_a_wait_ends_when_the_move_has_ended_and_the_tip_rests() -> None:
-    actor = Actor(replace(REST, moving=True), replace(REST, speed_mm_s=1.1), replace(REST, speed_mm_s=1.0))
-    assert actor.wait().speed_mm_s == 1
-    assert not actor.stops
-    assert actor.now > 10
+    arm, clock = actor(replace(REST, moving=True), replace(REST, speed_mm_s=1.1), replace(REST, speed_mm_s=1.0))
+    assert wait_until_still(arm, LIMITS, clock, clock.sleep).speed_mm_s == 1
+    assert not arm.stop.called
+    assert clock() > 10
 
 
 @pytest.mark.parametrize(
@@ -264,9 +244,9 @@ def test_a_wait_ends_when_the_move_has_ended_and_the_tip_rests() -> None:
     ],
 )
 def test_a_wait_stops_the_arm_before_it_tells(what: ArmState | BaseException, expected: str | None) -> None:
-    actor = Actor(replace(REST, moving=True), what)
+    arm, clock = actor(replace(REST, moving=True), what)
     with pytest.raises(RigFault if expected else KeyboardInterrupt) as caught:
-        actor.wait()
+        wait_until_still(arm, LIMITS, clock, clock.sleep)
     assert getattr(caught.value, "cause", None) == expected
-    assert actor.stops == 1
-    assert actor.now < 10 + LIMITS.deadline_s + 1
+    arm.stop.assert_called_once()
+    assert clock() < 10 + LIMITS.deadline_s + 1

@@ -34,11 +34,9 @@ MISSING = np.where(PRESSED, NUMBERED, np.nan)
     [
         EDGES | {"places": PLACES},
         EDGES | {"x": PLACES[:, 0], "y": PLACES[None, :, 1]},
-        EDGES | {"places": AT},
         EDGES | {"places": AT.T},
         {"press": PRESSED, "places": PLACES},
         {"press": PRESSED.astype(bool)[:, None], "places": AT},
-        {"press": NUMBERED, "x": AT[:, 0], "y": AT[:, 1]},
         {"press": MISSING, "places": AT},
         {"press": np.where(PRESSED, NUMBERED, -1), "places": PLACES.T.astype(np.float32)},
         {"places": np.where(PRESSED[:, None], AT, np.nan)},
@@ -53,30 +51,23 @@ def test_presses_are_told_in_many_ways(arrays: dict[str, np.ndarray]) -> None:
     assert recording.presses_mm.tolist() == (PLACES.T if arrays.get("places", AT).dtype == "f4" else PLACES).tolist()
 
 
-def test_readings_lie_one_way_or_the_other() -> None:
+def test_readings_lie_one_way_or_the_other_and_units_are_put_right() -> None:
     assert np.array_equal(made(EDGES | {"fibres": VOLTS.T}).readings, VOLTS)
     one = made(EDGES | {"fibres": VOLTS[:, 0], "time": TIMES[None]})
     assert np.array_equal(one.readings, VOLTS[:, :1])
     parts = [(Part("time", ""), TIMES), (Part("fibres", ""), VOLTS[:, 1]), (Part("fibres", "", 2.0), VOLTS.T)]
     several = assembled(Path("f"), [*parts, *((Part(name, ""), EDGES[name]) for name in EDGES)], {})
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
-
-
-def test_units_are_put_right() -> None:
     told = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "places": PLACES / 10}
     edges = {"begun": np.array([150, 601]), "lifted": np.array([500, 801])}
     recording = made(told | edges, **dict.fromkeys(("time", "fibres", "begun", "lifted"), 1e-3), places=10)
     expected = made(EDGES | {"places": PLACES})
     for name in ("times_s", "readings", "presses_mm", "begun", "lifted"):
         np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
-
-
-def test_times_of_presses_may_be_a_rounding_off_those_of_readings() -> None:
     times, begun = 0.0751879 * np.arange(4000), np.arange(20, 3900, 40)
     told = {"time": times, "fibres": np.ones((4000, 1)), "places": np.zeros((len(begun), 2))}
     recording = made(told | {"begun": 1000 * times[begun], "lifted": 1000 * times[begun + 20]}, begun=1e-3, lifted=1e-3)
-    assert np.array_equal(recording.begun, begun)
-    assert np.array_equal(recording.lifted, begun + 20)
+    assert np.array_equal([recording.begun, recording.lifted], [begun, begun + 20])  # a rounding off times of readings
 
 
 def test_presses_that_nothing_tells_are_found(recording: Recording) -> None:
@@ -98,19 +89,15 @@ def test_presses_that_nothing_tells_are_found(recording: Recording) -> None:
     ("arrays", "message"),
     [
         ({"time": np.ones((3, 4))}, r"time has shape \(3, 4\), expected one row or column"),
-        ({"time": np.float64(1)}, r"time has shape \(\)"),
         ({"time": np.array(["a", "b"])}, "time are"),
         ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), as time has it"),
-        ({"fibres": np.ones((12, 2, 2))}, "fibres have shape"),
         ({"press": PRESSED[:11]}, "press has 11 values, expected 12, one a reading"),
         ({"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))}, "press is missing or negative in row 11 and 0"),
         ({"press": 0 * PRESSED}, "press is nowhere above 0; without it, presses are found"),
         ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
-        ({"press": 1 - PRESSED}, "press 0 goes from reading 0"),
         ({"press": np.array([0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0, 0])}, "press 1 goes from reading 4"),
         (EDGES | {"lifted": np.array([5])}, "begun has 2 values and lifted 1"),
         (EDGES | {"begun": np.array([2.5, 7])}, "begun are .* whole numbers"),
-        (EDGES | {"lifted": np.array([5, 10**9])}, "press 1 goes from"),
         (EDGES | {"places": np.ones((3, 2))}, "places are 3, expected one for each of 2 presses or 12 readings"),
         (EDGES | {"places": np.ones((2, 2, 2))}, r"places have shape \(2, 2, 2\)"),
         (EDGES | {"x": np.ones(2), "y": np.ones(3)}, "x has 2 values and y 3"),

@@ -66,13 +66,9 @@ def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
         ({"times_s": "group"}, "times_s is no dataset"),
         ({"times_s": h5py.Empty("f8")}, "times_s holds None values"),
         ({"readings_v": "text"}, "readings_v holds object values, expected an array of real numbers"),
-        ({"readings_v": np.full((40, 2), np.inf)}, "readings hold infinity"),
-        ({"presses_mm": np.array([[1.0, np.nan]])}, "press 0 has one of x and y"),
         ({"begun": np.array([20.5])}, "begun are .*whole numbers"),
-        ({"times_s": np.arange(39.0)}, "times have shape"),
         ({"readings_v": (10**6, 10**6, 100)}, "readings_v holds 1000000000000 values, allowed are 268435456"),
         ({"readings_v": (2**24, 1, 2**20)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
-        ({"readings_v": (16, 1, 2**24)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
         ({"readings_v": (2**29, 1, 2**20)}, "readings_v holds 536870912 values, allowed are 268435456 in all"),
     ],
 )
@@ -115,7 +111,7 @@ def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
     return content
 
 
-def test_a_mapping_tells_what_other_datasets_hold(tmp_path: Path) -> None:
+def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_path: Path) -> None:
     content = lab(tmp_path)
     mapping = "time=/t:ms,fibres=/data/volts:mV,places=/xy:cm,begun=/on,lifted=off"
     recording = import_hdf5(tmp_path / "lab.h5", mapping)
@@ -128,9 +124,6 @@ def test_a_mapping_tells_what_other_datasets_hold(tmp_path: Path) -> None:
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
     lab(tmp_path, **{"data/volts": None, "data/ch0": content["data/volts"][0], "data/ch1": content["data/volts"][1]})
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("volts", "ch*")).fibres == 2
-
-
-def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path: Path) -> None:
     lab(tmp_path)
     there = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     for mapping, reason in (

@@ -144,22 +144,16 @@ def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recordi
 
 
 @pytest.mark.parametrize(("slower", "fps"), [(1.0, 13), (10.0, 1.34), (0.05, 268)])
-def test_rates_are_whole_numbers_unless_that_is_far_off(
-    eight: Recording, tmp_path: Path, slower: float, fps: float
-) -> None:
-    export_lerobot(replace(eight, times_s=eight.times_s * slower), tmp_path / "set")
-    info, _, _ = checked(tmp_path / "set")
-    assert info["fps"] == pytest.approx(fps, rel=0.02)
-    assert isinstance(info["fps"], int) == (slower < 2)
-
-
-def test_long_recordings_go_to_several_files_and_one_fibre_is_a_number(
-    eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_rates_are_whole_if_that_is_near_long_recordings_go_to_several_files_and_one_fibre_is_a_number(
+    eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slower: float, fps: float
 ) -> None:
     monkeypatch.setattr(lerobot, "_MB", 50)
     monkeypatch.setattr(lerobot, "CHUNK_FILES", 2)
-    export_lerobot(replace(eight, readings=eight.readings[:, :1]), tmp_path / "set")
+    changed = replace(eight, readings=eight.readings[:, :1], times_s=eight.times_s * slower)
+    export_lerobot(changed, tmp_path / "set")
     info, _, episodes = checked(tmp_path / "set")
+    assert info["fps"] == pytest.approx(fps, rel=0.02)
+    assert isinstance(info["fps"], int) == (slower < 2)
     assert info["features"]["observation.state"]["shape"] == [1]
     files = {(each["data/chunk_index"], each["data/file_index"]) for each in episodes}
     assert files == {(0, 0), (0, 1), (1, 0), (1, 1)}
@@ -183,9 +177,6 @@ def test_a_folder_appears_whole_or_not_at_all(
     unknown = replace(eight, presses_mm=np.full((8, 2), np.nan))
     with pytest.raises(InputError, match="no place of a press is known"):
         export_lerobot(unknown, tmp_path / "other")
-
-
-def test_without_pyarrow_it_is_one_line(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"set: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):
-        export_lerobot(eight, tmp_path / "set")
+    with pytest.raises(InputError, match=r"more: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):
+        export_lerobot(eight, tmp_path / "more")

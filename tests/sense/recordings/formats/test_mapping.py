@@ -20,9 +20,7 @@ def test_a_mapping_names_columns_and_units() -> None:
         Part("time", "t_ms", 1e-3),
         Part("fibres", "ch*", 0.005),
         Part("fibres", "ü", 1e-6),
-        Part("x", "px", 10),
-        Part("y", "py", None),
-        Part("press", "contact", None),
+        *(Part("x", "px", 10), Part("y", "py", None), Part("press", "contact", None)),
     ]
     units = ["time=t:min,fibres=c:V,places=p:um,depth=d:m,force=f:mN", "time=t:us,fibres=c:mV,reached=r:mm,force=f:N"]
     factors = [[part.factor for part in parse_mapping(each)] for each in units]
@@ -41,11 +39,9 @@ def test_parts_mean_columns() -> None:
     ("mapping", "message"),
     [
         ("", "mapping has '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, fibres, x"),
-        ("time", "mapping has 'time'"),
         ("time=,fibres=ch*", "mapping has 'time='"),
         ("zeit=t,fibres=ch*", "mapping has 'zeit=t'"),
         ("time=t_ms", "does not name fibres"),
-        ("fibres=ch*", "does not name time"),
         ("time=t_ms,time=t_ms,fibres=ch*", "names time twice"),
         ("time=t_ms,fibres=ch*,x=px", "names one of x and y, expected both or neither"),
         ("time=t_ms,fibres=ch*,lifted=px", "names one of begun and lifted"),
@@ -54,14 +50,11 @@ def test_parts_mean_columns() -> None:
         ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, min or a factor"),
         ("time=t_ms:0,fibres=ch*", "unit of time is '0'"),
         ("time=t_ms:nan,fibres=ch*", "unit of time is 'nan'"),
-        ("time=t_ms:1_0,fibres=ch*", "unit of time is '1_0'"),
         ("time=t_ms:,fibres=ch*", "unit of time is ''"),
         ("time=t_ms,fibres=ch*,press=contact:2", "unit of press is '2', allowed is none"),
         ("time=t,fibres=ch*", r"time is 't', expected one of 't_ms', 'Time \[s\]', 'ch1'"),
-        ("time=t_ms,fibres=z*", "fibres is 'z.', expected one of"),
         ("time=?*,fibres=ch*", "time is '..', which may be each of"),
         ("time=ch1,fibres=ch1", "fibres is 'ch1', which is named before"),
-        ("time=t_ms,fibres=ch1,fibres=ch1", "fibres is 'ch1', which is named before"),
         ("time=a\nb,fibres=ch*", "time is 'a.nb', expected one of"),
         ("time=" + "t" * 20_000, "mapping has 20005 characters"),
     ],

@@ -13,7 +13,7 @@ from sense import import_mat
 MAT = "para5_long_first4500.mat"
 
 
-def test_the_published_recording_comes_in_as_it_is(published: Path) -> None:
+def test_the_published_recording_comes_in_as_it_is_and_a_part_is_refused(published: Path, tmp_path: Path) -> None:
     recording = import_mat(published / MAT)
     content = scipy.io.loadmat(published / MAT)
     assert np.array_equal(recording.readings, content["voltage"])
@@ -21,14 +21,11 @@ def test_the_published_recording_comes_in_as_it_is(published: Path) -> None:
     assert np.array_equal(recording.times_s, content["tim"].ravel())
     assert recording.begun[:3].tolist() == [20, 60, 100]
     assert recording.lifted[:3].tolist() == [40, 80, 120]
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.99999])
-def test_a_truncated_recording_is_refused(published: Path, tmp_path: Path, share: float) -> None:
-    content = (published / MAT).read_bytes()
-    (tmp_path / "cut.mat").write_bytes(content[: int(share * len(content))])
-    with pytest.raises(InputError, match=r"cut\.mat"):
-        import_mat(tmp_path / "cut.mat")
+    whole = (published / MAT).read_bytes()
+    for share in (0.0, 0.3, 0.99999):
+        (tmp_path / "cut.mat").write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InputError, match=r"cut\.mat"):
+            import_mat(tmp_path / "cut.mat")
 
 
 def good() -> dict[str, np.ndarray]:
@@ -108,22 +105,15 @@ def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
     [
         ("tim", None, r"has no variable tim \(found pos, voltage\)"),
         ("voltage", np.ones((79, 4)), r"voltage has shape \(79, 4\), expected 40 rows for each of the 3 presses"),
-        ("voltage", np.full((120, 4), np.nan), "readings are all missing"),
         ("voltage", np.ones((120, 4)) * 1j, "is complex, expected a full matrix of real numbers"),
         ("voltage", np.array(["a", "b"], dtype=object), "is a cell array, expected a full matrix"),
         ("voltage", np.ones((39, 4)), r"voltage has shape \(39, 4\), expected at least 40 rows"),
-        ("voltage", np.ones((20, 6, 4)), "voltage has shape"),
         ("voltage", scipy.sparse.csc_matrix(np.ones((120, 4))), "voltage is a sparse matrix, expected a full matrix"),
         ("voltage", {"volts": 1.0}, "is a structure, expected a full matrix"),
-        ("voltage", np.full((120, 4), 1e200), "readings hold 1e"),
-        ("pos", np.ones((3, 3)), r"pos has shape \(3, 3\)"),
         ("pos", np.ones((1, 3)), r"pos has shape \(1, 3\), expected \(2, presses\)"),
         ("pos", np.ones((2, 0)), "pos has shape"),
         ("pos", np.ones((2, 5)), "each of the 5 presses of pos, 200 in all; only the last may be cut off"),
-        ("pos", np.array([[1, 2, np.nan], [1, 2, 3]]), "press 2 has one of x and y"),
-        ("tim", np.where(np.arange(120) == 7, np.nan, np.arange(120)), r"times hold NaN .*first in row 7"),
         ("tim", np.where(np.arange(120) == 7, 6, np.arange(120)), "times do not ascend at reading 7"),
-        ("tim", np.arange(100.0), "times have shape"),
     ],
 )
 def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value: Any, message: str) -> None:
@@ -134,7 +124,7 @@ def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value:
     assert "\n" not in str(caught.value)
 
 
-def test_a_mat_may_hold_what_real_rigs_give(tmp_path: Path) -> None:
+def test_a_mat_may_hold_what_real_rigs_give_and_no_places(tmp_path: Path) -> None:
     content = good()
     volts = content["voltage"]
     holed = volts.copy()
@@ -155,9 +145,6 @@ def test_a_mat_may_hold_what_real_rigs_give(tmp_path: Path) -> None:
         assert np.array_equal(recording.readings, (content | change)["voltage"], equal_nan=True)
         assert np.array_equal(recording.times_s, (content | change)["tim"].ravel())
         assert np.array_equal(recording.presses_mm, content["pos"].T)
-
-
-def test_a_mat_without_places_has_presses_of_unknown_place(tmp_path: Path) -> None:
     content = good()
     scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
     blind = import_mat(tmp_path / "blind.mat")

@@ -58,7 +58,6 @@ def test_presses_of_the_published_recording_are_found(published: Path) -> None:
     ("grid", "rig"),
     [
         (4, RigSettings(presses=150)),
-        (4, RigSettings(presses=150, noise_mv=0)),
         (4, RigSettings(presses=150, noise_mv=5)),
         (4, RigSettings(presses=150, drift_mv=150)),
         (4, RigSettings(presses=150, hysteresis=0.5, creep=0.4)),
@@ -117,6 +116,7 @@ def evenly(presses: int, held_s: float, apart_s: float) -> Spans:
     ids=["one 5 Hz", "one", "taps", "quick", "quick 100 Hz", "close", "held", "held long", "slow"],
 )
 def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> None:
+    """A press without an end lasts to the end."""
     times, readings = recorded(spans, rate_hz=rate_hz, ramp_s=ramp_s)
     touched, released = find_presses(readings, times)
     assert abs(len(touched) - len(spans)) <= 0.05 * len(spans)
@@ -124,15 +124,10 @@ def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> No
     for told, true in zip((times[touched], np.append(times, np.inf)[released]), zip(*spans, strict=True), strict=True):
         off = np.abs(told[:, None] - np.array(true)).min(axis=0)
         assert np.mean(off < allowed_s) >= 0.95
-
-
-def test_a_press_without_an_end_lasts_to_the_end() -> None:
-    times, readings = recorded([(3.0, 5.0), (8.0, 100.0)], end_s=12)
-    times, readings = times[: int(12 * RATE_HZ)], readings[: int(12 * RATE_HZ)]
-    touched, released = find_presses(readings, times)
-    assert len(touched) == 2
-    assert released[1] == len(readings)
-    assert as_commanded(Presses(touched, released), times)[1][1] == len(readings)
+    if spans[-1][1] - spans[-1][0] >= 1:
+        cut = int(np.mean(spans[-1]) * rate_hz)
+        presses = find_presses(readings[:cut], times[:cut])
+        assert presses.released[-1] == as_commanded(presses, times[:cut])[1][-1] == cut
 
 
 COUNT = 3.3 / 1023
@@ -149,12 +144,8 @@ COUNT = 3.3 / 1023
 def test_noise_is_no_press(fibres: int, sd: float, step: float, rate_hz: float, seed: int) -> None:
     readings = 2 + sd * np.random.default_rng(seed).standard_normal((5000, fibres))
     readings = np.rint(readings / step) * step if step else readings
-    assert len(find_presses(readings, np.arange(5000) / rate_hz).touched) == 0
-
-
-@pytest.mark.parametrize("readings", [np.full((300, 3), np.nan), np.zeros((1, 3))])
-def test_where_nothing_happens_nothing_is_found(readings: np.ndarray) -> None:
-    assert len(find_presses(readings, np.arange(len(readings)) / RATE_HZ).touched) == 0
+    for nothing in (readings, np.full((300, 3), np.nan), np.zeros((1, 3))):
+        assert len(find_presses(nothing, np.arange(len(nothing)) / rate_hz).touched) == 0
 
 
 def spoilt(kind: str, readings: np.ndarray) -> np.ndarray:
@@ -210,7 +201,7 @@ def test_it_does_not_matter_how_readings_are_cut(recording: Recording, cuts: lis
     assert [event.down for event in told] == [True, False] * (len(told) // 2) + [True] * (len(told) % 2)
 
 
-def test_events_are_told_soon(recording: Recording) -> None:
+def test_events_are_told_soon_and_what_is_no_stream_of_readings_is_refused(recording: Recording) -> None:
     finder = Finder(recording.fibres)
     lags = [
         at - event.reading
@@ -220,6 +211,21 @@ def test_events_are_told_soon(recording: Recording) -> None:
     assert len(lags) > 90
     assert min(lags) >= 1
     assert np.mean(np.array(lags) <= 2) > 0.95
+    for times, readings in ((np.zeros(3), (3, 2)), (np.zeros(2), (3, 4)), (np.zeros((2, 2)), (2, 4))):
+        with pytest.raises(InputError, match=r"times have shape .* and readings .*, expected \(n,\) and \(n, 4\)"):
+            Finder(4).feed(times, np.zeros(readings))
+    with pytest.raises(InputError, match="fibres is 0, allowed is a whole number from 1 to 512"):
+        Finder(0)
+    for value in (np.inf, 1001.0):
+        with pytest.raises(InputError, match="readings hold"):
+            Finder(1).feed([0.0], [[value]])
+    finder = Finder(2)
+    finder.feed([0.0, 0.1], np.zeros((2, 2)))
+    for again in (0.05, 0.1):
+        with pytest.raises(InputError, match=f"times begin at {again} s, expected later than the last reading, 0.1 s"):
+            finder.feed([again, 0.3], np.zeros((2, 2)))
+    finder.feed([], np.zeros((0, 2)))
+    finder.feed([0.11], np.zeros((1, 2)))
 
 
 @settings(max_examples=25)
@@ -260,24 +266,6 @@ def test_presses_found_make_a_recording(gaps: list[int], after: int, rate_hz: fl
     assert ((lifted == presses.touched + 1) | (times[presses.released] - times[lifted] <= SENT_UP_S)).all()
 
 
-def test_what_is_no_stream_of_readings_is_refused() -> None:
-    for times, readings in ((np.zeros(3), (3, 2)), (np.zeros(2), (3, 4)), (np.zeros((2, 2)), (2, 4))):
-        with pytest.raises(InputError, match=r"times have shape .* and readings .*, expected \(n,\) and \(n, 4\)"):
-            Finder(4).feed(times, np.zeros(readings))
-    with pytest.raises(InputError, match="fibres is 0, allowed is a whole number from 1 to 512"):
-        Finder(0)
-    for value in (np.inf, 1001.0):
-        with pytest.raises(InputError, match="readings hold"):
-            Finder(1).feed([0.0], [[value]])
-    finder = Finder(2)
-    finder.feed([0.0, 0.1], np.zeros((2, 2)))
-    for again in (0.05, 0.1):
-        with pytest.raises(InputError, match=f"times begin at {again} s, expected later than the last reading, 0.1 s"):
-            finder.feed([again, 0.3], np.zeros((2, 2)))
-    finder.feed([], np.zeros((0, 2)))
-    finder.feed([0.11], np.zeros((1, 2)))
-
-
 def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """Times and readings (R, C) of a pad of which all goes wrong that this room knows of.
 
@@ -313,17 +301,11 @@ def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.
 
 SCENES = {
     (0, 14.0, 60): (52, 77260, 78864),
-    (1, 14.0, 60): (54, 83609, 84935),
     (2, 5.0, 60): (40, 21532, 22152),
     (3, 100.0, 40): (36, 218694, 224817),
     (4, 300.0, 25): (23, 374517, 393217),
-    (5, 30.0, 60): (59, 170815, 173827),
-    (6, 14.0, 120): (105, 310988, 313704),
     (7, 14.0, 120): (98, 294192, 297817),
     (8, 14.0, 120): (87, 249420, 253232),
-    (9, 14.0, 120): (87, 248623, 252247),
-    (10, 30.0, 100): (65, 321638, 329859),
-    (11, 8.0, 120): (60, 100596, 102451),
     (12, 14.0, 200): (121, 527170, 533804),
 }
 """How many presses are found in scenes, and the sums of the readings at which they begin and end."""
@@ -337,7 +319,7 @@ def test_presses_of_scenes_are_found_where_they_always_were(seed: tuple[int, flo
     assert (len(found.touched), int(found.touched.sum()), int(found.released.sum())) == SCENES[seed]
 
 
-def test_presses_are_aligned_with_what_the_readings_show_of_them(recording: Recording) -> None:
+def test_presses_are_aligned_with_what_the_readings_show_of_them_or_stay_as_commanded(recording: Recording) -> None:
     begun, lifted = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
     for found, commanded in ((begun, recording.begun), (lifted, recording.lifted)):
         off = found - commanded
@@ -345,9 +327,6 @@ def test_presses_are_aligned_with_what_the_readings_show_of_them(recording: Reco
         assert 0 < np.abs(off).mean() < 3  # the simulated probe takes up to 0.35 s to be gone
     assert (lifted > begun).all()
     assert (begun[1:] >= lifted[:-1]).all()
-
-
-def test_presses_that_are_not_felt_stay_as_commanded(recording: Recording) -> None:
     silent = recording.readings.copy()
     first, last = int(recording.begun[10]) - 3, int(recording.begun[12]) - 10
     silent[first:last] = silent[first - 1]

@@ -74,11 +74,7 @@ def read_for(converter: Driver, seconds: float) -> ConverterSamples:
 
 
 def check(
-    samples: ConverterSamples,
-    board: Board,
-    within_s: float = 0.05,
-    inputs: Sequence[int] = (),
-    step_v: float = STEP_V,
+    samples: ConverterSamples, board: Board, within_s: float = 0.05, inputs: Sequence[int] = (), step_v: float = STEP_V
 ) -> None:
     """Every reading is what the board read at that index, at the right time.
 
@@ -132,25 +128,22 @@ def test_a_second_without_a_gap_right_to_a_step_and_on_time(kind: str, monkeypat
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "options"),
-    [(10.0, {}), (4000.0, {}), (1000.0, {"inputs": range(8), "averaging": 16}), (500.0, {"inputs": (11, 3, 0)})],
+    ("kind", "header", "options"),
+    [
+        *(("due", replace(HEADER, rate_hz=rate_hz), {}) for rate_hz in (10.0, 4000.0)),
+        ("due", HEADER, {"inputs": range(8), "averaging": 16}),
+        ("due", replace(HEADER, rate_hz=500.0), {"inputs": (11, 3, 0)}),
+        ("line", replace(HEADER, rate_hz=10.0), {}),
+        ("line", Header(333.0, 16, 5.0, 16), {"inputs": (15, 0, 7)}),
+    ],
 )
-def test_other_rates_channels_and_averages(rate_hz: float, options: dict[str, Any]) -> None:
-    board = emulated("due")
-    with connected(board, rate_hz, **options) as converter:
-        samples = read_for(converter, 0.1)
-        assert len(samples.times_s) > 0.2 * rate_hz
-        check(samples, board, inputs=options.get("inputs", ()))
-
-
-@pytest.mark.parametrize(
-    ("header", "inputs"), [(replace(HEADER, rate_hz=10.0), ()), (Header(333.0, 16, 5.0, 16), (15, 0, 7))]
-)
-def test_other_line_boards_and_inputs_in_the_order_of_the_fibres(header: Header, inputs: tuple[int, ...]) -> None:
-    board = emulated("line", header)
-    with connected(board, header.rate_hz, inputs=inputs) as converter:
+def test_other_rates_inputs_and_averages(kind: str, header: Header, options: dict[str, Any]) -> None:
+    board = emulated(kind, header)
+    with connected(board, header.rate_hz, **options) as converter:
+        samples = read_for(converter, 0.15)
+        assert len(samples.times_s) > 0.15 * header.rate_hz
         step_v = header.reference_v / header.full_scale + 1e-9
-        check(read_for(converter, 0.15), board, inputs=inputs, step_v=step_v)
+        check(samples, board, inputs=options.get("inputs", ()), step_v=step_v)
 
 
 def test_a_line_board_is_asked_through_noise_and_looked_upon_with_doubt_where_its_lines_have_no_check() -> None:
@@ -180,7 +173,7 @@ def test_garbled_bytes_cost_samples_that_are_counted_and_never_give_a_wrong_one(
         assert statistics.get("overruns", 0) == 0
 
 
-def test_samples_the_board_drops_are_missing_and_counted() -> None:
+def test_samples_the_board_drops_are_missing_and_counted_and_lost_conversions_end_the_reading() -> None:
     board = EmulatedBoard(waves)
     with connected(board) as converter:
         board.overrun(160)
@@ -188,6 +181,8 @@ def test_samples_the_board_drops_are_missing_and_counted() -> None:
         check(samples, board)
         assert samples.missing.max() == samples.missing.sum() == 160
         assert converter.statistics()["overruns"] == 160
+        board.halt()
+        fault_of(converter.read, "data", "lost conversions")
 
 
 @BOTH
@@ -222,13 +217,6 @@ def test_a_host_that_never_reads_is_told_so(kind: str, monkeypatch: pytest.Monke
         time.sleep(0.35)
         check(converter.read(), board)
         fault_of(converter.read, "data", "nobody has read")
-
-
-def test_a_board_that_has_lost_conversions_ends_the_reading() -> None:
-    board = EmulatedBoard(waves)
-    with connected(board) as converter:
-        board.halt()
-        fault_of(converter.read, "data", "lost conversions")
 
 
 @pytest.mark.parametrize("garbled", [0.0, pytest.param(2e-2, marks=pytest.mark.slow)], ids=["its header", "its times"])

@@ -19,17 +19,10 @@ from sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
 FIBRES = 4
-RIG = RigSettings(
-    presses=6,
-    rate_hz=100,
-    converter_rate_hz=1000,
-    readings_per_press=40,
-    pad_mm=(0.0, -400.0),
-    contact_mm=50.0,
-    box_mm=(-100, 100, -500, -300, 40, 120),
-    travel_mm_s=400,
-    press_mm_s=100,
-    acceleration_mm_s2=2000,
+RIG = RigSettings.model_validate(
+    {"presses": 6, "rate_hz": 100, "converter_rate_hz": 1000, "readings_per_press": 40}
+    | {"pad_mm": (0.0, -400.0), "contact_mm": 50.0, "box_mm": (-100, 100, -500, -300, 40, 120)}
+    | {"travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 2000}
 )
 
 
@@ -71,10 +64,8 @@ class FakeArm:
             raise RigFault("lost", "the arm is gone")
         self._advance()
         stopped = self.protective_stop or self.emergency_stop
-        return ArmState(
-            self.time(), self.pose, 0.0, self.force_n, self.protective_stop, self.emergency_stop,
-            self._from is not None and not stopped,
-        )  # fmt: skip
+        moving = self._from is not None and not stopped
+        return ArmState(self.time(), self.pose, 0.0, self.force_n, self.protective_stop, self.emergency_stop, moving)
 
     def drain(self) -> NDArray[np.float64]:
         if self.lost:

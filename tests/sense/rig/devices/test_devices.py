@@ -67,14 +67,6 @@ def test_every_way_in_which_a_port_is_refused_comes_with_advice(error: Exception
         raise refusal("COM7", error)
 
 
-def test_without_pyserial_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (Arduino("/dev/ttyACM0", 1000).connect, due_link.find_ports):
-        with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
-            action()
-        assert caught.value.cause == "refused"
-
-
 BUILT_IN = SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None)
 UNO = SimpleNamespace(device="/dev/ttyACM2", vid=0x2341, pid=0x0043, serial_number="uno")
 PROGRAMMING = SimpleNamespace(device="/dev/ttyACM1", vid=0x2341, pid=0x003D, serial_number="7")
@@ -102,3 +94,8 @@ def test_the_ports_of_a_due_are_found_native_first_and_that_of_a_line_board_wher
         line_driver.port_of(RigSettings())
     for port_of in (due_link.port_of, line_driver.port_of):
         assert port_of(RigSettings(port="COM3")) == "COM3"
+    monkeypatch.setitem(sys.modules, "serial", None)
+    for action in (Arduino("/dev/ttyACM0", 1000).connect, due_link.find_ports):
+        with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
+            action()
+        assert caught.value.cause == "refused"

@@ -24,7 +24,7 @@ def pressed(mishaps: float, presses: int) -> Finger:
     return finger
 
 
-def test_it_presses_where_it_is_asked_to_and_lifts_when_it_is_told() -> None:
+def test_it_presses_where_it_is_asked_to_lifts_when_it_is_told_and_makes_every_mistake() -> None:
     finger = pressed(0.0, 30)
     assert [stroke.kind for stroke in finger.strokes] == ["press"] * 30
     places = np.array([stroke.place_mm for stroke in finger.strokes])
@@ -38,9 +38,6 @@ def test_it_presses_where_it_is_asked_to_and_lifts_when_it_is_told() -> None:
     finger.look({"phase": "lift", "target": (5.0, -5.0)})  # it touches nothing where it is told to lift
     finger.volts(150.0 + np.arange(1, 201) / RATE_HZ)
     assert finger.said() == ["free"]
-
-
-def test_it_makes_every_mistake() -> None:
     strokes = pressed(1.0, 40).strokes
     assert {stroke.kind for stroke in strokes} == {*MISHAPS, "echo"}
     for before, stroke in pairwise(strokes):

@@ -8,17 +8,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 
 import padforge
 from design import Morphology
-from design.common.errors import InputError
 from design.settings import PUBLISHED_CONTACT
 from sense.recordings.press_journal import read_journal
 from sense.recordings.press_plan import PressPlan, planned
@@ -30,7 +28,7 @@ from sense.rig.boards import block_reader
 from sense.rig.devices.protocols import RigFault
 from sense.rig.emulators import whole_rig
 from sense.rig.emulators.printer.emulator import EmulatedPrinter
-from sense.rig.operation import look_over, record
+from sense.rig.operation import look_over
 from sense.rig.planning.setup import Setup
 from sense.rig.session.pad_frame import Frame
 from sense.rig.session.press_loop import Report, Session
@@ -120,23 +118,17 @@ def quick() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def arm() -> Iterator[Rig]:
-    rig = Rig(ARM, whole_rig.emulated)
-    with rig.kept:
-        yield rig
+RIGS = {
+    "arm": (ARM, whole_rig.emulated),
+    "line": (ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), whole_rig.emulated),
+    "printer": (PRINTER, whole_rig.emulated_printer),
+}
 
 
 @pytest.fixture
-def line() -> Iterator[Rig]:
-    rig = Rig(ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), whole_rig.emulated)
-    with rig.kept:
-        yield rig
-
-
-@pytest.fixture
-def printer() -> Iterator[Rig]:
-    rig = Rig(PRINTER, whole_rig.emulated_printer)
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """One of those."""
+    rig = Rig(*RIGS[request.param])
     with rig.kept:
         yield rig
 
@@ -154,15 +146,16 @@ def assert_whole(run: Path, plan: PressPlan, within_mm: float = 0.1) -> None:
     assert min(felt) > 0.01
 
 
+@pytest.mark.parametrize("rig", ["arm"], indirect=True)
 def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_goes_down(
-    arm: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One clock: where the tip is, by the controller's states, and what the fibres give, by the board's samples."""
     monkeypatch.setattr(block_reader, "SETTLE_S", 0.5)
-    plan = arm.plan(4)
-    began = arm.record(tmp_path / "run", plan)
+    plan = rig.plan(4)
+    began = rig.record(tmp_path / "run", plan)
     assert_whole(tmp_path / "run", plan)
-    recording, truth = Recording.open(tmp_path / "run"), arm.robot.truth.rows()
+    recording, truth = Recording.open(tmp_path / "run"), rig.robot.truth.rows()
     assert np.diff(recording.times_s).max() < 1.5 / recording.rate_hz
     truth = truth[truth[:, 0] > began]
     _, depths = Frame.of(ARM).tip(truth[:, 1:4])
@@ -175,65 +168,57 @@ def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_
     assert np.ptp(nearest) < 0.03  # a reading is a mean over 8 ms, and shallow touches show late
 
 
-def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(printer: Rig, tmp_path: Path) -> None:
-    plan = printer.plan(2)
-    printer.record(tmp_path / "run", plan, lambda done, of: printer.robot.garble(1e-3))
-    printer.robot.garble(0)
+@pytest.mark.parametrize("rig", ["printer"], indirect=True)
+def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(rig: Rig, tmp_path: Path) -> None:
+    plan = rig.plan(2)
+    rig.record(tmp_path / "run", plan, lambda done, of: rig.robot.garble(1e-3))
+    rig.robot.garble(0)
     assert_whole(tmp_path / "run", plan, 0.06)
-    made = printer.robot.firmware.made
+    made = rig.robot.firmware.made
     turned = np.array([move.move.at(move.lasted_s) for move in made]) + PRINTER.tcp_mm
     places, depths = Frame.of(PRINTER).tip(turned)
     presses = np.column_stack([plan.places_mm, plan.depths_mm])
     assert np.column_stack([places, depths])[depths > 0] == pytest.approx(presses, abs=0.06)
 
 
-class Fault(NamedTuple):
-    """How a rig is disturbed, what a person then reads, and what helps."""
-
-    disturb: Callable[[Rig], object]
-    cause: str
-    cure: Callable[[Rig], object]
-
-
-FAULTS = {
-    "protective": Fault(lambda rig: rig.robot.protective_stop(), "protective_stop", lambda rig: rig.robot.clear()),
-    "emergency": Fault(lambda rig: rig.robot.emergency_stop(), "emergency_stop", lambda rig: rig.robot.clear()),
-    "drop": Fault(lambda rig: rig.robot.drop("rtde"), "lost", lambda rig: None),
-    "freeze": Fault(lambda rig: rig.robot.freeze(True), "stale", lambda rig: rig.robot.freeze(False)),
-    "restart": Fault(lambda rig: rig.robot.restart(0.4), "lost", lambda rig: time.sleep(0.3)),
-    "stall": Fault(lambda rig: rig.board.stall(), "stale", lambda rig: rig.board.stall(False)),
-    "unplug": Fault(lambda rig: rig.board.unplug(), "lost", Rig.anew),
-    "reset": Fault(lambda rig: rig.board.reset(), "data", lambda rig: None),
-    "columns": Fault(lambda rig: rig.board.send_columns(15), "data", lambda rig: rig.board.send_columns(16)),
-    "printer_halts": Fault(lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
-    "printer_busy": Fault(lambda rig: rig.robot.busy(10), "stale", Rig.home),
-    "printer_restarts": Fault(lambda rig: rig.robot.restart(), "lost", Rig.home),
-    "board_of_printer": Fault(lambda rig: rig.board.unplug(), "lost", Rig.anew),
-    "printer_unplugged": Fault(lambda rig: rig.robot.unplug(), "lost", Rig.anew),
+FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] = {
+    "protective": (lambda rig: rig.robot.protective_stop(), "protective_stop", lambda rig: rig.robot.clear()),
+    "emergency": (lambda rig: rig.robot.emergency_stop(), "emergency_stop", lambda rig: rig.robot.clear()),
+    "drop": (lambda rig: rig.robot.drop("rtde"), "lost", lambda rig: None),
+    "freeze": (lambda rig: rig.robot.freeze(True), "stale", lambda rig: rig.robot.freeze(False)),
+    "restart": (lambda rig: rig.robot.restart(0.4), "lost", lambda rig: time.sleep(0.3)),
+    "stall": (lambda rig: rig.board.stall(), "stale", lambda rig: rig.board.stall(False)),
+    "unplug": (lambda rig: rig.board.unplug(), "lost", Rig.anew),
+    "reset": (lambda rig: rig.board.reset(), "data", lambda rig: None),
+    "columns": (lambda rig: rig.board.send_columns(15), "data", lambda rig: rig.board.send_columns(16)),
+    "printer_halts": (lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
+    "printer_busy": (lambda rig: rig.robot.busy(10), "stale", Rig.home),
+    "printer_restarts": (lambda rig: rig.robot.restart(), "lost", Rig.home),
+    "board_of_printer": (lambda rig: rig.board.unplug(), "lost", Rig.anew),
+    "printer_unplugged": (lambda rig: rig.robot.unplug(), "lost", Rig.anew),
 }
+"""How a rig is disturbed, the cause that a person then reads, and what helps."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "presses", "names"),
+    ("rig", "presses", "names"),
     [
         ("arm", 9, "protective drop freeze stall unplug emergency restart"),
         ("line", 6, "reset columns stall unplug"),
         ("printer", 8, " ".join(name for name in FAULTS if "printer" in name)),
     ],
+    indirect=["rig"],
 )
-def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(
-    kind: str, presses: int, names: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(rig: Rig, presses: int, names: str, tmp_path: Path) -> None:
     """One after the other in one recording, which is resumed after each, at last with bytes of the board damaged."""
-    rig, run = request.getfixturevalue(kind), tmp_path / "run"
-    plan = rig.plan(presses)
+    run, plan = tmp_path / "run", rig.plan(presses)
     for press, name in enumerate(names.split(), start=1):
         disturb, cause, cure = FAULTS[name]
         fault, told_s = rig.disturbed(run, plan, disturb)
         assert fault.cause == cause, name
         assert "\n" not in str(fault)
-        assert told_s < (2 if kind == "printer" else 5), name
+        assert told_s < (2 if rig.settings is PRINTER else 5), name
         assert rig.rests(), name
         if name == "board_of_printer":  # the probe is lifted
             tip = rig.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
@@ -262,33 +247,9 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
     assert np.unique(volts).size > grid
 
 
-def test_a_board_that_is_not_emulated_is_refused() -> None:
-    rig = whole_rig.emulated_rig(RigSettings(board="crane"), PAD)
-    with pytest.raises(InputError, match="emulated are due and line"), whole_rig.emulated(PAD, PUBLISHED_CONTACT, rig):
-        pass
-
-
-EIGHT = Morphology.straight(8)
-LINE = RigSettings.model_validate({"board": "line", "presses": 1, **QUICK})
-
-
-@pytest.mark.slow
-def test_sixteen_fibres_are_recorded_and_their_wiring_is_kept(tmp_path: Path) -> None:
-    setup = Setup(EIGHT, PUBLISHED_CONTACT, LINE, tmp_path / "run", "test")
-    recording = record("simulated", setup)
-    assert recording is not None
-    assert recording.fibres == 16
-    assert recording.source["rig"]["channels"] == list(range(16))
-    turned = LINE.model_copy(update={"channels": tuple(range(16))[::-1]})
-    with pytest.raises(InputError, match=r"\[rig\] channels: got \[15, 14, .* was begun with \[0, 1, "):
-        record("simulated", replace(setup, rig=turned), resume=True)
-    with pytest.raises(InputError, match=r"was begun with another pad|\[rig\] channels"):
-        record("simulated", replace(setup, pad=Morphology.straight(6)), resume=True)
-
-
 def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sense.rig.diagnostics.LOOK_S", 0.3)
-    setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, LINE, tmp_path, "test")
+    setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
     found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
     assert found["channel 1"].found.startswith("input 14 rests at")
     assert found["channel 2"].found.startswith("input 3 rests at")

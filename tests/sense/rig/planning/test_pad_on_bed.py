@@ -44,26 +44,16 @@ def changed(folder, tmp_path) -> Callable[..., Path]:
     return write
 
 
-def test_the_mould_tells_all_that_a_printer_has_to_know(folder):
+def test_the_mould_tells_all_that_a_printer_has_to_know_and_what_rig_says_counts_more(folder, changed):
     rig = on_bed(RIG, folder)
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
     assert rig.box_mm == pytest.approx((100 - HALF, 100 + HALF, 90 - HALF, 90 + HALF, 3.0, 130.0), abs=1e-5)
     require_safe_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
-
-
-@pytest.mark.parametrize(("place", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
-def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, depth):
-    with pytest.raises(RigFault, match="no move"):
-        require_safe_plan(PressPlan(np.array([place]), np.array([depth])), on_bed(RIG, folder))
-
-
-def test_the_workspace_ends_where_the_nozzle_does(folder):
-    box = on_bed(RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder).box_mm
+    box = on_bed(
+        RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder
+    ).box_mm  # it ends where the nozzle does
     assert box is not None
     assert (box[0], box[3]) == (95, 90)
-
-
-def test_what_rig_says_counts_more(folder):
     said = RIG.model_copy(update={"pad_mm": (50.0, 60.0), "contact_mm": 9.0, "pad_angle_deg": 90.0})
     rig = on_bed(said, folder)
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg) == ((50.0, 60.0), 9.0, 90.0)
@@ -71,6 +61,16 @@ def test_what_rig_says_counts_more(folder):
     assert rig.box_mm[0] == 50 - HALF
     everything = rig.model_copy(update={"tcp_mm": None})
     assert on_bed(everything, folder / "nowhere") is everything
+    for angle_deg, (right, top) in ((0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))):
+        box = on_bed(RIG, changed(pad_mm=[60.0, 20.0], angle_deg=angle_deg)).box_mm
+        assert box is not None
+        assert box[:4] == (100 - right, 100 + right, 90 - top, 90 + top)
+
+
+@pytest.mark.parametrize(("place", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
+def test_the_tip_meets_neither_the_holder_nor_the_bed_beside_it(folder, place, depth):
+    with pytest.raises(RigFault, match="no move"):
+        require_safe_plan(PressPlan(np.array([place]), np.array([depth])), on_bed(RIG, folder))
 
 
 @pytest.mark.parametrize(
@@ -108,10 +108,3 @@ def test_a_pad_without_a_holder_lies_nobody_knows_where(folder, tmp_path):
 def test_a_damaged_frame_is_named(changed, key, value, said):
     with pytest.raises(InputError, match=said):
         on_bed(RIG, changed(**{key: value}))
-
-
-@pytest.mark.parametrize(("angle_deg", "halves"), [(0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))])
-def test_the_workspace_over_a_rectangle_is_as_wide_and_high_as_that(changed, angle_deg, halves):
-    (right, top), box = halves, on_bed(RIG, changed(pad_mm=[60.0, 20.0], angle_deg=angle_deg)).box_mm
-    assert box is not None
-    assert box[:4] == (100 - right, 100 + right, 90 - top, 90 + top)

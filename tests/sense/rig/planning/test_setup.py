@@ -44,12 +44,21 @@ def begun(tmp_path_factory) -> Path:
     return out
 
 
-def test_a_resumed_recording_keeps_its_plan_and_tells_where_another_is_asked_for(begun, tmp_path):
+def test_a_plan_is_of_a_kind_or_from_a_file_and_is_kept_where_another_is_asked_for_later(begun, tmp_path):
     assert resumed(begun, seed=9, presses=3) == resumed(begun)
-    assert resumed(begun, seed=9)[0] == pytest.approx([*planned(PAD, RIG, np.random.default_rng(0)).places_mm[0], 5.0])
     other = replace(setup(begun), rig=RIG.model_copy(update={"seed": 9, "presses": 30}))
     assert kept_plan(other).endswith("the plan it was begun with, [rig] presses = 5, seed = 0")
     assert kept_plan(setup(begun)) == kept_plan(replace(other, out=tmp_path / "new")) == ""
+    # `--plan` and `[rig] plan` say the same
+    (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
+    named = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
+    assert named.plan_file == tmp_path / "places.csv"
+    assert plan_of(setup(tmp_path / "run"), named, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
+    grid = RigSettings(plan="grid", presses=4)
+    assert grid.plan_file is None
+    assert len(plan_of(setup(tmp_path / "run"), grid, resume=False)) == 4
+    with pytest.raises(InputError, match=r"\[rig\] plan: got 'grids', expected uniform, .* or a \.csv file"):
+        RigSettings(plan="grids")
 
 
 def test_a_recording_of_a_rectangle_is_resumed_but_for_holes_that_were_made_since(tmp_path):
@@ -81,19 +90,13 @@ def test_other_settings_are_refused(begun, key, value):
         plan_of(setup(begun), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
 
 
-def test_limits_and_addresses_may_change(begun):
+def test_another_pad_is_refused_and_other_limits_addresses_and_sides_that_nobody_named_are_not(begun, tmp_path):
     limits = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1)}
     resumed(begun, **limits, host="arm", port="COM3")
-
-
-def test_another_pad_is_refused(begun):
     with pytest.raises(InputError, match="another pad"):
         resumed(begun, Morphology.random(2, 3, 1))
     with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
         resumed(begun, Morphology.straight(3), channels=())
-
-
-def test_a_recording_of_before_there_was_a_side_to_name_counts_as_not_mirrored(begun, tmp_path):
     document = json.loads((begun / START).read_text())
     assert document["source"]["rig"].pop("mirrored") is False
     (tmp_path / START).write_text(json.dumps(document))
@@ -134,16 +137,3 @@ def test_a_recording_without_a_plan_cannot_be_resumed(tmp_path, source):
     (tmp_path / "start.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="has no plan"):
         resumed(tmp_path)
-
-
-def test_a_plan_is_of_a_kind_or_from_a_file(tmp_path):
-    """`--plan` and `[rig] plan` say the same."""
-    (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
-    named = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
-    assert named.plan_file == tmp_path / "places.csv"
-    assert plan_of(setup(tmp_path / "run"), named, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
-    grid = RigSettings(plan="grid", presses=4)
-    assert grid.plan_file is None
-    assert len(plan_of(setup(tmp_path / "run"), grid, resume=False)) == 4
-    with pytest.raises(InputError, match=r"\[rig\] plan: got 'grids', expected uniform, .* or a \.csv file"):
-        RigSettings(plan="grids")

@@ -37,11 +37,15 @@ def retreated(arm: FakeArm) -> FakeArm:
     return arm
 
 
-def test_a_force_that_falls_lets_the_tool_off() -> None:
+def test_a_force_that_falls_lets_the_tool_off_and_above_the_pad_it_is_lifted_off_what_it_presses() -> None:
     arm = retreated(pressed(DEEP_MM, lambda arm: 25 * max(0.0, 50 - arm.pose[2])))
     assert arm.pose[2] == pytest.approx(50 + HEIGHT_MM)
     assert arm.stops == 0
     assert arm.time() - 100 == pytest.approx((4 + HEIGHT_MM) / SPEED_MM_S, abs=0.1)
+    assert retreated(pressed(75.0, lambda arm: 0.0)).moves == []
+    arm = retreated(pressed(75.0, lambda arm: 80.0 if arm.pose[2] < 76 else 0.0))
+    assert arm.pose[2] == pytest.approx(75 + HEIGHT_MM)
+    assert retreated(pressed(115.0, lambda arm: 80.0 if arm.pose[2] < 116 else 0.0)).pose[2] == LIMITS.box_mm[2][1]
 
 
 @pytest.mark.parametrize(
@@ -63,13 +67,13 @@ def test_a_force_that_does_not_fall_stops_the_arm_again(force: Callable[[FakeArm
     assert arm.pose[2] < DEEP_MM + most_mm
 
 
-@pytest.mark.parametrize("what", ["protective_stop", "emergency_stop", "lost"])
-def test_an_arm_that_was_stopped_or_is_gone_is_not_moved(what: str) -> None:
+@pytest.mark.parametrize("what", ["protective_stop", "emergency_stop", "lost", "pose"])
+def test_an_arm_that_was_stopped_is_gone_or_stands_elsewhere_is_not_moved(what: str) -> None:
     arm = pressed(DEEP_MM, lambda arm: 80.0)
-    setattr(arm, what, True)
-    with pytest.raises(RigFault) as caught:
+    setattr(arm, what, (102.0, *arm.pose[1:]) if what == "pose" else True)
+    with pytest.raises(RigFault, match="x 102 mm" if what == "pose" else ".") as caught:
         retreated(arm)
-    assert caught.value.cause == what
+    assert what in (caught.value.cause, "pose")
     assert arm.moves == []
 
 
@@ -82,21 +86,6 @@ def test_a_tool_too_deep_or_at_the_edge_of_the_box_comes_up(x: float, y: float, 
     arm = pressed(z, lambda arm: 0.0)
     arm.pose = (x, y, *arm.pose[2:])
     assert retreated(arm).pose[:3] == (x, y, pytest.approx(50 + HEIGHT_MM))
-
-
-def test_a_tool_that_stands_elsewhere_is_left_there() -> None:
-    arm = pressed(DEEP_MM, lambda arm: 0.0)
-    arm.pose = (102.0, *arm.pose[1:])
-    with pytest.raises(RigFault, match="x 102 mm"):
-        retreated(arm)
-    assert arm.moves == []
-
-
-def test_a_tool_above_the_pad_is_only_lifted_off_what_it_presses() -> None:
-    assert retreated(pressed(75.0, lambda arm: 0.0)).moves == []
-    arm = retreated(pressed(75.0, lambda arm: 80.0 if arm.pose[2] < 76 else 0.0))
-    assert arm.pose[2] == pytest.approx(75 + HEIGHT_MM)
-    assert retreated(pressed(115.0, lambda arm: 80.0 if arm.pose[2] < 116 else 0.0)).pose[2] == LIMITS.box_mm[2][1]
 
 
 @pytest.mark.slow

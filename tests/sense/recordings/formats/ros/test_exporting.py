@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
 
 from design.common.errors import InputError
 from sense import Recording
@@ -17,7 +19,7 @@ from sense.recordings.formats.model_findings import FaultFound, ModelFindings
 from sense.recordings.formats.ros import exporting
 from sense.recordings.formats.ros.exporting import export_bag
 from sense.recordings.formats.ros.importing import import_bag
-from sense.recordings.import_export import export_file, open_recording
+from sense.recordings.import_export import export_file
 
 
 def others_read(path: Path) -> tuple[dict[str, list[tuple[int, Any]]], dict[str, str]]:
@@ -74,47 +76,26 @@ def test_an_independent_reader_finds_types_frames_stamps_and_values(eight: Recor
     assert set(about["topics"]) | {"/pad/recording"} == set(kinds)
 
 
-def test_rosbag2_knows_how_the_topics_are_offered_and_what_they_hold(bag: Path) -> None:
-    from rosbags.interfaces import QosDurability
-    from rosbags.rosbag2 import Reader
-
-    with Reader(bag) as reader:
-        durability = {each.topic: each.ext.offered_qos_profiles[0].durability for each in reader.connections}  # pyright: ignore
-    assert {topic for topic, how in durability.items() if how == QosDurability.TRANSIENT_LOCAL} == {"/pad/recording"}
-    assert b"/pad/readings: V, one value for each fibre" in bag.read_bytes()
-
-
 def test_an_export_reads_back_the_same_and_is_reproducible(eight: Recording, bag: Path, tmp_path: Path) -> None:
-    again = import_bag(bag)
-    assert again == eight
-    assert again.digest == eight.digest
-    assert again.source == eight.source
-    assert open_recording(bag) == eight
+    """Also times of any clock, presses on end and one that is never lifted."""
+    edges = np.array([10, 21, 200]), np.array([20, 30, len(eight.readings)])
+    others = [replace(eight, times_s=eight.times_s + shift) for shift in (-1e3, 1.7e9, 5e9, 0.1234567890123)]
+    for other in (eight, *others, Recording(eight.readings, eight.times_s, np.eye(3, 2), *edges)):
+        export_bag(other, tmp_path / "eight.mcap")
+        assert (found := import_bag(tmp_path / "eight.mcap")) == other
+        assert (found.digest, found.source) == (other.digest, other.source)
+        assert [file.name for file in tmp_path.iterdir()] == ["eight.mcap"]
     export_bag(eight, tmp_path / "eight.mcap")
     assert (tmp_path / "eight.mcap").read_bytes() == bag.read_bytes()
-    assert [file.name for file in tmp_path.iterdir()] == ["eight.mcap"]
-
-
-@pytest.mark.parametrize("shift", [-1e3, 1.7e9, 5e9, 0.1234567890123])
-def test_times_of_any_clock_come_back(eight: Recording, tmp_path: Path, shift: float) -> None:
-    shifted = replace(eight, times_s=eight.times_s + shift)
-    export_bag(shifted, tmp_path / "r.mcap")
-    assert import_bag(tmp_path / "r.mcap").digest == shifted.digest
-
-
-def test_presses_on_end_and_one_that_is_never_lifted_come_back(eight: Recording, tmp_path: Path) -> None:
-    begun = np.array([10, 21, 200])
-    packed = Recording(eight.readings, eight.times_s, np.eye(3, 2), begun, np.array([20, 30, len(eight.readings)]))
-    export_bag(packed, tmp_path / "r.mcap")
-    assert import_bag(tmp_path / "r.mcap") == packed
+    with Reader(bag) as reader:  # rosbag2 tells whoever comes later what is in the recording
+        durability = {each.topic: each.ext.offered_qos_profiles[0].durability for each in reader.connections}  # pyright: ignore
+    assert {topic for topic, how in durability.items() if how == QosDurability.TRANSIENT_LOCAL} == {"/pad/recording"}
 
 
 def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: Path) -> None:
     depth = np.where(np.arange(8) < 4, 2.0, np.nan)
-    places, faults = (
-        (np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])),
-        [FaultFound(5, (1,), "open", "fibre 2 is open")],
-    )
+    places = np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])
+    faults = [FaultFound(5, (1,), "open", "fibre 2 is open")]
     findings = ModelFindings(*places, np.ones(8), depth, depth / 4, faults, (3,))
     export_bag(eight, tmp_path / "r.mcap", findings)
     found, kinds = others_read(tmp_path / "r.mcap")
@@ -122,15 +103,12 @@ def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: 
     stamp, first = found["/pad/touches"][0]
     assert stamp == found["/pad/readings"][eight.lifted[0]][0]
     np.testing.assert_allclose(xyz(first.pose.pose.position), [0.003, 0.003, -0.002])
-    np.testing.assert_allclose(
-        [first.pose.covariance[at] for at in (0, 7, 14)], np.square([5e-4, 2.5e-4, 5e-4 / 1.6449])
-    )
+    spread = np.sqrt([first.pose.covariance[at] for at in (0, 7, 14)])
+    np.testing.assert_allclose(spread, [5e-4, 2.5e-4, 5e-4 / 1.6449])
     assert found["/pad/touches"][7][1].pose.covariance[14] == -1
     levels = [[status.level for status in content.status] for _, content in found["/pad/health"]]
-    assert [[int(bytes([level])[0]) if isinstance(level, int) else level[0] for level in each] for each in levels] == [
-        [0, 0, 0, 2],
-        [0, 2, 0, 2],
-    ]
+    numbers = [[level if isinstance(level, int) else level[0] for level in each] for each in levels]
+    assert numbers == [[0, 0, 0, 2], [0, 2, 0, 2]]
     told = found["/pad/health"][1][1].status[1]
     assert (told.name, told.message, told.values[0].value) == ("pad: fibre 2", "fibre 2 is open", "open")
     assert import_bag(tmp_path / "r.mcap") == eight
@@ -154,13 +132,11 @@ def test_poses_of_an_arm_are_metres_and_quaternions(eight: Recording, tmp_path: 
     assert import_bag(tmp_path / "r.mcap") == eight
 
 
-def test_what_import_would_not_take_is_not_written(
+def test_what_import_would_not_take_or_nothing_can_write_is_not_written(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exporting, "MOST_MESSAGES", 100)
-    with pytest.raises(
-        InputError, match=r"would be \d+ messages of \d+ bytes and 0 of an arm or a model, allowed in a bag are 100"
-    ):
+    with pytest.raises(InputError, match=r"would be \d+ messages .* allowed in a bag are 100"):
         export_bag(eight, tmp_path / "r.mcap")
     monkeypatch.undo()
     with pytest.raises(InputError, match=r"too long for a bag: \d+ characters of times, presses and source"):
@@ -170,9 +146,6 @@ def test_what_import_would_not_take_is_not_written(
     with pytest.raises(InputError, match=r"there\.mcap: is a folder, expected a file or nothing"):
         export_bag(eight, tmp_path / "there.mcap")
     assert [file.name for file in tmp_path.iterdir()] == ["there.mcap"]
-
-
-def test_without_rosbags_it_is_one_line(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
     for run in (lambda: export_bag(eight, tmp_path / "r.mcap"), lambda: import_bag(tmp_path / "r.mcap")):
         with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[ros\]'"):

@@ -10,14 +10,14 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from design.common.errors import InputError
-from sense import Recording, import_mat, open_recording
+from sense import Recording, open_recording
 from sense.recordings.formats.ros.exporting import export_bag
 from sense.recordings.formats.ros.importing import import_bag
 from sense.recordings.import_export import import_file
 
 from .foreign import STORE, Message, array, make, pose, wrench, write_bag
 
-READINGS, PRESSED, PLACE, FORCE = "/pad/readings", "/pad/pressed", "/pad/place", "/pad/force"
+READINGS, PLACE = "/pad/readings", "/pad/place"
 
 
 def changed(bag: Path, folder: Path, change: Callable[[str, float, Any], bool]) -> Path:
@@ -46,6 +46,10 @@ def test_messages_alone_are_the_recording_but_for_roundings(eight: Recording, ba
     found = import_bag(changed(bag, tmp_path / "bag", lambda topic, *_: topic != "/pad/recording"))
     close(found, eight)
     assert found.source == {"kind": "ros", "file": "bag.mcap"}
+    untold = import_bag(changed(bag, tmp_path / "untold", lambda topic, *_: topic == READINGS))
+    assert untold.source["presses"] == "found"
+    assert len(untold.presses_mm) >= 7
+    assert not untold.known.any()
 
 
 def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path: Path) -> None:
@@ -62,7 +66,9 @@ def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path:
     np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.known]) / 1000)
 
 
-def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, tmp_path: Path) -> None:
+def test_a_part_of_a_bag_is_what_its_messages_say_and_what_is_edited_counts(
+    eight: Recording, bag: Path, tmp_path: Path
+) -> None:
     first, end = (int(stamps) for stamps in (eight.begun[1] + 3, eight.begun[6] + 2))
     span = eight.times_s[[first, end]] + [-1e-6, 1e-6]
     kept = lambda topic, time, _: topic == "/pad/recording" or span[0] <= time <= span[1]  # noqa: E731
@@ -79,8 +85,6 @@ def test_a_part_of_a_bag_is_what_its_messages_say(eight: Recording, bag: Path, t
     )
     close(found, part)
 
-
-def test_what_is_edited_counts(eight: Recording, bag: Path, tmp_path: Path) -> None:
     def edited(topic: str, _: float, message: Any) -> bool:
         if topic == PLACE:
             message.pose.pose.position.x += moved_m
@@ -95,13 +99,6 @@ def test_what_is_edited_counts(eight: Recording, bag: Path, tmp_path: Path) -> N
     found = import_bag(changed(bag, tmp_path / "louder", edited))
     assert found == replace(eight, readings=eight.readings + 0.5)
     assert found.source["note"] == "readings are not those that were exported"
-
-
-def test_presses_are_found_where_no_message_tells_them(eight: Recording, bag: Path, tmp_path: Path) -> None:
-    found = import_bag(changed(bag, tmp_path / "bag", lambda topic, *_: topic == READINGS))
-    assert found.source["presses"] == "found"
-    assert len(found.presses_mm) >= 7
-    assert not found.known.any()
 
 
 def lab() -> Iterator[Message]:
@@ -181,7 +178,9 @@ def test_arrays_that_change_their_length_and_topics_that_say_nothing_are_refused
             import_bag(bag, "fibres=/f,press=/down")
 
 
-def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -> None:
+def test_folders_are_bags_only_where_they_say_so_and_files_in_one_may_be_several_or_in_another_order(
+    tmp_path: Path, folder: Path
+) -> None:
     with pytest.raises(InputError, match=r"ends in '', allowed are \.mat, \.csv, .*or a rosbag2 folder"):
         import_file(tmp_path)
     assert open_recording(folder)
@@ -194,9 +193,6 @@ def test_folders_are_bags_only_where_they_say_so(tmp_path: Path, folder: Path) -
     bag.unlink()
     with pytest.raises(InputError, match=r"has metadata\.yaml, but no file that ends in \.mcap or \.db3"):
         import_file(bag.parent, ALL)
-
-
-def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
     messages = list(lab())
     mixed = [messages[at] for at in np.random.default_rng(0).permutation(len(messages))]
     for number, part in enumerate((messages[:400], messages[400:])):
@@ -204,13 +200,6 @@ def test_a_bag_in_several_files_or_another_order_is_one(tmp_path: Path) -> None:
         (tmp_path / "bag").mkdir(exist_ok=True)
         bag.rename(tmp_path / "bag" / bag.name)
     (tmp_path / "bag" / "metadata.yaml").write_text("")
-    expected = import_file(write_bag(tmp_path / "lab", messages), ALL)
+    expected = import_file(write_bag(tmp_path / "whole", messages), ALL)
     assert import_file(tmp_path / "bag", ALL) == expected
     assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected
-
-
-@pytest.mark.slow
-def test_the_published_recording_comes_back_to_the_bit(published: Path, tmp_path: Path) -> None:
-    recording = import_mat(published / "para5_long_first4500.mat")
-    export_bag(recording, tmp_path / "r.mcap")
-    assert import_bag(tmp_path / "r.mcap").digest == recording.digest

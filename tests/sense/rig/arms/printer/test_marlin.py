@@ -10,10 +10,7 @@ from sense.rig.arms.printer.motion import StraightMove
 M115 = [
     "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"
     " PROTOCOL_VERSION:1.0 MACHINE_TYPE:Ender-3 Pro EXTRUDER_COUNT:1 UUID:cede2a2f-41a2-4748-9b12-c55c62f367ff",
-    "Cap:SERIAL_XON_XOFF:0",
-    "Cap:EEPROM:1",
-    "Cap:EMERGENCY_PARSER:1",
-    "Cap:AUTOREPORT_POS:0",
+    *("Cap:SERIAL_XON_XOFF:0", "Cap:EEPROM:1", "Cap:EMERGENCY_PARSER:1", "Cap:AUTOREPORT_POS:0"),
 ]
 M503 = [
     "echo:; Maximum feedrates (units/s):",
@@ -25,38 +22,11 @@ M503 = [
 ]
 
 
-def test_lines_are_written_as_marlin_reads_them():
+def test_lines_are_written_as_marlin_reads_them_and_what_a_printer_says_of_itself_is_read():
     """A numbered line ends in the exclusive or of its bytes, a move is in mm/min."""
     assert marlin.numbered(0, "M110 N0") == b"N0 M110 N0*125\n"
     assert marlin.numbered(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
     assert marlin.move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
-
-
-@pytest.mark.parametrize(
-    ("read", "line", "expected"),
-    [
-        (marlin.resend, "Resend: 42", 42),
-        (marlin.resend, "Resend:7", 7),
-        (marlin.resend, "rs N12", 12),
-        (marlin.resend, "Resend: ", None),
-        (marlin.resend, "ok", None),
-        (marlin.resend, "Resend: 4x", None),
-        (marlin.place, "X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
-        (marlin.place, "X:1.00 Y:2.00 Z:3.00", (1.0, 2.0, 3.0)),
-        (marlin.place, "X:1.00 Y:2.00 Z:3.0o E:0.00", None),
-        (marlin.place, "X:1.00 Y:2.00", None),
-        (marlin.place, "T:20.1 /0.0 B:20.0 /0.0", None),
-        (marlin.halts, "Error:Printer halted. kill() called!", True),
-        (marlin.halts, "Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
-        (marlin.halts, "Error:checksum mismatch, Last Line: 41", False),
-        (marlin.halts, "echo:Printer halted", False),
-    ],
-)
-def test_a_line_is_read_whole_or_not_at_all(read, line, expected):
-    assert read(line) == expected
-
-
-def test_what_a_printer_says_of_itself_and_of_its_axes():
     found = marlin.Firmware.of(M115)
     assert found.name == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
     assert found.machine == "Ender-3 Pro"
@@ -68,10 +38,27 @@ def test_what_a_printer_says_of_itself_and_of_its_axes():
     assert marlin.limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
 
 
+@pytest.mark.parametrize(
+    ("read", "line", "expected"),
+    [
+        *((marlin.resend, line, number) for line, number in (("Resend: 42", 42), ("Resend:7", 7), ("rs N12", 12))),
+        *((marlin.resend, line, None) for line in ("Resend: ", "ok", "Resend: 4x")),
+        (marlin.place, "X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
+        (marlin.place, "X:1.00 Y:2.00 Z:3.00", (1.0, 2.0, 3.0)),
+        *((marlin.place, line, None) for line in ("X:1.00 Y:2.00 Z:3.0o E:0.00", "X:1.00 Y:2.00", "T:20.1 /0.0")),
+        (marlin.halts, "Error:Printer halted. kill() called!", True),
+        (marlin.halts, "Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
+        *((marlin.halts, line, False) for line in ("Error:checksum mismatch, Last Line: 41", "echo:Printer halted")),
+    ],
+)
+def test_a_line_is_read_whole_or_not_at_all(read, line, expected):
+    assert read(line) == expected
+
+
 LONG_WAY = StraightMove((0.0, 0.0, 0.0), (30.0, 40.0, 0.0), 10.0, 20.0)
 
 
-def test_a_long_move_has_a_trapezoid_of_speed_and_a_short_one_never_reaches_it():
+def test_moves_have_a_trapezoid_of_speed_and_no_axis_exceeds_its_limits():
     assert LONG_WAY.duration_s == pytest.approx(50 / 10 + 10 / 20)
     assert LONG_WAY.at(-1.0) == LONG_WAY.start
     assert LONG_WAY.at(0.5) == pytest.approx((1.5, 2.0, 0.0))  # 2.5 mm while it gains speed
@@ -84,9 +71,6 @@ def test_a_long_move_has_a_trapezoid_of_speed_and_a_short_one_never_reaches_it()
     nowhere = StraightMove((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 10.0, 10.0)
     assert nowhere.duration_s == 0
     assert nowhere.within((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)).at(0.0) == nowhere.end
-
-
-def test_no_axis_exceeds_its_limits():
     move = LONG_WAY.within((3.0, 100.0, 1.0), (100.0, 4.0, 1.0))  # z does not move, and limits nothing
     assert move.speed * 0.6 == pytest.approx(3.0)
     assert move.acceleration * 0.8 == pytest.approx(4.0)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sense.rig.arms.printer import driver as module
 from sense.rig.arms.printer import marlin
 from sense.rig.arms.printer.driver import Printer
 from sense.rig.arms.printer.link import MarlinLink
@@ -24,7 +23,7 @@ from tests.sense.rig.devices.fakes import fault_of
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
-AT = (80.0, 110.0, 60.0)
+AT, BAUD = (80.0, 110.0, 60.0), 115_200
 TCP = (30.0, 0.0, -20.0)
 RIG = RigSettings(tcp_mm=TCP, clearance_mm=2.0, depth_mm=3.0)
 QUICK: dict[str, Any] = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.0)}
@@ -51,7 +50,7 @@ def to_rest(arm: Printer) -> ArmState:
     return state
 
 
-def test_a_printer_says_who_it_is_and_where_its_tip_is():
+def test_a_printer_says_who_it_is_where_its_tip_is_and_how_fast_its_axes_are():
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         told = arm.connect()
         assert told["firmware"].startswith("Marlin")
@@ -59,6 +58,10 @@ def test_a_printer_says_who_it_is_and_where_its_tip_is():
         state = arm.state()
         assert state.pose == pytest.approx(pose(110, 110, 40))
         assert (state.moving, state.force_n) == (False, None)
+        arm.move(pose(110, 110, 38), 200.0, 50.0)
+        to_rest(arm)
+        made = printer.firmware.made[-1].move
+        assert (made.speed, made.acceleration) == pytest.approx((15, 50), rel=1e-3)
 
 
 @pytest.mark.parametrize("realtime", [pytest.param(True, marks=pytest.mark.slow), False])
@@ -76,15 +79,6 @@ def test_the_tip_goes_straight_and_its_place_is_known_all_the_way(realtime):
         assert np.diff(rows[:, 0]).max() < 0.4
         assert len(rows) > 10
         assert np.isnan(rows[:, 8]).all()
-
-
-def test_axes_are_no_faster_than_the_printer_makes_them():
-    with connected(max_mm_s=(500.0, 500.0, 20.0)) as (arm, printer):
-        arm.move(pose(110, 110, 38), 200.0, 3000.0)
-        to_rest(arm)
-        made = printer.firmware.made[-1].move
-        assert made.speed == pytest.approx(20, rel=1e-3)
-        assert made.acceleration == pytest.approx(3000)
 
 
 @pytest.mark.parametrize("emergency_parser", [pytest.param(True, marks=pytest.mark.slow), False])
@@ -122,7 +116,7 @@ def test_faults_are_told_within_two_seconds(disturb, cause, match, under_way):
         assert fault_of(arm.state, cause, match) < 2
 
 
-def test_a_stop_that_is_not_confirmed_halts_the_printer():
+def test_a_stop_that_is_not_confirmed_halts_the_printer_and_a_place_beyond_its_reach_is_told_before():
     with connected() as (arm, printer):
         arm.move(pose(110, 110, 10), 10.0, 3000.0)
         time.sleep(0.3)
@@ -135,9 +129,6 @@ def test_a_stop_that_is_not_confirmed_halts_the_printer():
         time.sleep(0.05)
         assert printer.firmware.halted
         assert printer.nozzle_at(begun + 0.6)[0] == pytest.approx(printer.nozzle_at(begun + 5)[0])
-
-
-def test_a_place_beyond_the_printers_reach_is_told_before_it_goes_there():
     with connected() as (arm, printer):
         with pytest.raises(RigFault, match=r"is about to go to 220\.00, .* but was sent to 230\.00") as fault:
             arm.move(pose(260, 110, 40), 50.0, 3000.0)
@@ -163,19 +154,16 @@ def test_a_printer_that_cannot_be_used_is_refused(options, settings, match):
         assert len(printer.firmware.made) == 1
 
 
-def test_other_firmware_and_silent_ports_are_refused(monkeypatch):
+def test_other_firmware_is_refused(monkeypatch):
     monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:RepRapFirmware FIRMWARE_VERSION:3.4")
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         fault_of(arm.connect, "refused", "'RepRapFirmware', allowed is Marlin")
         monkeypatch.setattr(firmware, "IDENTITY", "FIRMWARE_NAME:Marlin 1.1.9 (Github) PROTOCOL_VERSION:1.0")
         fault_of(arm.connect, "refused", "only once it stands; allowed is Marlin 2")
-        monkeypatch.setattr(module, "CONNECT_S", 0.2)
-        printer.busy(60)
-        fault_of(arm.connect, "refused", "no printer answers; check .* printer_baud")
 
 
-def test_orders_that_are_none_are_refused_and_break_nothing():
-    with connected() as (arm, _):
+def test_orders_that_are_none_and_a_second_program_are_refused_and_break_nothing():
+    with connected() as (arm, printer), closing(driven(printer)) as second:
         for order, match in (
             ((110, 110, 40, 0.0, 3.0, 0.0), "a printer cannot turn it"),
             (pose(float("nan"), 110, 40), "finite numbers"),
@@ -185,28 +173,16 @@ def test_orders_that_are_none_are_refused_and_break_nothing():
         arm.move(pose(110, 110, 39.5), 10.0, 1000.0)
         with pytest.raises(RigFault, match="under way"):
             arm.move(pose(110, 110, 40), 10.0, 100.0)
-        assert to_rest(arm).pose[2] == pytest.approx(39.5)
-
-
-def test_a_port_in_use_is_refused_and_free_again_after_close():
-    with connected() as (arm, printer):
-        second = driven(printer)
         fault_of(second.connect, "refused", "another program uses it")
+        assert to_rest(arm).pose[2] == pytest.approx(39.5)
         arm.close()
         arm.close()
         second.connect()
-        second.close()
-
-
-@contextmanager
-def link_to(port: str) -> Iterator[MarlinLink]:
-    with closing(MarlinLink(port, 115_200)) as link:
-        yield link
 
 
 def test_every_line_is_executed_once_and_in_its_turn_whatever_noise_there_is():
     ends = np.column_stack([50 + np.arange(1, 31) / 50, np.full((30, 2), 50.0)])
-    with EmulatedPrinter((50.0, 50.0, 50.0), seed=3) as printer, link_to(printer.port) as link:
+    with EmulatedPrinter((50.0, 50.0, 50.0), seed=3) as printer, closing(MarlinLink(printer.port, BAUD)) as link:
         link.begin(2.0)
         answer = link.ask("M114")
         assert [marlin.place(line) for line in answer] == [(50, 50, 50)]
@@ -219,27 +195,24 @@ def test_every_line_is_executed_once_and_in_its_turn_whatever_noise_there_is():
         assert np.array([made.move.end for made in printer.firmware.made[1:]]) == pytest.approx(ends)
 
 
-def test_what_is_silent_is_no_printer():
-    with EmulatedPrinter(AT) as printer, link_to(printer.port) as link:
+def test_what_is_silent_is_no_printer_and_a_board_that_restarts_as_its_port_is_opened_does_so_once():
+    with EmulatedPrinter(AT) as printer, closing(MarlinLink(printer.port, BAUD)) as link:
         printer.busy(60)
-        fault_of(lambda: link.begin(0.2), "refused", "no printer answers")
+        fault_of(lambda: link.begin(0.2), "refused", "no printer answers; check .* printer_baud")
         printer.busy(0)
         link.begin(2.0)
         printer.busy(60)
         fault_of(lambda: link.ask("M114", 0.3), "stale", r"not answered for 0\.3 s; it may be busy")
+    with EmulatedPrinter(AT, restarts=True) as printer:
+        with closing(MarlinLink(printer.port, BAUD)) as link:
+            fault_of(lambda: link.begin(2.0), "refused", "restarted")
+        with closing(MarlinLink(printer.port, BAUD)) as link:
+            link.begin(2.0)
 
 
 @pytest.mark.slow
 def test_what_never_falls_silent_is_no_printer():
     """As where the port is that of the board that reads the fibres."""
     board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4))
-    with board, link_to(board.port) as link:
+    with board, closing(MarlinLink(board.port, BAUD)) as link:
         assert fault_of(lambda: link.begin(0.5), "refused", "no printer answers") < 5
-
-
-def test_a_board_that_restarts_as_its_port_is_opened_does_so_once():
-    with EmulatedPrinter(AT, restarts=True) as printer:
-        with link_to(printer.port) as link:
-            fault_of(lambda: link.begin(2.0), "refused", "restarted")
-        with link_to(printer.port) as link:
-            link.begin(2.0)

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from itertools import chain, repeat
 from unittest import mock
 
 import numpy as np
@@ -18,10 +19,6 @@ VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.
 """Of a state: stamp, pose, speed, force, mode, runtime, safety and progress."""
 
 
-def portions(data: bytes, size: int) -> list[bytes]:
-    return [data[at : at + size] for at in range(0, len(data), size)]
-
-
 def spoiled(data: bytes, places: list[tuple[int, int]]) -> bytes:
     """`data` with some bytes replaced."""
     changed = bytearray(data)
@@ -35,21 +32,21 @@ DAMAGE = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_si
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20), DAMAGE)
 def test_frames_survive_any_cut_and_damage_is_the_same_in_any_portions(sent, size, damage) -> None:
-    def cut(parts: list[bytes]) -> list[tuple[int, bytes] | None]:
+    def cut(data: bytes, size: int) -> list[tuple[int, bytes] | None]:
         splitter, found = frames.Splitter(), []
         try:
-            for part in parts:
-                for frame in splitter.feed(part):
+            for at in range(0, len(data), size):
+                for frame in splitter.feed(data[at : at + size]):
                     found.append(frame)
         except ValueError:
             found.append(None)
         return found
 
     stream = b"".join(frames.frame(*frame) for frame in sent)
-    assert cut(portions(stream, size)) == sent
+    assert cut(stream, size) == sent
     if stream:
         damaged = spoiled(stream, damage)
-        assert cut(portions(damaged, size)) == cut([damaged])
+        assert cut(damaged, size) == cut(damaged, len(damaged))
     with pytest.raises(ValueError, match="2 bytes"):
         list(frames.Splitter().feed(b"\x00\x02U"))
 
@@ -61,22 +58,6 @@ def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
     times = [clock.host_time(0.008 * i, 100 + 0.008 * i + delay) for i, delay in enumerate(delays)]
     np.testing.assert_allclose(times, 100 + 0.008 * np.arange(len(delays)), atol=1e-3)
     assert (np.diff(times) > 0).all()
-
-
-class Link:
-    """A socket that hands out what a controller sends, frame by frame."""
-
-    def __init__(self, sent: list[bytes]) -> None:
-        self._sent = iter(sent)
-
-    def recv(self, most: int) -> bytes:
-        return next(self._sent, b"")
-
-    def settimeout(self, seconds: float) -> None: ...
-
-    def setsockopt(self, *option: int) -> None: ...
-
-    def sendall(self, data: bytes) -> None: ...
 
 
 def state(*values: float) -> bytes:
@@ -95,7 +76,9 @@ def stream(*states: bytes, major: int = 5, version: bytes = b"\x01", types: list
 
 
 def reader(sent: list[bytes]) -> RtdeReader:
-    with mock.patch("socket.create_connection", return_value=Link(sent)):
+    """One that connects to a controller which sends that, frame by frame, and then no more."""
+    link = mock.Mock(recv=mock.Mock(side_effect=chain(sent, repeat(b""))))
+    with mock.patch("socket.create_connection", return_value=link):
         return RtdeReader("arm", 1.0)
 
 

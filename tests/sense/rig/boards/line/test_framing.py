@@ -1,7 +1,6 @@
 """Lines of text, written and read back, in any portions and damaged in every way; and the samples they come to."""
 
 import pickle
-import sys
 from binascii import crc32
 
 import numpy as np
@@ -75,19 +74,6 @@ def test_any_bit_byte_or_newline_that_is_wrong_costs_its_lines_and_gives_no_othe
             assert found[0] == SAMPLES[0]
 
 
-@settings(max_examples=20)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_noise_gives_nothing_that_was_not_sent(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    samples = [Sample(k * 2000, tuple(rng.integers(4096, size=4).tolist())) for k in range(300)]
-    stream = bytearray(b"".join(sample_line(each.time_us, each.counts, True) for each in samples))
-    for at in np.flatnonzero(rng.random(len(stream)) < 3e-3)[::-1].tolist():
-        stream[at : at + 1] = rng.bytes(int(rng.integers(4)))
-    found, decoder = decoded(bytes(stream))
-    assert set(found) <= set(samples)
-    assert len(found) + decoder.damaged >= 250
-
-
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
@@ -111,16 +97,16 @@ def test_a_line_that_is_no_sample_is_counted_and_said(line: bytes, complaint: st
     assert (decoder.damaged, decoder.in_a_row) == (1, 0)
 
 
-def test_what_is_wrong_with_most_lines_is_said_and_lines_for_people_are_passed_over() -> None:
+def test_lines_for_people_wrong_ones_and_those_without_a_header_are_passed_over_and_noise_does_not_grow() -> None:
     short = sample_line(2000, (1, 2, 3), True)
     found, decoder = decoded(b"# warming up\n", LINES[0], b"#\n\n")
     assert (found, decoder.damaged) == ([SAMPLES[0]], 0)
     decoder.feed(short + short + b"1,2\n# hot\n")
     assert decoder.in_a_row == 3
     assert "4 numbers" in decoder.complaint
-
-
-def test_without_a_header_nothing_is_a_sample_and_noise_without_an_end_does_not_grow() -> None:
+    header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"  # whose check may be left out
+    found, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
+    assert (found, decoder.damaged) == ([Sample(10, (1, 2))], 1)
     decoder = Decoder()
     assert decoder.feed(b"boot: 1,2,3\n" + LINES[0]) == []
     for _ in range(1000):
@@ -128,22 +114,15 @@ def test_without_a_header_nothing_is_a_sample_and_noise_without_an_end_does_not_
     assert len(pickle.dumps(decoder)) < 10_000
 
 
-def test_a_board_may_leave_the_check_out_but_one_that_is_there_must_fit() -> None:
-    header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"
-    found, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
-    assert found == [Sample(10, (1, 2))]
-    assert decoder.header == Header(100, 10, 5, 2, checked=False)
-    assert decoder.damaged == 1
-
-
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
         ("2 rate_hz=100 bits=10 reference_v=5 channels=2", "version 2 of the line protocol, expected 1"),
         ("1 rate_hz=100 bits=10 reference_v=5", "channels of its header is 'missing', allowed is 1 to 512"),
-        ("1 rate_hz=fast bits=10 reference_v=5 channels=2", "rate_hz of its header is 'fast', allowed is 10 to 10000"),
-        ("1 rate_hz=9.9 bits=10 reference_v=5 channels=2", "rate_hz of its header is '9.9'"),
-        ("1 rate_hz=nan bits=10 reference_v=5 channels=2", "rate_hz of its header is 'nan'"),
+        *(
+            (f"1 rate_hz={said} bits=10 reference_v=5 channels=2", f"rate_hz of its header is '{said}', allowed is 10")
+            for said in ("fast", "9.9", "nan")
+        ),
         ("1 rate_hz=100 bits=10.5 reference_v=5 channels=2", "bits of its header is '10.5', allowed is 1 to 24"),
         ("1 rate_hz=100 bits=10 reference_v=0 channels=2", "reference_v of its header is '0'"),
         ("1 rate_hz=100 bits=10 reference_v=5 channels=513", "channels of its header is '513'"),
@@ -167,16 +146,6 @@ def read(times_us: list[int] | np.ndarray, assembler: Assembler | None = None) -
     return assembler.samples([(1.0, Lines([int(time_us) for time_us in times_us], counts))])
 
 
-def test_counts_become_volts_in_the_order_of_the_fibres_and_nothing_new_is_an_empty_reading() -> None:
-    assembler = Assembler(THREE, (2, 0))
-    empty = assembler.samples([])
-    assert (empty.times_s.shape, empty.volts.shape, empty.missing.shape) == ((0,), (0, 2), (0,))
-    assert empty.missing.dtype == np.int64
-    samples = read([1000, 2000], assembler)
-    assert samples.volts == pytest.approx(np.array([[5, 0], [5, 5 / 1023]]))
-    assert np.diff(samples.times_s) == pytest.approx([1e-3])
-
-
 WRAPPED = ((2**32 - 3000 + 1000 * np.array([0, 1, 4, 5, 25])) % 2**32).tolist()
 
 
@@ -194,20 +163,16 @@ def test_every_sample_has_its_slot_and_the_slots_left_out_are_missing(times_us, 
     samples = read(times_us)
     assert np.rint(samples.volts[:, 0] * 1023 / 5).astype(int).tolist() == taken
     assert samples.missing.tolist() == missing
-    if times_us is WRAPPED:
-        assert np.diff(samples.times_s) == pytest.approx([1e-3, 3e-3, 1e-3, 20e-3])
+    assert np.diff(samples.times_s) == pytest.approx(1e-3 * (1 + samples.missing[1:]), rel=1e-3)
 
 
 @pytest.mark.parametrize("share", [0.98, 0.999, 1.001, 1.02])
-def test_a_rate_that_is_not_quite_what_it_says_loses_nothing(share: float) -> None:
-    rng = np.random.default_rng(0)
-    samples = read(np.cumsum(np.full(2000, 1000 / share)) + rng.uniform(-150, 150, 2000))
+def test_a_rate_that_is_not_quite_what_it_says_and_lines_that_are_late_lose_nothing(share: float) -> None:
+    rng, assembler = np.random.default_rng(0), Assembler(THREE, (0, 1, 2))
+    samples = read(np.cumsum(np.full(2000, 1000 / share)) + rng.uniform(-150, 150, 2000), assembler)
     assert len(samples.times_s) == 2000
     assert not samples.missing.any()
-
-
-def test_lines_that_are_late_by_less_than_half_a_period_are_where_they_belong() -> None:
-    rng = np.random.default_rng(1)
+    assert len(pickle.dumps(assembler)) < 10_000
     kept = np.sort(rng.choice(4000, 3000, replace=False))
     samples = read(1000 * kept + rng.uniform(0, 450, 3000))
     assert np.array_equal(np.cumsum(1 + samples.missing) - 1, kept - kept[0])
@@ -230,12 +195,3 @@ def test_times_that_cannot_be_line_after_line_are_a_fault(before_us: int, after:
     with pytest.raises(RigFault, match=said) as caught:
         read(after, assembler)
     assert caught.value.cause == "data"
-
-
-def test_an_hour_takes_no_more_memory_than_a_second() -> None:
-    assembler, held = Assembler(THREE, (0, 1, 2)), []
-    for second in range(300):
-        read(1000 * (1 + np.arange(100)) + 100_000 * second, assembler)
-        held.append(sys.getallocatedblocks())
-    assert assembler.taken == 30_000
-    assert max(held[-50:]) < max(held[100:150]) + 1000

@@ -1,10 +1,11 @@
-"""The emulated arm: the record of what it really did, its dashboard, and what it leaves behind."""
+"""The emulated arm: the record of what it really did, its dashboard and program, and what it leaves behind."""
 
 import re
 import subprocess
 import sys
 import tempfile
 import time
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 
 from sense.rig.arms.ur5 import rtde_frames as ur_frames
 from sense.rig.devices.protocols import RigFault
+from sense.rig.emulators.ur import controller as ur_controller
 from sense.rig.emulators.ur import truth as ur_truth
+from sense.rig.emulators.ur.controller import Controller
 from sense.rig.emulators.ur.emulator import UrEmulator
 
 
@@ -44,6 +47,41 @@ def test_one_at_a_time_and_the_ports_are_free_again(address: str) -> None:
         assert robot.asked() == asked
 
 
+START, CYCLE_S = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0]), 0.008
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["paused", "stopped"])
+def test_a_program_that_a_protective_stop_has_paused_goes_on_when_a_person_plays_and_a_stopped_one_does_not(
+    stopped: bool,
+) -> None:
+    """Without sockets, and ur-rtde's orders written as it writes them."""
+    controller, clock = Controller("cb3", START), count(1)
+
+    def cycle(seconds: float) -> None:
+        for _ in range(round(seconds / CYCLE_S)):
+            controller.tick(next(clock) * CYCLE_S)
+
+    controller.upload()
+    cycle(1.0)
+    pose = (*START[:2], 0.0, *START[3:], 0.1, 1.0)
+    orders = {"input_int_register_1": 1, "input_int_register_0": ur_controller.MOVE}
+    controller.write({f"input_double_register_{i}": float(value) for i, value in enumerate(pose)} | orders, 1.0)
+    cycle(0.5)
+    assert controller.motion.pose[2] < START[2]
+    controller.protective_stop()
+    controller.play()
+    cycle(0.5)
+    assert controller.motion.pose[2] > 0.14
+    if stopped:
+        assert controller.dashboard("stop") == "Stopped"
+    controller.clear()
+    controller.play()
+    cycle(3.0)
+    height = controller.motion.pose[2]
+    assert height > 0.14 if stopped else height == pytest.approx(0.0)
+    assert (controller.state()["runtime_state"] == ur_frames.PLAYING) is not stopped
+
+
 LEFT = """
 import os, sys
 from sense.rig.emulators.ur.emulator import UrEmulator
@@ -59,12 +97,8 @@ def test_what_a_killed_program_has_left_among_temporary_files_goes_with_the_next
     """And nothing else goes, nor the file of one that is at work."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    near = {
-        "padforge-ur-mine",
-        "padforge-ur-0123456789abcde",
-        "padforge-ur-127.0.0.1.lock",
-        "padforge-arm-127.0.0.1.lock",
-    }
+    others = ("ur-mine", "ur-0123456789abcde", "ur-127.0.0.1.lock", "arm-127.0.0.1.lock")
+    near = {f"padforge-{name}" for name in others}
     for name in near:
         (tmp_path / name).touch()
     assert subprocess.run([sys.executable, "-c", LEFT, address], check=False).returncode == 9
