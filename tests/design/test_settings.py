@@ -5,35 +5,17 @@ import tomllib
 import numpy as np
 import pytest
 
-from design import (
-    Contact,
-    InputError,
-    Morphology,
-    Spec,
-    localisation_error,
-    published_objective,
-    score,
-    signals,
-    signals_quantized,
-    signals_sparse,
-)
+import design
+from design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
 from design.common.settings import commented_toml
 from design.criteria.information import information
-from design.settings import (
-    MEASURED_REACH,
-    PUBLISHED_CONTACT,
-    Layout,
-    PadSettings,
-    RulesSettings,
-    SearchSettings,
-    sensed_rectangle,
-)
+from design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Layout, sensed_rectangle
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 
 
-def test_the_written_defaults_read_back_as_the_defaults():
+def test_the_written_defaults_read_back_as_the_defaults_and_overrides_win():
     text = commented_toml(MODELS)
     spec = Spec(tomllib.loads(text))
     for model in MODELS.values():
@@ -42,6 +24,9 @@ def test_the_written_defaults_read_back_as_the_defaults():
         assert f"[{name}]" in text
         for key, field in model.model_fields.items():
             assert any(line.startswith(f"{key} = ") and str(field.description) in line for line in text.splitlines())
+    spec = Spec({"search": {"knots": 7, "seed": 3}})
+    found = spec.section(SearchSettings, knots=2, seed=None)
+    assert (found.knots, found.seed) == (2, 3)
 
 
 SELF = []
@@ -49,18 +34,17 @@ SELF.append(SELF)
 REFUSED = [
     (PadSettings, {"grid": 0}, r"grid: got 0, .*greater than or equal to 1"),
     (PadSettings, {"grid": "4"}, r"grid: got '4', .*integer"),
+    *((PadSettings, {"grid": grid}, "grid: got ") for grid in (np.float64(4), np.int64(0), np.array([4]))),
+    *((PadSettings, {"grid": grid}, "grid: got ") for grid in (np.bool_(True), np.datetime64("2026-01-01"))),
     (PadSettings, {"gird": 4}, r"gird: no such key, allowed are grid"),
     (PadSettings, {"fibre_diameter_mm": 0.3}, r"fibre_diameter_mm: no such key, it is \[fibre\] diameter_mm now"),
     (PadSettings, {"horizontals": 0, "verticals": 0}, "horizontals and verticals are both 0, allowed is one fibre or"),
-    (PadSettings, {"horizontals": -1}, "horizontals: got -1"),
     (PadSettings, {"verticals": 257}, "verticals: got 257"),
     (PadSettings, {"pitch_mm": float("nan")}, "pitch_mm: got nan, .*finite"),
     (PadSettings, {"pitch_mm": 0}, "pitch_mm.*: got 0"),
     (PadSettings, {"pitch_mm": [8, 0]}, r"pitch_mm: got .8, 0., .*allowed is 0.1 to 1000, or .along x, along y."),
-    (PadSettings, {"pitch_mm": [8, 9, 10]}, "pitch_mm"),
     (PadSettings, {"horizontals": 2, "pitch_mm": [8, 15], "sensed_mm": [40, 46]}, "the pad itself is 45 mm high"),
     (PadSettings, {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]}, r"sensed_mm: got \[31, 5\], .*is 30 mm wide and"),
-    (PadSettings, {"keep_out_mm": [[0, 0], [1, 1]]}, "keep_out_mm"),
     (PadSettings, {"keep_out_mm": [[[0, 0], [1, 1]]]}, "keep_out_mm: .*polygon 1 has 2 corners"),
     (PadSettings, {"keep_out_mm": "hole"}, "keep_out_mm"),
     (PadSettings, {"keep_out_mm": SELF}, "keep_out_mm"),
@@ -72,25 +56,16 @@ REFUSED = [
     (Contact, {"reach": [[0, 1], [1, 0.5], [2, 0.1]]}, "reach: .*last weight must be 0"),
     # a profile whose spline leaves its points
     (Contact, {"reach": [[0, 1], [0.5, 0.8], [0.51, 0.6], [1.2, 0]]}, "between the points at 0 and 0.5 mm .* 0.65 to"),
-    (
-        Contact,
-        {"reach": [[0, 10], [9, 10], [10, 0]]},
-        "between the points at 0 and 9 mm .* comes to 20.5, allowed is 8",
-    ),
-    (
-        Contact,
-        {"reach": [[0, -1], [0.2, 1], [1, 0]]},
-        "between the points at 0.2 and 1 mm .* comes to 7.48, allowed is",
-    ),
+    (Contact, {"reach": [[0, 10], [9, 10], [10, 0]]}, "between the points at 0 and 9 mm .* 20.5, allowed is 8"),
+    (Contact, {"reach": [[0, -1], [0.2, 1], [1, 0]]}, "between the points at 0.2 and 1 mm .* 7.48, allowed is"),
     (SearchSettings, {"method": "luck"}, "method: got 'luck', .*descent"),
 ]
 
 
 @pytest.mark.parametrize(("model", "table", "message"), REFUSED, ids=lambda value: str(value)[:30])
 def test_refusals_name_the_key_the_value_and_what_is_allowed(model, table, message):
-    with pytest.raises(InputError, match=rf"^pad\.toml: \[{model.section()}\] .*{message}") as refusal:
+    with pytest.raises(InputError, match=rf"^pad\.toml: \[{model.section()}\] .*{message}"):
         Spec({model.section(): table}, "pad.toml", sections=MODELS).section(model)
-    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("other", [None, 3, "a", int, np.ones((2, 2)), [1], {1: 2}])
@@ -125,39 +100,17 @@ def test_files_that_are_no_toml_are_refused(tmp_path, content, message):
         Spec.load(path)
 
 
-def test_overrides_win_over_the_file():
-    spec = Spec({"search": {"knots": 7, "seed": 3}})
-    found = spec.section(SearchSettings, knots=2, seed=None)
-    assert (found.knots, found.seed) == (2, 3)
-
-
 def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
-    assert PadSettings().model_dump() == {
-        "grid": 4,
-        "horizontals": "grid",
-        "verticals": "grid",
-        "pitch_mm": 11.25,
-        "deep_family": "horizontal",
-        "leads": "edges",
-        "sensed_mm": "beyond",
-        "keep_out_mm": (),
-        "bent_radius_mm": "flat",
-    }
+    pad, rules = PadSettings(), RulesSettings()
+    assert (pad.grid, pad.horizontals, pad.verticals, pad.pitch_mm) == (4, None, None, 11.25)
+    assert (pad.deep_family, pad.leads, pad.sensed_mm) == ("horizontal", "edges", "beyond")
+    assert (pad.keep_out_mm, pad.bent_radius_mm) == ((), None)
     published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "reach": ()}
     assert PUBLISHED_CONTACT.model_dump() == published
     assert Contact().model_dump() == published | {"length": "euclidean", "reach": MEASURED_REACH}
-    assert RulesSettings().model_dump() == {
-        "enforce": True,
-        "min_bend_radius_mm": 1.0,
-        "min_gap_mm": 0.8,
-        "same_family_crossings": 0,
-        "max_crossings": "any",
-        "min_crossing_angle_deg": 0.0,
-        "max_common_track_mm": 2.0,
-        "border_mm": 2.0,
-        "keep_out_mm": 1.5,
-        "max_length_mm": 500.0,
-    }
+    assert (rules.enforce, rules.min_bend_radius_mm, rules.min_gap_mm, rules.border_mm) == (True, 1.0, 0.8, 2.0)
+    assert (rules.same_family_crossings, rules.max_crossings, rules.min_crossing_angle_deg) == (0, None, 0.0)
+    assert (rules.max_common_track_mm, rules.keep_out_mm, rules.max_length_mm) == (2.0, 1.5, 500.0)
     search = SearchSettings().model_dump()
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
@@ -188,16 +141,7 @@ def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):
     require_ends(model, key, kept, refused)
 
 
-def test_what_is_pressed_lies_about_the_middle_of_the_pad():
-    assert sensed_rectangle(Layout.of(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
-    assert sensed_rectangle(Layout.of(4), "fibres") == ((1, 1), (4, 4))
-    assert sensed_rectangle(Layout.of(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
-    assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
-    again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
-    np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
-
-
-def test_a_rectangle_is_stated_and_written_and_is_what_was_stated():
+def test_a_rectangle_is_what_was_stated_and_its_middle_is_pressed():
     pad = {"horizontals": 3, "verticals": 6, "pitch_mm": [8, 15], "bent_radius_mm": 40}
     hole = {"keep_out_mm": [[[0, 0], [4, 0], [0, 4]]]}
     stated = Spec({"pad": pad | hole}).section(PadSettings)
@@ -207,9 +151,15 @@ def test_a_rectangle_is_stated_and_written_and_is_what_was_stated():
     assert PadSettings.model_validate_json(stated.model_dump_json()) == stated
     assert stated.of(Layout.of(4)).layout == Layout.of(4)
     assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
+    assert sensed_rectangle(Layout.of(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
+    assert sensed_rectangle(Layout.of(4), "fibres") == ((1, 1), (4, 4))
+    assert sensed_rectangle(Layout.of(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
+    assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
+    again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
+    np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
 
 
-def test_a_contact_given_by_its_shape_is_of_the_published_kind():
+def test_a_contact_given_by_its_shape_is_of_the_published_kind_and_has_no_reach_beside_it():
     """As it was before contacts were measured, and where it is written out, whatever it is, it reads back so."""
     ways = (
         ({}, MEASURED_REACH, "euclidean"),
@@ -230,9 +180,6 @@ def test_a_contact_given_by_its_shape_is_of_the_published_kind():
         assert (
             Spec(tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))).section(Contact) == contact
         )
-
-
-def test_a_shape_beside_a_reach_is_refused_since_it_would_change_nothing():
     stated = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
     for shape in ({"radius": 0.9}, {"sides": "circle"}, {"weight": "inverse"}):
         with pytest.raises(InputError, match=r"\[contact\] reach: .*which counts where reach is \[\]"):
@@ -240,15 +187,12 @@ def test_a_shape_beside_a_reach_is_refused_since_it_would_change_nothing():
         assert Spec({"contact": stated | shape | {"reach": []}}).section(Contact).reach == ()
 
 
-def test_the_measured_profile_is_about_a_gaussian_in_mm_and_in_grid_units_of_the_built_pad_in_fifths():
+def test_the_measured_profile_is_about_a_gaussian_and_one_with_a_skirt_below_0_is_a_contact():
     distance = [d for d, _ in Contact().profile_points(11.25)]
     assert distance == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.65]  # to the bit
     assert [d for d, _ in Contact().profile_points(5.0)] == [d / 5 for d, _ in MEASURED_REACH]
     for d, weight in MEASURED_REACH:
         assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
-
-
-def test_a_smooth_profile_with_a_skirt_below_0_is_a_contact():
     for points in (5, 13, 40):
         for skirt in (0.0, 0.3):
             distance = np.linspace(0, 18, points)
@@ -278,12 +222,6 @@ def test_numbers_of_numpy_are_numbers(model, given, plain):
     assert model(**given).model_dump_json() == model(**plain).model_dump_json()
 
 
-def test_values_of_numpy_that_are_no_such_number_are_refused_as_pythons_are():
-    for grid in (np.float64(4), np.int64(0), np.array([4]), np.bool_(True), np.datetime64("2026-01-01")):
-        with pytest.raises(InputError, match=r"^\[pad\] grid: got "):
-            PadSettings(grid=grid)  # pyright: ignore[reportArgumentType]
-
-
 @pytest.mark.parametrize("shape", [(2**9, 2**9), (2**40, 2), (2**18, 0)])
 @pytest.mark.parametrize(
     ("model", "key"), [(PadSettings, "pitch_mm"), (PadSettings, "keep_out_mm"), (Contact, "reach"), (Contact, "radius")]
@@ -299,14 +237,16 @@ def test_arrays_larger_than_any_setting_are_refused_before_they_are_lists(model,
 def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_paper_is_restated():
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
-    np.testing.assert_array_equal(signals_sparse(pad, presses).toarray(), signals(pad, presses))
-    np.testing.assert_array_equal(signals_quantized(pad, presses), signals_quantized(pad, presses, PUBLISHED_CONTACT))
-    assert published_objective(pad) == published_objective(pad, PUBLISHED_CONTACT)
+    np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
+    np.testing.assert_array_equal(
+        design.signals_quantized(pad, presses), design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
+    )
+    assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
     quick = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
-    assert localisation_error(pad, **quick) == localisation_error(pad, PUBLISHED_CONTACT, **quick)
+    assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
     assert SearchSettings().usual_contact == Contact()
     assert SearchSettings(method="genetic").usual_contact == PUBLISHED_CONTACT
-    terms, published = score(pad, lost=0), score(pad, PUBLISHED_CONTACT, lost=0)
+    terms, published = design.score(pad, lost=0), design.score(pad, PUBLISHED_CONTACT, lost=0)
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:
         assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name

@@ -47,7 +47,7 @@ def test_a_later_round_times_what_it_is_asked_to_an_item_and_judges_once(monkeyp
     assert so_far.times[trial.key] == pytest.approx([0.005] * 2)
 
 
-def test_files_hold_what_was_measured(tmp_path):
+def test_files_hold_what_was_measured_which_nothing_is_where_none_can_be_written(tmp_path):
     heard = []
     summary, changes = run_benches([bench()], tmp_path, heard.append, {})
     assert heard
@@ -68,6 +68,9 @@ def test_files_hold_what_was_measured(tmp_path):
     assert [(row["case"], row["reference_error"], row["error"]) for row in summary["summary"]] == [
         *(("a", 0.5, 0.1), ("b", 0.5, 0.1))
     ]
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file/out: cannot be written"):
+        run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
 
 
 @pytest.mark.parametrize(
@@ -93,12 +96,6 @@ def test_files_hold_what_was_measured(tmp_path):
 )
 def test_what_has_become_worse_is_found(before, now, what):
     assert [change.what for change in worsenings(document(**before), document(**now))] == what
-
-
-def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="file/out: cannot be written"):
-        run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
 
 
 def test_work_that_has_become_slower_and_worse_is_found(tmp_path, monkeypatch):

@@ -55,16 +55,9 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     assert search_lines(result, Path("out/pad"))[1:] == told[1:]
     first, second = (11.25 * value for value in straight[:2])
     assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 fibres failed")
-    assert told[3:] == [
-        "  these are straight fibres: nothing better was found; more steps or time may find it",
-        "  all rules hold",
-    ]
-    terms = {name: value / 2 if name.startswith("expected_error") else value for name, value in result.terms.items()}
-    better = search_lines(replace(result, terms=terms, found_by="start 1"), Path("out/pad"))
-    assert better[1].startswith(f"  expected error {first / 2:.2f} / {second / 2:.2f} mm with 0 / 1 fibres failed")
-    assert better[2].split() == f"{first:.2f} / {second:.2f} mm with straight fibres".split()
+    assert (told[3].startswith("  these are straight fibres"), told[4:]) == (True, ["  all rules hold"])
     alike = search_lines(replace(result, found_by="start 1"), Path("out/pad"))
-    assert alike[3] == "  no better than straight fibres, as far as such figures tell, with 0, 1 failed"
+    assert alike[3].startswith("  no better than straight fibres")
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
         Path("out/pad/design.json").write_text(json.dumps(document | change))
@@ -184,9 +177,6 @@ def test_a_plan_shows_keep_outs_as_stated_and_to_where_half_of_the_contact_is_fe
     assert drawn == [np.array(hole).tolist() for hole in holes]
     (press,) = (patch for patch in patches if isinstance(patch, Circle))
     assert press.radius == pytest.approx(np.sqrt(2 * np.log(2)) * 6.2, rel=0.01)
-
-
-@pytest.mark.parametrize("holes", [4, None, "ab", [3], [[1.0, 2.0]], [[]], [[(0, 0), (1, np.nan)]], np.ones((1, 3, 2))])
-def test_a_plan_of_keep_outs_that_are_no_polygons_is_refused_in_one_line(holes):
-    with pytest.raises(InputError, match="keep_out_mm"):
-        draw_plan(Morphology.straight(2), Contact(), (), holes)
+    for none in (4, None, "ab", [3], [[1.0, 2.0]], [[]], [[(0, 0), (1, np.nan)]], np.ones((1, 3, 2))):
+        with pytest.raises(InputError, match="keep_out_mm"):
+            draw_plan(Morphology.straight(2), Contact(), (), none)  # pyright: ignore[reportArgumentType]

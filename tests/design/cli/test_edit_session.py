@@ -47,18 +47,7 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
 
 
-def test_a_knot_goes_where_it_is_taken_within_its_neighbours_and_the_pad(tmp_path):
-    begun, _ = session(tmp_path, grid=2, pitch_mm=10.0)
-    knots = np.array(move(begun, 1, 3, 0.7, 4.0)["fibres"][0]["knots"])
-    assert knots[3] == pytest.approx([0.7, 4.0])
-    knots = np.array(move(begun, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
-    assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
-    assert knots[3, 1] == -15
-    knots = np.array(move(begun, 3, 1, 900.0, -900.0)["fibres"][2]["knots"])
-    assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
-
-
-def test_drags_are_undone_at_once_and_done_again(tmp_path):
+def test_a_knot_goes_where_it_is_dragged_and_drags_are_undone_and_done_again(tmp_path):
     begun, shown = session(tmp_path, grid=2)
     first = shown[-1]["fibres"]
     for y_mm in (1.0, 2.0, 3.0):
@@ -72,6 +61,14 @@ def test_drags_are_undone_at_once_and_done_again(tmp_path):
     ask(begun, do="redo")
     assert ask(begun, do="redo")["fibres"] == after["fibres"]
     assert [view["number"] for view in shown[1:]] == list(range(1, len(shown)))
+    begun, _ = session(tmp_path, grid=2, pitch_mm=10.0)
+    knots = np.array(move(begun, 1, 3, 0.7, 4.0)["fibres"][0]["knots"])
+    assert knots[3] == pytest.approx([0.7, 4.0])
+    knots = np.array(move(begun, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
+    assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
+    assert knots[3, 1] == -15
+    knots = np.array(move(begun, 3, 1, 900.0, -900.0)["fibres"][2]["knots"])
+    assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
 
 
 def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
@@ -120,18 +117,14 @@ HOSTILE = (
 )
 
 
-def test_what_cannot_be_done_changes_nothing(tmp_path):
+def test_what_cannot_be_done_is_told_and_changes_nothing(tmp_path):
     begun, shown = session(tmp_path, grid=2)
     for body in HOSTILE:
         with pytest.raises(InputError) as refused:
             begun.edit(body)
-        assert len(str(refused.value).splitlines()) == 1, body
-        assert len(str(refused.value)) < 300
+        assert len(str(refused.value)) < 300, body
     assert len(shown) == 2
     assert ask(begun, do="undo")["fibres"] == shown[1]["fibres"]
-
-
-def test_a_fibre_has_no_more_knots_than_it_may_and_none_where_there_is_no_room(tmp_path):
     begun, _ = session(tmp_path, Morphology.straight(1))
     assert ask(begun, do="add", fibre=1)["at"] == (0, 1)
     ask(begun, do="remove", fibre=1, knot=1)
@@ -141,9 +134,6 @@ def test_a_fibre_has_no_more_knots_than_it_may_and_none_where_there_is_no_room(t
     full, _ = session(tmp_path, most)
     with pytest.raises(InputError, match="64 knots"):
         ask(full, do="add", fibre=1)
-
-
-def test_a_disk_that_refuses_is_told_and_nothing_is_lost(tmp_path):
     begun, _ = session(tmp_path, grid=1)
     move(begun, 1, 1, 0.0, 3.0)
     (tmp_path / "out.json").mkdir()

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -81,9 +81,7 @@ def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
         yield program
 
 
-def test_it_refuses_what_is_hostile_saves_beside_the_pad_and_tells_what_is_not_kept(
-    program: Program, tmp_path: Path, pad: Path
-) -> None:
+def test_it_refuses_what_is_hostile_and_saves_beside_the_pad(program: Program, tmp_path: Path, pad: Path) -> None:
     before = pad.read_bytes()
     assert "saves to pad-edited.json" in program.said
     first = program.ask(do="undo")
@@ -133,12 +131,9 @@ def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None
         (["pad.json", "--out", "pad.json/x.json"], r"pad.json: cannot be written"),
     ],
 )
-def test_mistakes_are_told_before_a_page_is_there(
-    tmp_path: Path, pad: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], told: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    ended = CliRunner().invoke(edit, arguments)
-    assert re.search(told, str(ended.exception))
+def test_mistakes_are_told_before_a_page_is_there(tmp_path: Path, pad: Path, arguments: list[str], told: str) -> None:
+    with chdir(tmp_path):
+        assert re.search(told, str(CliRunner().invoke(edit, arguments).exception))
 
 
 @pytest.mark.slow

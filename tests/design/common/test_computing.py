@@ -57,16 +57,13 @@ def test_results_and_errors_of_tasks_come_out_with_their_keys(threads):
         list(run_tasks([("a", partial(pow, 0, -1)), ("b", partial(pow, 1, 2))], pool))
 
 
-def test_a_task_is_followed_by_the_next_of_its_key():
+def test_a_task_is_followed_by_the_next_of_its_key_and_results_come_as_they_are_done():
     def next_one(key, result):
         return partial(str.__add__, result, key) if len(result) < 3 else None
 
     found = list(run_tasks([("a", lambda: "a"), ("b", lambda: "b")], then=next_one))
     for key in ("a", "b"):
         assert [result for own, result in found if own == key] == [key, 2 * key, 3 * key]
-
-
-def test_results_come_as_they_are_done_and_so_many_at_once():
     first, inside, most = threading.Event(), 0, 0
 
     def counted(work):

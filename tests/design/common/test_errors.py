@@ -12,7 +12,8 @@ from design.common.errors import InputError, what_to_install
 LONGEST = "a" * errors.LONGEST_PATH
 
 
-def test_numbers_and_paths_within_their_bounds_are_taken():
+def test_numbers_and_paths_within_their_bounds_are_taken_and_a_refusal_is_one_line():
+    assert str(InputError("pad\n.toml:\u2028none")) == "pad .toml: none"
     assert [errors.whole("n", np.int8(n), 2, 5) for n in (2, 5)] == [2, 5]
     for value in (0.0, 2.5, 1, np.float32(0.5)):
         number = errors.real("x", value, 0.0, 2.5)
@@ -49,12 +50,8 @@ def test_what_is_just_beyond_them_or_of_another_kind_is_refused(check, values, m
         ("distributed", "design", "distributed, which is not installed: pip install 'padforge[cluster]'"),
         ("serial", "train", "pyserial, which is not installed: pip install 'padforge[rig]'"),
         ("PIL", "design,cad,train", "pillow, which is not installed: pip install 'padforge[design,cad,train]'"),
+        *((name, "", None) for name in ("nothing_of_the_kind", "numpy", None)),
     ],
 )
 def test_what_is_missing_is_told_with_what_brings_it(module, wanted, said):
-    assert what_to_install(ModuleNotFoundError(name=module), wanted) == f"this needs {said}"
-
-
-def test_what_no_extra_brings_is_no_matter_of_installing():
-    for name in ("nothing_of_the_kind", "numpy", None):
-        assert what_to_install(ModuleNotFoundError(name=name)) is None
+    assert what_to_install(ModuleNotFoundError(name=module), wanted) == (said and f"this needs {said}")

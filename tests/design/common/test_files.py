@@ -11,21 +11,9 @@ from typing import Any
 
 import pytest
 
+from design.common import files
 from design.common.errors import InputError
-from design.common.files import (
-    atomic,
-    check_replaceable,
-    claimed,
-    find_dependents,
-    locks,
-    read_bytes,
-    read_json,
-    refuse_unwritable,
-    sha256,
-    staged,
-    unchanged,
-    write_json,
-)
+from design.common.files import locks
 from design.common.files.folders import EXCHANGE
 
 CLAIM = "import sys\nfrom pathlib import Path\nfrom design.common.files import claimed\n"
@@ -34,42 +22,19 @@ ANOTHER = CLAIM + "try:\n  with claimed(Path(sys.argv[1])): print('in')\nexcept 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
     path = tmp_path / "result.json"
-    write_json(path, {"format": "x/1"})
+    files.write_json(path, {"format": "x/1"})
 
     def fail_halfway():
-        with atomic(path) as temporary:
+        with files.atomic(path) as temporary:
             temporary.write_text("half a fi")
             raise RuntimeError("halfway")
 
     with pytest.raises(RuntimeError, match="halfway"):
         fail_halfway()
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(path, {"value": float("nan")})
-    assert read_json(path, "x/1") == {"format": "x/1"}
+        files.write_json(path, {"value": float("nan")})
+    assert files.read_json(path, "x/1") == {"format": "x/1"}
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_new_files_have_ordinary_permissions(tmp_path):
-    mask = os.umask(0o022)
-    try:
-        write_json(tmp_path / "a.json", {})
-    finally:
-        os.umask(mask)
-    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
-
-
-def test_a_folder_has_a_digest_that_follows_its_content(tmp_path):
-    (tmp_path / "a").write_text("1")
-    before = sha256(tmp_path)
-    (tmp_path / "a").write_text("2")
-    assert sha256(tmp_path) != before
-    (tmp_path / "a").write_text("1")
-    assert sha256(tmp_path) == before
-    (tmp_path / "a").rename(tmp_path / "b")
-    assert sha256(tmp_path) != before
-    if sys.platform == "linux":
-        (tmp_path / os.fsdecode(b"\xff")).touch()
-        assert len(sha256(tmp_path)) == 64
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
@@ -77,11 +42,11 @@ def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
     with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
-        read_json(pipe, "x/1")
+        files.read_json(pipe, "x/1")
     with pytest.raises(InputError, match=r"pipe\.json: cannot be written"):
-        write_json(pipe, {})
+        files.write_json(pipe, {})
     with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
-        sha256(pipe)
+        files.sha256(pipe)
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
 
@@ -89,54 +54,57 @@ def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
 def test_what_cannot_be_read_or_written_is_named(tmp_path):
     path = tmp_path / "file"
     path.write_text("123456")
-    assert read_bytes(path, 6) == b"123456"
+    assert files.read_bytes(path, 6) == b"123456"
     with pytest.raises(InputError, match=r"it has 6 bytes, allowed are 5"):
-        read_bytes(path, 5)
+        files.read_bytes(path, 5)
     with pytest.raises(InputError, match=r"file/new\.json: cannot be written"):
-        write_json(path / "new.json", {})
-    for taken in (refuse_unwritable, lambda path: claimed(path).__enter__()):
+        files.write_json(path / "new.json", {})
+    for taken in (files.refuse_unwritable, lambda path: files.claimed(path).__enter__()):
         with pytest.raises(InputError, match="is a file, expected a folder"):
             taken(path / "deeper")
 
 
-def test_a_file_within_another_one_is_put_in_place_once(tmp_path):
-    with atomic(tmp_path / "a.txt") as outer, atomic(outer) as inner:
+def test_a_file_within_another_one_is_put_in_place_once_with_ordinary_permissions(tmp_path):
+    with files.atomic(tmp_path / "a.txt") as outer, files.atomic(outer) as inner:
         inner.write_text("whole")
         assert list(tmp_path.iterdir()) == [outer]
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    mask = os.umask(0o022)
+    try:
+        files.write_json(tmp_path / "a.json", {})
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
 
 
 def another(folder):
     return subprocess.run([sys.executable, "-c", ANOTHER, folder], capture_output=True, text=True, check=True).stdout
 
 
-def test_one_run_at_a_time_writes_to_a_folder_and_a_claim_ends_with_its_process(tmp_path):
-    folder = tmp_path / "out" / "pad"
-    with claimed(folder):
-        assert "another run is writing there" in another(folder)
-        with pytest.raises(InputError, match="another run is writing there"), claimed(folder):
-            pass
-    code = CLAIM + "import os\nwith claimed(Path(sys.argv[1])): os._exit(9)"
-    assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
-    with claimed(folder), claimed(tmp_path / "out" / "other"):
-        pass
-
-
-def test_a_folder_made_for_nothing_goes_again(tmp_path):
-    with pytest.raises(KeyError), claimed(tmp_path / "a" / "b"):
+def test_one_run_at_a_time_writes_to_a_folder_which_goes_again_if_made_for_nothing(tmp_path):
+    with pytest.raises(KeyError), files.claimed(tmp_path / "a" / "b"):
         raise KeyError
     assert list(tmp_path.iterdir()) == []
-    with claimed(tmp_path / "a" / "b"):
+    with files.claimed(tmp_path / "a" / "b"):
         (tmp_path / "a" / "b" / "result").touch()
     assert (tmp_path / "a" / "b" / "result").exists()
     (tmp_path / "kept").mkdir()
-    with claimed(tmp_path / "kept"):
+    with files.claimed(tmp_path / "kept"):
         pass
     assert (tmp_path / "kept").exists()
+    folder = tmp_path / "out" / "pad"
+    with files.claimed(folder):
+        assert "another run is writing there" in another(folder)
+        with pytest.raises(InputError, match="another run is writing there"), files.claimed(folder):
+            pass
+    code = CLAIM + "import os\nwith claimed(Path(sys.argv[1])): os._exit(9)"
+    assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
+    with files.claimed(folder), files.claimed(tmp_path / "out" / "other"):
+        pass
 
 
 def replaced(folder, *names, without=(), text="new"):
-    with staged(folder, without) as stage:
+    with files.staged(folder, without) as stage:
         for name in names:
             (stage / name).write_text(text)
             if name == "fails":
@@ -210,14 +178,25 @@ def test_what_another_run_does_meanwhile_is_no_fault_and_is_put_back(tmp_path, m
     assert contents(tmp_path) == {"b": "another's", "e": "another's"}
 
 
-def test_files_are_known_by_their_digests_in_one_folder_only(tmp_path):
+def test_files_are_known_by_their_digests_in_one_folder_only_and_a_folder_by_its_content(tmp_path):
     for path in (tmp_path / "a", tmp_path / "b", tmp_path / "in" / "c"):
-        write_json(path, {})
-    digest = sha256(tmp_path / "a")
+        files.write_json(path, {})
+    digest = files.sha256(tmp_path / "a")
     (tmp_path / "b").write_text("changed")
     names = ["a", "b", "c", "../a", "/", "", "..", "in", "in/c", str(tmp_path / "a"), "a\0", "a" * 1000, "\ud800"]
-    assert unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
-    assert unchanged(tmp_path, {"a": None, "c": [1]}) == set()
+    assert files.unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
+    assert files.unchanged(tmp_path, {"a": None, "c": [1]}) == set()
+    (tmp_path / "a").write_text("1")
+    before = files.sha256(tmp_path)
+    (tmp_path / "a").write_text("2")
+    assert files.sha256(tmp_path) != before
+    (tmp_path / "a").write_text("1")
+    assert files.sha256(tmp_path) == before
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert files.sha256(tmp_path) != before
+    if sys.platform == "linux":
+        (tmp_path / os.fsdecode(b"\xff")).touch()
+        assert len(files.sha256(tmp_path)) == 64
 
 
 @pytest.fixture
@@ -243,14 +222,14 @@ def windows(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="it is no stand-in there")
-def test_without_flock_two_runs_do_not_write_into_one_folder(windows, tmp_path):
-    with claimed(tmp_path), pytest.raises(InputError, match="another run is writing there"), claimed(tmp_path):
-        pass
-    with claimed(tmp_path):
-        pass
-
-
-def test_without_flock_a_locked_file_is_read_on_from_where_it_was(windows, tmp_path):
+def test_without_flock_two_runs_do_not_write_into_one_folder_and_a_locked_file_is_read_on(windows, tmp_path):
+    for _ in range(2):
+        with (
+            files.claimed(tmp_path),
+            pytest.raises(InputError, match="another run is writing there"),
+            files.claimed(tmp_path),
+        ):
+            pass
     (tmp_path / "journal").write_bytes(b"line\n")
     with (tmp_path / "journal").open("r+b", buffering=0) as first, (tmp_path / "journal").open("rb") as second:
         first.seek(3)
@@ -266,7 +245,9 @@ PAD = "morphology.json"
 
 def document(path: Path, inputs: object = None, **more: object) -> Path:
     path.parent.mkdir(exist_ok=True)
-    write_json(path, {"format": "padforge-some/1", "provenance": {"command": path.name, "inputs": inputs}, **more})
+    files.write_json(
+        path, {"format": "padforge-some/1", "provenance": {"command": path.name, "inputs": inputs}, **more}
+    )
     return path
 
 
@@ -274,7 +255,7 @@ def document(path: Path, inputs: object = None, **more: object) -> Path:
 def folder(tmp_path: Path) -> Path:
     """A pad with its mould, its recording, and what was learnt from that."""
     pad = document(tmp_path / PAD, format="padforge-morphology/1")
-    digest = {PAD: sha256(pad)}
+    digest = {PAD: files.sha256(pad)}
     document(tmp_path / "design.json", morphology_sha256=digest[PAD])
     document(tmp_path / "fabrication.json", digest)
     document(tmp_path / "recording" / "start.json", digest)
@@ -288,22 +269,22 @@ def folder(tmp_path: Path) -> Path:
 
 def test_dependents_are_found_through_others(folder: Path) -> None:
     made = ["design.json", "fabrication.json", "fibre_loss.json", "localizer.json", "recording"]
-    assert find_dependents(folder / PAD) == made
-    assert find_dependents(folder / PAD, remade=["design.json", "recording"]) == made[1:4]
-    assert find_dependents(folder / "localizer.json") == ["fibre_loss.json"]
-    assert find_dependents(folder / "edited.json") == find_dependents(folder / "contacts.json") == []
+    assert files.find_dependents(folder / PAD) == made
+    assert files.find_dependents(folder / PAD, remade=["design.json", "recording"]) == made[1:4]
+    assert files.find_dependents(folder / "localizer.json") == ["fibre_loss.json"]
+    assert files.find_dependents(folder / "edited.json") == files.find_dependents(folder / "contacts.json") == []
 
 
 @pytest.mark.parametrize(
     "content", ["", "3", "[]", '{"provenance": 3}', '{"provenance": {"inputs": [1]}}', "[" * 10**5]
 )
 def test_what_else_lies_there_is_passed_over(folder: Path, content: str) -> None:
-    before = find_dependents(folder / PAD)
+    before = files.find_dependents(folder / PAD)
     (folder / "other.json").write_text(content)
     (folder / "folder.json").mkdir()
     (folder / ".unfinished-set-0").mkdir()
-    document(folder / ".unfinished-set-0" / "start.json", {PAD: sha256(folder / PAD)})
-    assert find_dependents(folder / PAD) == before
+    document(folder / ".unfinished-set-0" / "start.json", {PAD: files.sha256(folder / PAD)})
+    assert files.find_dependents(folder / PAD) == before
 
 
 def test_a_file_that_others_were_made_from_is_replaced_by_force_alone(folder: Path) -> None:
@@ -311,11 +292,11 @@ def test_a_file_that_others_were_made_from_is_replaced_by_force_alone(folder: Pa
     for by in (other, {"command": "another"}):
         line = r"morphology.json: fabrication.json, .* and recording were made from it; .* another --out, .* --force$"
         with pytest.raises(InputError, match=line):
-            check_replaceable(folder / PAD, by, remade=["design.json"])
-        check_replaceable(folder / PAD, by, force=True)
-        check_replaceable(folder / "contacts.json", by)
-        check_replaceable(folder / "none.json", by)
+            files.check_replaceable(folder / PAD, by, remade=["design.json"])
+        files.check_replaceable(folder / PAD, by, force=True)
+        files.check_replaceable(folder / "contacts.json", by)
+        files.check_replaceable(folder / "none.json", by)
     same = folder / "new" / PAD
     same.write_bytes((folder / PAD).read_bytes())
-    check_replaceable(folder / PAD, same)
-    check_replaceable(folder / PAD, {"command": PAD})
+    files.check_replaceable(folder / PAD, same)
+    files.check_replaceable(folder / PAD, {"command": PAD})

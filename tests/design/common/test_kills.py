@@ -11,22 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from design.common import files
 from design.common.errors import InputError
-from design.common.files import (
-    atomic,
-    claimed,
-    clear_litter,
-    read_bytes,
-    resolve_exchange,
-    scratch,
-    settle,
-    sha256,
-    staged,
-    unchanged,
-    unfinished_file,
-    write_json,
-    write_text,
-)
 from design.common.files.folders import EXCHANGE
 from tools.kills import killed
 
@@ -44,7 +30,7 @@ def made(folder: Path) -> Path:
 
 
 def renewed(folder: Path) -> None:
-    with claimed(folder), staged(folder, without=["gone", "a"]) as stage:
+    with files.claimed(folder), files.staged(folder, without=["gone", "a"]) as stage:
         for name in ("a", "b", "c"):
             (stage / name).write_bytes(b"new")
 
@@ -55,11 +41,10 @@ def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> N
     for number in itertools.count():
         folder = made(tmp_path / str(number))
         ended = not killed(lambda folder=folder: renewed(folder), number, folder)
-        found.append({name: read_bytes(folder / name) for name in ("b", "a")})
+        found.append({name: files.read_bytes(folder / name) for name in ("b", "a")})
         assert found[-1] in (OLD, NEW), number
-        assert [resolve_exchange(folder / name).exists() for name in ("c", "gone")] == (
-            [True, False] if found[-1] == NEW else [False, True]
-        )
+        exist = [files.resolve_exchange(folder / name).exists() for name in ("c", "gone")]
+        assert exist == [found[-1] == NEW, found[-1] == OLD]
         assert (folder / "mine").read_bytes() == b"old"
         renewed(folder)
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == NEW | {"c": b"new", "mine": b"old"}
@@ -72,7 +57,7 @@ def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> N
 
 def test_the_next_run_clears_up_a_file_that_was_being_written(tmp_path: Path) -> None:
     def write() -> None:
-        with atomic(tmp_path / "a.json") as temporary:
+        with files.atomic(tmp_path / "a.json") as temporary:
             temporary.write_bytes(b"new")
 
     left = set()
@@ -89,7 +74,7 @@ def test_a_link_is_no_exchange(tmp_path: Path) -> None:
     (tmp_path / "elsewhere" / "a").write_bytes(b"another")
     folder = made(tmp_path / "out")
     (folder / EXCHANGE).symlink_to(tmp_path / "elsewhere")
-    assert read_bytes(folder / "a") == b"old"
+    assert files.read_bytes(folder / "a") == b"old"
     with pytest.raises(InputError):
         renewed(folder)
     assert (folder / "a").read_bytes() == (folder / "gone").read_bytes() == b"old"
@@ -119,13 +104,19 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_who_reads_changes_nothing(broken_off: Path) -> None:
+def test_who_reads_changes_nothing_and_the_next_run_puts_in_place_what_it_reads(broken_off: Path) -> None:
     before = content(broken_off)
-    assert {name: read_bytes(broken_off / name) for name in ("a", "b")} == NEW
-    assert unchanged(broken_off, {name: sha256(broken_off / name) for name in ("a", "b", "mine")}) == {"a", "b", "mine"}
+    assert {name: files.read_bytes(broken_off / name) for name in ("a", "b")} == NEW
+    assert files.unchanged(broken_off, {name: files.sha256(broken_off / name) for name in ("a", "b", "mine")}) == {
+        "a",
+        "b",
+        "mine",
+    }
     with pytest.raises(InputError, match="cannot be read"):
-        read_bytes(broken_off / "gone")
+        files.read_bytes(broken_off / "gone")
     assert content(broken_off) == before
+    files.write_text(broken_off / "b", "newer")
+    assert content(broken_off) == {"a": b"new", "b": b"newer", "c": b"new", "mine": b"old"}
 
 
 def copied(folder: Path, elsewhere: Path) -> None:
@@ -149,17 +140,17 @@ def test_an_exchange_is_worth_nothing_elsewhere(tmp_path: Path, broken_off: Path
     carried(broken_off, folder := tmp_path / "elsewhere")
     before = content(folder)
     for use in (
-        lambda: read_bytes(folder / "a"),
+        lambda: files.read_bytes(folder / "a"),
         lambda: renewed(folder),
-        lambda: write_text(folder / "b", "another"),
-        lambda: settle(folder),
+        lambda: files.write_text(folder / "b", "another"),
+        lambda: files.settle(folder),
     ):
         with pytest.raises(InputError, match=f"{EXCHANGE}: begun in another folder"):
             use()
     assert content(folder) == before
     shutil.rmtree(folder / EXCHANGE)
     renewed(folder)
-    assert read_bytes(folder / "a") == read_bytes(folder / "b") == b"new"
+    assert files.read_bytes(folder / "a") == files.read_bytes(folder / "b") == b"new"
 
 
 PLANTED: list[Callable[[Path], object]] = [
@@ -178,25 +169,20 @@ def test_what_only_has_the_name_of_an_exchange_is_left_alone(tmp_path: Path) -> 
         (folder / EXCHANGE / "a").write_bytes(b"planted")
         plant(folder / EXCHANGE)
         before = content(folder)
-        for use in (lambda: read_bytes(folder / "a"), lambda: renewed(folder)):  # noqa: B023
+        for use in (lambda: files.read_bytes(folder / "a"), lambda: renewed(folder)):  # noqa: B023
             with pytest.raises(InputError, match="begun in another folder"):
                 use()
         assert content(folder) == before
 
 
-def test_the_next_run_puts_in_place_what_it_reads(broken_off: Path) -> None:
-    write_text(broken_off / "b", "newer")
-    assert content(broken_off) == {"a": b"new", "b": b"newer", "c": b"new", "mine": b"old"}
-
-
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write everywhere")
 def test_who_may_not_put_files_in_place_reads_them_and_is_told_so(broken_off: Path) -> None:
     broken_off.chmod(0o555)
-    assert {name: read_bytes(broken_off / name) for name in ("a", "b")} == NEW
+    assert {name: files.read_bytes(broken_off / name) for name in ("a", "b")} == NEW
     with pytest.raises(InputError, match="cannot be written"):
-        settle(broken_off)
+        files.settle(broken_off)
     broken_off.chmod(0o755)
-    settle(broken_off)
+    files.settle(broken_off)
     assert (broken_off / "b").read_bytes() == b"new"
 
 
@@ -206,12 +192,12 @@ def test_nobody_puts_files_of_another_user_in_place(broken_off: Path, given: str
     """Whoever shares a folder reads them; as in /tmp, where anybody may put files, not even that."""
     os.chown(broken_off / EXCHANGE / given, 12345, 12345)
     before = content(broken_off)
-    assert {name: read_bytes(broken_off / name) for name in ("a", "b")} == NEW
+    assert {name: files.read_bytes(broken_off / name) for name in ("a", "b")} == NEW
     with pytest.raises(InputError, match="left by a run of another user"):
         renewed(broken_off)
     if not given:
         broken_off.chmod(0o1777)
-        assert read_bytes(broken_off / "b") == b"old"
+        assert files.read_bytes(broken_off / "b") == b"old"
         with pytest.raises(InputError, match="cannot be written"):
             renewed(broken_off)
     assert content(broken_off) == before
@@ -234,16 +220,16 @@ def names(folder: Path) -> set[str]:
 
 
 def write_one(folder: Path) -> None:
-    write_json(folder / "new.json", {})
+    files.write_json(folder / "new.json", {})
 
 
 def write_some(folder: Path) -> None:
-    with staged(folder) as stage:
+    with files.staged(folder) as stage:
         (stage / "new.json").touch()
 
 
 def claim(folder: Path) -> None:
-    with claimed(folder):
+    with files.claimed(folder):
         (folder / "new.json").touch()
 
 
@@ -273,20 +259,20 @@ def test_files_and_folders_are_not_taken_for_each_other_and_links_not_followed(t
     (folder / f".unfinished-set-{NUMBER[::-1]}").symlink_to(tmp_path / "mine")
     os.mkfifo(folder / f".unfinished-{NUMBER[::-1]}.pipe")
     before = names(folder)
-    clear_litter(folder)
+    files.clear_litter(folder)
     assert names(folder) == before
     (folder / f".unfinished-set-{NUMBER[1:]}0").mkdir()
     (folder / f".unfinished-set-{NUMBER[1:]}0" / "link").symlink_to(tmp_path / "mine")
-    clear_litter(folder)
+    files.clear_litter(folder)
     assert names(folder) == before
     assert names(tmp_path / "mine") == {"work"}
 
 
 def test_what_somebody_is_at_work_with_stays(tmp_path: Path) -> None:
-    with scratch(tmp_path), unfinished_file(tmp_path, ".json"), atomic(tmp_path / "a.txt"):
+    with files.scratch(tmp_path), files.unfinished_file(tmp_path, ".json"), files.atomic(tmp_path / "a.txt"):
         at_work = names(tmp_path)
         assert len(at_work) == 3
-        clear_litter(tmp_path)
+        files.clear_litter(tmp_path)
         another = "import sys, pathlib, design.common.files as f; f.clear_litter(pathlib.Path(sys.argv[1]))"
         subprocess.run([sys.executable, "-c", another, tmp_path], check=True)
         assert names(tmp_path) == at_work
@@ -300,7 +286,7 @@ def test_what_is_another_ones_stays_and_all_where_there_are_no_locks(tmp_path: P
     (tmp_path / FILES[0]).touch()
     with monkeypatch.context() as patch:
         patch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-        clear_litter(tmp_path)
+        files.clear_litter(tmp_path)
     assert names(tmp_path) == {FILES[0]}
     monkeypatch.setattr("fcntl.flock", none_here)
     claim(tmp_path)

@@ -80,9 +80,7 @@ ELSEWHERE = "http://elsewhere.example"
         (b"1" * 100, "/double", {}, 200),
     ],
 )
-def test_only_the_page_itself_is_heard_where_it_was_agreed_and_no_more_than_that(
-    page: LocalPage, body: bytes | None, path: str, headers: dict[str, str], status: int
-) -> None:
+def test_only_the_page_is_heard(page: LocalPage, body: bytes | None, path: str, headers: dict, status: int) -> None:
     assert posted(page, body, path, **headers).status == status
 
 
@@ -104,7 +102,9 @@ def test_with_a_token_only_those_who_know_it_are_answered_by_whatever_name_they_
             LocalPage(0, PAGE, host=host, token=token)
 
 
-def test_an_address_that_is_none_is_refused_in_silence(page: LocalPage, capfd: pytest.CaptureFixture[str]) -> None:
+def test_half_a_post_is_not_heard_and_no_address_refused_in_silence(
+    page: LocalPage, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Whoever asks for it knows no token yet, and would fill the terminal."""
     for asked in (b"GET http://[ HTTP/1.0", b"POST http://[x]y/double HTTP/1.0"):
         with socket.create_connection((HOST, port_of(page)), timeout=10) as stranger:
@@ -112,9 +112,6 @@ def test_an_address_that_is_none_is_refused_in_silence(page: LocalPage, capfd: p
             assert stranger.recv(100).split()[1] == b"400"
     assert posted(page, b"1").status == 200
     assert capfd.readouterr().err == ""
-
-
-def test_half_of_what_was_posted_is_not_heard(page: LocalPage) -> None:
     asked = f"POST /double HTTP/1.0\r\nHost: {HOST}:{port_of(page)}\r\nOrigin: http://{HOST}:{port_of(page)}\r\n"
     with socket.create_connection((HOST, port_of(page)), timeout=10) as browser:
         browser.sendall(f"{asked}Content-Length: 2\r\n\r\n4".encode())
@@ -149,7 +146,7 @@ def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monk
         assert [json.loads(next(told)[6:])["at"] for _ in range(2)] == [0, 1]
 
 
-def test_markdown_becomes_headings_lists_tables_and_paragraphs():
+def test_markdown_becomes_elements_and_html_in_it_and_in_sections_is_text():
     rows = "| a | b |\n| --- | --- |\n| 1.5 mm | fail |"
     steps = "1. Stir **well**.\n2. Read `x.json`."
     head, rows, steps, end = html_pieces(f"# Title\n\n## Mix\n\n{rows}\n\n{steps}\n\nDone.")
@@ -158,14 +155,8 @@ def test_markdown_becomes_headings_lists_tables_and_paragraphs():
     assert '<td class="number">1.5 mm</td><td class="fail">fail</td>' in rows
     assert re.sub(r"\s", "", steps) == ("<ol><li>Stir<strong>well</strong>.</li><li>Read<code>x.json</code>.</li></ol>")
     assert end.strip() == "<p>Done.</p>"
-
-
-def test_html_and_links_in_markdown_are_text():
     (piece,) = html_pieces('<img src="x"> [a](javascript:b) ![c](http://d) &lt;')
     assert piece.strip() == "<p>&lt;img src=&quot;x&quot;&gt; [a](javascript:b) ![c](http://d) &amp;lt;</p>"
-
-
-def test_sections_are_linked_and_their_text_is_escaped():
     text = whole_page("<b>", "&", [PageSection("A <i> b", [table(["<u>"], [["<s>"]])], [("<1>", "<2>")])])
     assert not re.search("<[ius12]>", text)
     assert "<title>&lt;b&gt;</title>" in text

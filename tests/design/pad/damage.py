@@ -11,11 +11,7 @@ from design import InputError
 T = TypeVar("T")
 
 damages = st.lists(
-    st.tuples(
-        st.floats(0, 1, exclude_max=True),
-        st.binary(max_size=8),
-        st.sampled_from([0, 1, 16, 10**9]),
-    ),
+    st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.sampled_from([0, 1, 16, 10**9])),
     min_size=1,
     max_size=3,
 )
@@ -35,6 +31,5 @@ def read_damaged(
     except InputError as error:
         message = str(error)
     assert path.name in message
-    assert "\n" not in message
     assert len(message) < 1000
     return None

@@ -23,7 +23,7 @@ def scipy_curve(pad, fibre):
 
 @given(pads)
 @settings(max_examples=15)
-def test_slopes_and_sampled_curves_are_scipys(pad):
+def test_slopes_samples_and_bezier_spans_are_scipys(pad):
     at = np.linspace(0, pad.grid + 1, 200)
     compiled = sample_curves(pad.knots[None], pad.layout.horizontals, 200)[0]
     axes = [0] * pad.grid + [1] * pad.grid
@@ -36,6 +36,12 @@ def test_slopes_and_sampled_curves_are_scipys(pad):
         np.testing.assert_allclose(slopes(pad)[fibre], curve.derivative()(curve.x), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(compiled[fibre], expected, atol=1e-9)
         np.testing.assert_allclose(smooth[fibre].numpy(), expected, atol=1e-9)
+    u = np.linspace(0, 1, 7)[:, None]
+    for fibre, spans in enumerate(beziers(pad)):
+        axis, curve = 0 if fibre < pad.grid else 1, scipy_curve(pad, fibre)
+        for p in spans:
+            points = (1 - u) ** 3 * p[0] + 3 * (1 - u) ** 2 * u * p[1] + 3 * (1 - u) * u**2 * p[2] + u**3 * p[3]
+            np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)
 
 
 def test_torch_gradients_pass_the_finite_difference_test():
@@ -43,17 +49,6 @@ def test_torch_gradients_pass_the_finite_difference_test():
     v = torch.tensor([[1.0, 1.7, 2.1, 1.2, 1.0]], dtype=torch.float64, requires_grad=True)
     at = torch.linspace(0.05, 2.95, 9, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda t, v: pchip_sample(t, v, at), (t, v))
-
-
-@given(pads)
-@settings(max_examples=15)
-def test_bezier_spans_lie_on_the_curve(pad):
-    u = np.linspace(0, 1, 7)[:, None]
-    for fibre, spans in enumerate(beziers(pad)):
-        axis, curve = 0 if fibre < pad.grid else 1, scipy_curve(pad, fibre)
-        for p in spans:
-            points = (1 - u) ** 3 * p[0] + 3 * (1 - u) ** 2 * u * p[1] + 3 * (1 - u) * u**2 * p[2] + u**3 * p[3]
-            np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)
 
 
 @given(pads, st.sampled_from([1e-2, 1e-3, 1e-4]))
@@ -90,29 +85,26 @@ def test_wild_curves_keep_to_their_knots_and_every_horizontal_crosses_every_vert
     assert crossings(pad, across=False) == [c for c in found if c not in across]
 
 
-def test_length_of_straight_and_bent_fibres():
+def test_lengths_and_crossings_of_straight_bent_and_touching_fibres():
+    """Each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2); and one beside it."""
     np.testing.assert_allclose(lengths(Morphology.straight(3)), 4)
     pad = Morphology.random(4, 5, seed=3)
     polyline = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in flatten(pad, 1e-8)]
     np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
-
-
-def test_a_straight_grid_crosses_at_its_nodes():
     found = crossings(Morphology.straight(3))
     assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
     np.testing.assert_allclose([c.place for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
-
-
-def diagonal_pad():
-    """Two fibres, each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2)."""
     fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
-    return Morphology(np.stack([fibre, fibre[:, ::-1]]))
-
-
-def test_fibres_that_run_on_each_other_also_count_where_they_cross():
-    found = crossings(diagonal_pad())
+    pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
+    found = crossings(pad)
     np.testing.assert_allclose([c.place for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
-    np.testing.assert_allclose(crossing_angles(diagonal_pad(), found), [90, 0, 90])
+    np.testing.assert_allclose(crossing_angles(pad, found), [90, 0, 90])
+    bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
+    pad = Morphology(np.stack([fibre, bow]))
+    found = crossings(pad)
+    touch = [np.allclose(c.place, 1) for c in found]
+    assert sum(touch) == 1
+    assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
 
 
 @given(pads)
@@ -124,16 +116,6 @@ def test_angles_are_those_of_scipys_tangents(pad):
         rise, run = slope[c.first](c.place[0]), slope[c.second](c.place[1])
         between = np.degrees(np.arctan(rise) + np.arctan(run) - np.pi / 2) % 180
         assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
-
-
-def test_a_touch_has_angle_0():
-    line = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
-    bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
-    pad = Morphology(np.stack([line, bow]))
-    found = crossings(pad)
-    touch = [np.allclose(c.place, 1) for c in found]
-    assert sum(touch) == 1
-    assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("name", "all_", "family"), [("1para", 16, 0), ("5para_dis", 30, 6), ("20para", 672, 124)])

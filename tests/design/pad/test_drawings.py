@@ -59,7 +59,7 @@ def apart(one: Morphology, other: Morphology) -> float:
     return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
 
 
-def test_curves_become_fibres(tmp_path: Path) -> None:
+def test_curves_become_fibres_whose_ends_are_put_right_within_the_tolerance(tmp_path: Path) -> None:
     plain = import_plan(svg(tmp_path, PATHS), LAYOUT, 0.05).pad
     assert plain.to_mm(flatten(plain, 1e-4)[1])[0] == pytest.approx([-20, 6])  # y of an SVG goes down
     t = np.linspace(0, 1, 200)[:, None]
@@ -67,6 +67,12 @@ def test_curves_become_fibres(tmp_path: Path) -> None:
     drawn = (1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d
     upper = shapely.LineString(plain.to_mm(flatten(plain, 1e-4)[1]))
     assert shapely.distance(shapely.points(drawn), upper).max() < 0.06
+    ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
+    found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
+    assert found.fibres[1].moved_mm == pytest.approx(0.03)
+    with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
+        import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
+    assert "--tolerance-mm" in str(told.value)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +98,7 @@ def test_it_is_read_as_it_is_drawn(tmp_path: Path, plain: Morphology, drawn: str
     assert apart(import_plan(svg(tmp_path, drawn, head=head), LAYOUT, 0.4).pad, plain) < 0.02
 
 
-def test_pieces_are_put_together(tmp_path: Path) -> None:
+def test_pieces_are_put_together_and_what_another_file_would_have_to_declare_draws_nothing(tmp_path: Path) -> None:
     parts = [
         '<polyline points="-20,-6 -5,-8"/><line x1="5" y1="-4" x2="-5" y2="-8"/><path d="M5-4 20-6"/>',
         '<line x1="-20" y1="6" x2="20" y2="6"/>',
@@ -101,15 +107,9 @@ def test_pieces_are_put_together(tmp_path: Path) -> None:
     found = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
     assert found.fibres[1].off_mm < 0.05
     assert "to" in found.fibres[1].name
-
-
-def test_ends_are_put_right_within_the_tolerance_and_said(tmp_path: Path) -> None:
-    ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
-    found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
-    assert found.fibres[1].moved_mm == pytest.approx(0.03)
-    with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
-        import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
-    assert "--tolerance-mm" in str(told.value)
+    path = svg(tmp_path, f"&a;{PATHS[:-2]}/>&b;")
+    path.write_text('<!DOCTYPE svg SYSTEM "svg11.dtd">' + path.read_text())
+    assert len(import_plan(path, LAYOUT, 0.05).fibres) == 5
 
 
 def instead(way: str) -> str:
@@ -130,16 +130,11 @@ REFUSED = [
     ('<rect id="pad" width="1" height="7"/>' + PATHS, "pad is drawn 1 by 7, expected the shape of 40 by 36"),
     (PATHS + "".join(f'<line x1="-20" y1="-6" x2="{x}" y2="0"/>' for x in (-18, -17)), "more than two"),
     ('<path id="x" d="M 0 0 L 1"/>', "x: no path that can be read"),
-    *(
-        (f'<path id="x" transform="{wrong}" d="M 0 0 L 1 1"/>', "x: transform")
-        for wrong in ("turn(3)", "scale(", "rotate(1e999)")
-    ),
+    *((f'<path id="x" transform="{no}" d="M0 0L1 1"/>', "x: tran") for no in ("turn(3)", "scale(", "rotate(1e999)")),
     ('<g transform="scale(1e200)"><path id="x" transform="scale(1e200)" d="M 0 0C1 1 2 2 3 3"/></g>', "x: coord"),
     (f'<path id="x" d="M 0 0 C {"9" * 300} 1 2 2 1e300 3 A 1e200 1 9 0 1 1e9 2"/>', "x: (coord|no path)"),
     ('<line id="x" x1="5%" x2="1" y2="2"/>', "x: x1 is '5%', expected a length"),
-    ('<line id="x" x1="1e308" x2="1" y2="2" transform="scale(1e308)"/>', "x: coordinates"),
     ('<path id="x" d="M 0 0 L 1e999 1"/>', "x: coordinates"),
-    ('<path id="x" d="M 0 0 L 9e9 1"/>', "x: coordinates"),
     ('<use id="x" href="#x"/>', "x: <use> of <use>"),
     ('<g id="a"><use href="#b"/></g><g id="b"><use href="#a"/><use href="#a"/></g>', "<use>|elements"),
     ('<path d="M0 0' + "L1 1L2 1" * 101_000 + '"/>', "points"),
@@ -186,12 +181,6 @@ def test_hostile_files_are_refused_in_one_line(tmp_path: Path, content: bytes) -
         assert "root:" not in str(refused.value)
     with pytest.raises(InputError, match=r"allowed are \.svg and \.dxf"):
         import_plan(tmp_path / "plan.pdf", LAYOUT, 0.05)
-
-
-def test_what_another_file_would_have_to_declare_draws_nothing(tmp_path: Path) -> None:
-    path = svg(tmp_path, f"&a;{PATHS[:-2]}/>&b;")
-    path.write_text('<!DOCTYPE svg SYSTEM "svg11.dtd">' + path.read_text())
-    assert len(import_plan(path, LAYOUT, 0.05).fibres) == 5
 
 
 @pytest.fixture(scope="module")

@@ -83,7 +83,7 @@ def test_culled_sums_equal_the_full_scan(contact, grid, knots, seed):
     np.testing.assert_allclose(signals_quantized(pad, presses, contact, 300), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_a_population_is_its_members_one_by_one_in_the_unit_of_its_layout():
+def test_a_population_is_its_members_one_by_one_and_the_serpentine_fills_its_rectangle():
     pads = [Morphology.random(3, 2, seed) for seed in range(3)]
     presses = np.random.default_rng(0).uniform(0, 4, (24, 2))
     batch = signals_quantized(np.stack([pad.knots for pad in pads]), presses)
@@ -95,9 +95,6 @@ def test_a_population_is_its_members_one_by_one_in_the_unit_of_its_layout():
     assert not np.allclose(signals(Morphology(pads[0].knots, 5.0), presses), signals(pads[0], presses), atol=0.1)
     pad = Morphology.random((3, 2), 4, seed=0, pitch_mm=(5.0, 8.0))
     assert published_terms(pad.knots[None], Contact(), layout=pad.layout) == published_terms(pad, Contact())
-
-
-def test_the_serpentine_fills_its_rectangle_and_turns_at_the_end_of_each_row():
     positions = boustrophedon(((0.5, 2), (4.5, 3)), 3)
     expected = [(0.5, 2), (2.5, 2), (4.5, 2), (4.5, 2.5), (2.5, 2.5), (0.5, 2.5), (0.5, 3), (2.5, 3), (4.5, 3)]
     assert positions.tolist() == [list(position) for position in expected]

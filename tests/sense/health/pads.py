@@ -31,40 +31,27 @@ def later(model: HealthModel, readings: Array, pad: Recording, first: int = LEAR
     return examine(model, readings[start:], pad.times_s[start:], pad.begun[first:] - start, pad.lifted[first:] - start)
 
 
-Fault = Callable[[Array, int, np.random.Generator], None]
+Fault = Callable[[Array, Array, np.random.Generator], Array]
+FAULTS: dict[str, Fault] = {
+    "stuck": lambda own, before, rng: np.full_like(own, own[0]),
+    "open": lambda own, before, rng: np.zeros_like(own),
+    "floating": lambda own, before, rng: rng.uniform(0, 3.3, len(own)),
+    "noisy": lambda own, before, rng: own + 0.016 * rng.standard_normal(len(own)),
+    "offset": lambda own, before, rng: own + 0.1,
+    "drifting": lambda own, before, rng: own - 5e-5 * np.arange(len(own)),
+    "weak": lambda own, before, rng: (own + np.median(before)) / 2,
+}
+"""What fibre 1 reads instead of its own readings, of those before, or "swapped" with fibre 4."""
 
 
-def stuck(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, 1] = readings[at, 1]
-
-
-def open_low(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, 1] = 0.0
-
-
-def floating(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, 1] = rng.uniform(0, 3.3, len(readings) - at)
-
-
-def swapped(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, [1, 4]] = readings[at:, [4, 1]]
-
-
-def noisy(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, 1] += 0.016 * rng.standard_normal(len(readings) - at)
-
-
-def offset(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, 1] += 0.1
-
-
-def drifting(readings: Array, at: int, rng: np.random.Generator) -> None:
-    readings[at:, 1] -= 5e-5 * np.arange(len(readings) - at)
-
-
-def weak(readings: Array, at: int, rng: np.random.Generator) -> None:
-    rest = np.median(readings[at - 400 : at, 1])
-    readings[at:, 1] = rest + 0.5 * (readings[at:, 1] - rest)
+def spoilt(pad: Recording, fault: str, press: int = BAD_FROM, readings: Array | None = None) -> Array:
+    """Readings in which a fibre fails from a press on."""
+    found, at = (pad.readings if readings is None else readings).copy(), int(pad.begun[press])
+    if fault == "swapped":
+        found[at:, [1, 4]] = found[at:, [4, 1]]
+    else:
+        found[at:, 1] = FAULTS[fault](found[at:, 1], found[at - 400 : at, 1], np.random.default_rng(2))
+    return found
 
 
 def faulty(rng: np.random.Generator, readings: Array) -> Array:

@@ -97,16 +97,13 @@ def test_ratios_are_those_of_densities(seed: int) -> None:
         np.testing.assert_allclose(begin[q, c], beginning, rtol=1e-9, atol=1e-9)
 
 
-def test_what_is_missing_speaks_neither_for_nor_against() -> None:
+def test_the_likeliest_step_is_that_of_the_loudest_filter_and_what_is_missing_says_nothing() -> None:
     model, traces, targets, mean, spread = by_hand(0)
     traces[2, 1, 7] = targets[2, 1, 0] = np.nan
     stay, begin = model.ratios(traces, targets, mean, spread)
     assert not stay[2, 1].any()
     assert not begin[2, 1].any()
     assert stay[2, 0].any()
-
-
-def test_the_likeliest_step_is_that_of_the_filter_that_answers_most() -> None:
     model, traces, *_ = by_hand(1)
     answers = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
     for q, c in np.ndindex(PRESSES, FIBRES):
@@ -185,16 +182,13 @@ def test_noise_is_that_of_the_quiet_thirds_and_spikes_are_none(seed: int, size: 
     assert (noise_of(steep) == found).all()
 
 
-def test_a_tail_is_read_by_the_number_of_fibres_lost() -> None:
+def test_a_tail_has_the_mean_excess_of_the_highest_tenth_and_is_read_by_the_fibres_lost() -> None:
+    """400 climbs of one press each to known heights, of which the level makes the highest no rarer than once."""
     tail = Tail(level=np.array([[1.0, 2.0], [3.0, 4.0]]), slope=np.array([[1.0, 2.0], [2.0, 4.0]]))
     heights = np.array([[5.0, 8.0]])
     np.testing.assert_allclose(tail.rarity(heights, 0), [[4.0, 3.0]])
     np.testing.assert_allclose(tail.rarity(heights, 1), [[1.0, 1.0]])
     np.testing.assert_allclose(tail.rarity(heights, 7), [[1.0, 1.0]])
-
-
-def test_the_slope_of_a_tail_is_the_mean_excess_of_the_highest_tenth() -> None:
-    """400 climbs of one press each to known heights, of which the level makes the highest no rarer than once."""
     heights = np.random.default_rng(0).permutation(np.linspace(0.1, 40, 400))
     ratios = np.full((1000, 1, 1), -100.0)
     ratios[: 2 * 400 : 2, 0, 0] = heights
@@ -207,7 +201,7 @@ def test_the_slope_of_a_tail_is_the_mean_excess_of_the_highest_tenth() -> None:
     assert Tail.fit([(-ratios * 0 - 1, -ratios * 0 - 1)]).slope[0, 0] == 1
 
 
-def test_a_climb_is_the_best_sum_over_all_beginnings() -> None:
+def test_a_climb_is_the_best_sum_over_all_beginnings_and_its_tail_leads_to_the_rate_of_false_alarms() -> None:
     rng = np.random.default_rng(3)
     stay, begin = rng.normal(-0.3, 1, (2, 40))
     height = np.zeros(())
@@ -218,8 +212,6 @@ def test_a_climb_is_the_best_sum_over_all_beginnings() -> None:
         none = [stay[first : press + 1].sum() for first in range(press + 2)]
         assert height == pytest.approx(max(0.0, *sums, *none))
 
-
-def test_the_tail_of_exact_ratios_leads_to_the_rate_of_false_alarms() -> None:
     def ratios(presses: int, seed: int) -> Array:
         """Of a mean of 1 against 0, for numbers of mean 0."""
         return np.random.default_rng(seed).standard_normal((presses, 3, 1)) - 0.5

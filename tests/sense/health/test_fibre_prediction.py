@@ -8,20 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sense.health import fibre_prediction
-from sense.health.fibre_prediction import (
-    COMPONENTS,
-    INPUTS,
-    MEMBERS,
-    RELEASED,
-    REST,
-    TARGETS,
-    TRACE,
-    History,
-    Shapes,
-    expected,
-    shapes_of,
-    traces_of,
-)
+from sense.health.fibre_prediction import COMPONENTS, INPUTS, MEMBERS, RELEASED, REST, TARGETS, TRACE, History, Shapes
 
 FIBRES = 2
 
@@ -68,7 +55,7 @@ def test_shapes_are_principal_directions_and_sizes_keep_a_part_of_their_smallnes
     strength = np.array([5.0, 2.0, 0.5])
     traces = np.zeros((400, FIBRES, TRACE))
     traces[:, :, REST:] = np.einsum("qck,kw->qcw", strength * rng.normal(0, 1, (400, FIBRES, 3)), patterns)
-    shapes, inputs, targets = shapes_of(traces)
+    shapes, inputs, targets = fibre_prediction.shapes_of(traces)
     for fibre in range(FIBRES):
         for component, pattern in enumerate(patterns):
             assert abs(shapes.basis[fibre, REST:, component] @ pattern) > 0.98
@@ -102,7 +89,7 @@ def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int,
     weights = random_weights(fibres, rng)
     inputs = rng.standard_normal((3, fibres, INPUTS)).astype(np.float32)
     alive = rng.random((3, fibres)) < 0.7
-    mean, spread = expected(weights, inputs, alive)
+    mean, spread = fibre_prediction.expected(weights, inputs, alive)
     for press in range(3):
         for fibre in range(fibres):
             others = [c for c in range(fibres) if c != fibre and alive[press, c]]
@@ -122,16 +109,13 @@ def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int,
             assert np.allclose(spread[press, fibre], np.sqrt(total), rtol=1e-3, atol=1e-4)
 
 
-def test_the_trace_of_a_press_keeps_to_it() -> None:
+def test_the_trace_of_a_press_keeps_to_it_and_what_was_not_recorded_of_its_release_is_missing() -> None:
     readings = np.arange(100.0)[:, None] * [1.0, 2.0]
     whole = fibre_prediction.press_trace(readings, begun=30, lifted=55, low=0, high=100)
     assert whole.shape == (2, TRACE)
     assert whole[0].tolist() == [*range(20, 50), *range(55, 75)]
     tight = fibre_prediction.press_trace(readings, begun=30, lifted=34, low=28, high=36)
     assert tight[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
-
-
-def test_what_was_not_recorded_of_a_release_is_missing() -> None:
     readings = np.arange(100.0)[:, None] * [1.0, 2.0]
     # The next press begins before a reading of the release was taken.
     none = fibre_prediction.press_trace(readings, begun=30, lifted=55, low=0, high=55)
@@ -139,9 +123,9 @@ def test_what_was_not_recorded_of_a_release_is_missing() -> None:
     assert np.isnan(none[:, -RELEASED:]).all()
     begun, lifted = np.array([10, 50]), np.array([30, 70])
     for end in (70, 74, 90):
-        cut_off, last = traces_of(readings[:end], begun, lifted)[:, 0]
+        cut_off, last = fibre_prediction.traces_of(readings[:end], begun, lifted)[:, 0]
         assert cut_off[-RELEASED:].tolist() == [*range(30, 50)]
         assert np.array_equal(last, [*range(40, 70), *range(70, end), *[np.nan] * (90 - end)], equal_nan=True)
     # One that the next press cuts short is filled.
-    cut_off, _ = traces_of(readings, begun, np.array([45, 70]))[:, 0]
+    cut_off, _ = fibre_prediction.traces_of(readings, begun, np.array([45, 70]))[:, 0]
     assert cut_off[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]

@@ -17,7 +17,7 @@ from sense import Recording
 from sense.health.health_model import COMMANDED, DETECTED, HealthModel
 from sense.health.model_folder import health_files, health_in
 from sense.health.trained_model import ModelFiles, files_of, one_cycle
-from tests.sense.health.pads import BAD_FROM, later, weak
+from tests.sense.health.pads import later, spoilt
 from tools.kills import killed
 
 DOCUMENT, WEIGHTS = (path.name for path in files_of(Path(), COMMANDED))
@@ -34,8 +34,7 @@ def test_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path
         assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
     read = HealthModel.load(tmp_path / "new")
     assert read.provenance == {"command": "test"}
-    readings = pad.readings.copy()
-    weak(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
+    readings = spoilt(pad, "weak")
     assert later(read, readings, pad) == later(model, readings, pad)
 
 
@@ -55,9 +54,8 @@ def test_a_changed_document_is_refused(model: HealthModel, tmp_path: Path, chang
     model.save(tmp_path)
     document = json.loads((tmp_path / DOCUMENT).read_text())
     (tmp_path / DOCUMENT).write_text(json.dumps(document | change))
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message):
         HealthModel.load(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -86,9 +84,8 @@ def test_damaged_files_are_refused(model: HealthModel, tmp_path: Path, name: str
         (tmp_path / name).symlink_to("/dev/zero")
     elif spoilt != "missing":
         (tmp_path / name).write_bytes(torn if isinstance(spoilt, str) else spoilt)
-    with pytest.raises(InputError, match=r"not the weights|cannot be read|JSON|a file") as caught:
+    with pytest.raises(InputError, match=r"not the weights|cannot be read|JSON|a file"):
         health_in(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", [None, 3, "", "a/b", "..", "x" * 300, "a\nb"])

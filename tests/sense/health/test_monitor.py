@@ -20,23 +20,7 @@ from sense.health.monitor import TEXTS, FibreFault, Monitor, examine, fault_line
 from sense.health.schema import LEAST_PRESSES
 from sense.recordings.processing.limits import LEAST_SPREAD_V
 from sense.recordings.simulation.published_protocol import simulate
-from tests.sense.health.pads import (
-    BAD_FROM,
-    LEARNT,
-    PRESSES,
-    Fault,
-    drifting,
-    faulty,
-    floating,
-    later,
-    learn,
-    noisy,
-    offset,
-    open_low,
-    stuck,
-    swapped,
-    weak,
-)
+from tests.sense.health.pads import BAD_FROM, LEARNT, PRESSES, faulty, later, learn, spoilt
 
 FEW = 320
 """Presses that health is learnt from, but not enough to call a fibre weak."""
@@ -45,27 +29,17 @@ FEW = 320
 @pytest.mark.parametrize(
     ("fault", "kind", "within"),
     [
-        (stuck, {"stuck"}, 20),
-        (open_low, {"open"}, 20),
-        (floating, {"open"}, 20),
-        (swapped, {"swapped", "offset"}, 20),
-        (noisy, {"noisy"}, 20),
-        (offset, {"offset"}, 20),
-        (drifting, {"drifting"}, 60),
-        (weak, {"weak"}, 60),
+        *(("stuck", {"stuck"}, 20), ("open", {"open"}, 20), ("floating", {"open"}, 20), ("noisy", {"noisy"}, 20)),
+        *(("swapped", {"swapped", "offset"}, 20), ("offset", {"offset"}, 20)),
+        *(("drifting", {"drifting"}, 60), ("weak", {"weak"}, 60)),
     ],
 )
-def test_a_bad_fibre_is_named_once_with_its_fault(
-    pad: Recording, model: HealthModel, fault: Fault, kind: set[str], within: int
-) -> None:
-    readings = pad.readings.copy()
-    fault(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
-    findings = later(model, readings, pad)
-    first = findings[0]
-    bad_from = BAD_FROM - LEARNT
+def test_a_bad_fibre_is_named(pad: Recording, model: HealthModel, fault: str, kind: set[str], within: int) -> None:
+    findings = later(model, spoilt(pad, fault), pad)
+    first, bad_from = findings[0], BAD_FROM - LEARNT
     assert first.kind in kind
     # Where rests differ a swap shows as two offsets before the answers have told what it is.
-    guilty = {1, 4} if fault is swapped else {1}
+    guilty = {1, 4} if fault == "swapped" else {1}
     named = [fibre for finding in findings for fibre in finding.fibres]
     assert bad_from <= first.press <= bad_from + within
     assert first.since <= first.press
@@ -75,18 +49,12 @@ def test_a_bad_fibre_is_named_once_with_its_fault(
 
 
 @pytest.mark.parametrize(("beyond", "kind"), [(-1.01, "open"), (-0.99, "stuck"), (0.99, "stuck"), (1.01, "open")])
-def test_one_value_farther_off_than_rests_ever_spread_is_open_and_else_stuck(
-    pad: Recording, model: HealthModel, beyond: float, kind: str
-) -> None:
+def test_one_value_farther_off_than_rests_is_open(pad: Recording, model: HealthModel, beyond: float, kind: str) -> None:
     low, high = model.rests[:, 1]
     readings = pad.readings.copy()
     readings[pad.begun[BAD_FROM] :, 1] = (high if beyond > 0 else low) + beyond * (high - low)
     (finding,) = later(model, readings, pad)
     assert (finding.fibres, finding.kind) == ((1,), kind)
-
-
-def test_a_healthy_pad_is_left_in_peace(pad: Recording, model: HealthModel) -> None:
-    assert later(model, pad.readings, pad) == []
 
 
 @pytest.mark.parametrize("after", [0, 3])
@@ -100,8 +68,7 @@ def test_a_healthy_pad_is_left_in_peace_where_the_last_release_was_not_recorded(
 
 
 def test_presses_one_by_one_tell_the_same(pad: Recording, model: HealthModel) -> None:
-    readings = pad.readings.copy()
-    noisy(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
+    readings = spoilt(pad, "noisy")
     monitor = Monitor(model)
     findings: list[FibreFault] = []
     for press in range(LEARNT, PRESSES):
@@ -132,13 +99,10 @@ def test_a_fibre_is_missing_after_twenty_presses_on_end(pad: Recording, model: H
     [
         ({"readings": np.s_[:, :5]}, "readings are of 5 fibres, health was learnt from 6"),
         ({"times_s": np.s_[1:]}, "times have shape"),
-        ({"begun": np.s_[::-1]}, "each to end before the next begins"),
         ({"lifted": np.s_[:-1]}, "presses have 760 begins and 759 ends"),
     ],
 )
-def test_a_recording_that_does_not_fit_is_refused(
-    pad: Recording, model: HealthModel, change: dict[str, Any], message: str
-) -> None:
+def test_another_recording_is_refused(pad: Recording, model: HealthModel, change: dict, message: str) -> None:
     parts = {name: getattr(pad, name)[change.get(name, ...)] for name in ("readings", "times_s", "begun", "lifted")}
     with pytest.raises(InputError, match=message):
         examine(model, **parts)
@@ -152,20 +116,15 @@ def test_a_rate_or_a_press_that_does_not_fit_is_refused(pad: Recording, model: H
     for begun, lifted in ((0, 30), (30, 30), (10, 61)):
         with pytest.raises(InputError, match="allowed is a whole number from"):
             Monitor(model).update(pad.readings[:60], begun, lifted)
-
-
-@pytest.mark.parametrize(
-    ("begun", "lifted"),
-    [([0, 5], [4, 9]), ([1, 4], [5, 9]), ([1, 5], [1, 9]), ([1, 5], [2, 5]), ([1, 5], [5, 10])],
-)
-def test_presses_follow_each_other_within_the_readings(begun: list[int], lifted: list[int]) -> None:
     readings, times_s = np.zeros((9, 2)), np.arange(9.0)
     checked_presses(readings, times_s, [1, 5], [5, 9])
-    with pytest.raises(InputError, match="each to end before the next begins"):
-        checked_presses(readings, times_s, begun, lifted)
+    for wrong in (([0, 5], [4, 9]), ([1, 4], [5, 9]), ([1, 5], [1, 9]), ([1, 5], [2, 5]), ([1, 5], [5, 10])):
+        with pytest.raises(InputError, match="each to end before the next begins"):
+            checked_presses(readings, times_s, *wrong)
 
 
-def test_every_hypothesis_has_an_equal_part_of_the_false_alarms(model: HealthModel) -> None:
+def test_a_healthy_pad_is_left_in_peace_and_every_hypothesis_has_a_part_of_false_alarms(pad, model) -> None:
+    assert later(model, pad.readings, pad) == []
     for alarms in (1e-3, 1e-5):
         assert np.exp(-replace(model, false_alarms=alarms).threshold) == pytest.approx(alarms / len(HYPOTHESES))
 
@@ -199,15 +158,13 @@ def test_on_the_published_recording_faults_are_named_and_health_is_not(published
     end = pad.begun[1362]
     short = Recording(pad.readings[:end], pad.times_s[:end], pad.presses_mm[:1362], pad.begun[:1362], pad.lifted[:1362])
     assert later(model, short.readings, short, first=1000) == []
-    for fault, within in ((stuck, 20), (swapped, 20), (offset, 20), (weak, 60)):
-        readings = short.readings.copy()
-        fault(readings, int(short.begun[1300]), np.random.default_rng(0))
-        found = later(model, readings, short, first=1280)[0]
-        assert set(found.fibres) <= ({1, 4} if fault is swapped else {1})
+    for fault, within in (("stuck", 20), ("swapped", 20), ("offset", 20), ("weak", 60)):
+        found = later(model, spoilt(short, fault, 1300), short, first=1280)[0]
+        assert set(found.fibres) <= ({1, 4} if fault == "swapped" else {1})
         assert 20 <= found.press <= 20 + within
 
 
-def test_dead_channels_are_known_and_left_out(pad: Recording) -> None:
+def test_dead_channels_are_left_out_and_a_single_fibre_still_tells_what_its_own_readings_do(pad: Recording) -> None:
     readings = pad.readings.copy()
     readings[:, 0] = 3.3
     readings[:, 3] = np.minimum(readings[:, 3], np.quantile(readings[:, 3], 0.2))
@@ -215,11 +172,7 @@ def test_dead_channels_are_known_and_left_out(pad: Recording) -> None:
     assert model.dead == (0, 3)
     assert Monitor(model).lost == (0, 3)
     assert later(model, readings, pad) == []
-    noisy(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
-    assert later(model, readings, pad)[0].fibres == (1,)
-
-
-def test_a_single_fibre_still_tells_what_its_own_readings_do(pad: Recording) -> None:
+    assert later(model, spoilt(pad, "noisy", readings=readings), pad)[0].fibres == (1,)
     readings = pad.readings[:, 1:2].copy()
     model = learn(readings, pad)
     readings[pad.begun[BAD_FROM] :] = readings[pad.begun[BAD_FROM]]
@@ -246,17 +199,11 @@ def test_health_learnt_from_few_presses_calls_no_fibre_weak(pad: Recording) -> N
     model = learn(pad.readings, pad, FEW)
     end = int(pad.begun[FEW])
     assert not examine(model, pad.readings[:end], pad.times_s[:end], pad.begun[:FEW], pad.lifted[:FEW])
-    readings = pad.readings.copy()
-    weak(readings, int(pad.begun[BAD_FROM]), np.random.default_rng(2))
-    assert "weak" not in {finding.kind for finding in later(model, readings, pad, FEW)}
+    assert "weak" not in {finding.kind for finding in later(model, spoilt(pad, "weak"), pad, FEW)}
 
 
-def test_health_is_learnt_from_the_presses_that_were_not_held_back(
-    localizer: Localizer, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        learning, "fit_health_model", lambda readings, times_s, begun, lifted, **options: (begun, lifted)
-    )
+def test_presses_held_back_teach_no_health(localizer: Localizer, recording: Recording, monkeypatch) -> None:
+    monkeypatch.setattr(learning, "fit_health_model", lambda readings, times_s, *edges, **options: edges)
     learnt = np.setdiff1d(np.arange(len(recording.begun)), localizer.test)
     edges: dict[str, Any] = {**learning.learn_health(recording, localizer.test, localizer.provenance)}
     assert 0 < len(localizer.test) < len(learnt)
@@ -272,9 +219,7 @@ def test_health_is_learnt_from_the_presses_that_were_not_held_back(
         (1, LEARNT, 0.0, "false alarms a press are 0"),
     ],
 )
-def test_what_cannot_be_learnt_from_is_refused(
-    pad: Recording, scale: float, presses: int, false_alarms: float, message: str
-) -> None:
+def test_what_cannot_teach_is_refused(pad: Recording, scale: float, presses: int, false_alarms: float, message) -> None:
     edges, rng = (pad.begun[:presses], pad.lifted[:presses]), np.random.default_rng(0)
     with pytest.raises(InputError, match=message):
         fit_health_model(scale * pad.readings, pad.times_s, *edges, rng=rng, false_alarms=false_alarms)
@@ -292,8 +237,6 @@ def test_what_cannot_be_learnt_from_is_refused(
         ({"provenance": {"seed": "a"}}, "the seed of provenance is 'a'"),
     ],
 )
-def test_what_health_is_not_learnt_from_is_refused_in_one_line(
-    pad: Recording, change: dict[str, Any], message: str
-) -> None:
+def test_what_health_is_not_learnt_from_is_refused(pad: Recording, change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         learning.learn_health(**{"recording": pad, "held_back": (), "provenance": {"seed": 0}, **change})

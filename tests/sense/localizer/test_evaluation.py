@@ -19,16 +19,23 @@ def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0)
     return Found(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
 
 
-def test_a_row_of_errors_is_made_of_the_means_of_each_set_and_of_all_presses() -> None:
+def test_rows_of_errors_are_made_of_the_means_of_every_set_and_of_measures_that_are_known() -> None:
     row = error_row(2, [off_by(0, 1, 2, 3), off_by(1, 1, 1, 9, r50=1.5, r90=8.0)], PLACES)
     assert (row["lost"], row["subsets"]) == (2, 2)
     assert (row["mean_mm"], row["std_mm"], row["max_mm"]) == pytest.approx((2.25, 0.75, 3.0))
     assert row["median_mm"] == 1
     assert row["p95_mm"] == pytest.approx(3 + 0.65 * 6)
     assert (row["within_r50"], row["within_r90"]) == pytest.approx((5 / 8, 6 / 8))
+    found = replace(off_by(0, 0, 0, 0), measures={"depth_mm": Measured(np.array([1.0, 2, 3, 4]), np.full(4, 0.15))})
+    depths = np.array([1.1, 2.0, 3.3, np.nan])
+    row = error_row(0, [found], PLACES, {"depth_mm": depths, "force_n": depths})
+    assert row["depth_mean_mm"] == pytest.approx(0.4 / 3)
+    assert row["depth_within_r90"] == pytest.approx(2 / 3)
+    assert not [key for key in row if key.startswith("force")]
+    assert not [key for key in error_row(0, [found], PLACES) if key.startswith("depth")]
+    assert conformal([found], PLACES, {"depth_mm": depths})[3] == pytest.approx(0.3 / 0.15)
+    assert conformal([found], PLACES)[3] == 1
 
-
-def test_every_set_of_a_size_is_tried_and_told() -> None:
     def locate(lost: tuple[int, ...]) -> Found:
         return off_by(*[float(sum(lost))] * 4)
 
@@ -72,7 +79,8 @@ def test_radii_hold_what_they_say_on_average_also_of_few_presses_with_several_se
     assert 0.885 < most < 0.915 + 1 / presses
 
 
-def test_errors_by_place_are_those_of_a_fifth_of_either_side() -> None:
+def test_errors_by_place_are_those_of_a_fifth_and_a_fibre_is_idle_below_two_percent_of_its_range() -> None:
+    """Idle in five presses of 20 readings, of which fibre 1 moves by 0 to 1 V, fibre 2 by far less in one."""
     pressed = np.array([[0.0, 0.0], [1.9, 0.9], [2.1, 0.0], [10.0, 5.0], [9.9, 4.9]])
     found = pressed + np.array([[1, 0], [3, 0], [1.2, 1.6], [0, 0], [0, 4]])
     rows = by_place(found, pressed)
@@ -82,10 +90,6 @@ def test_errors_by_place_are_those_of_a_fifth_of_either_side() -> None:
     )
     (row,) = by_place(PLACES[:1] + 1, PLACES[:1])
     assert (row["x_mm"], row["y_mm"], row["presses"]) == (0.5, 0.5, 1)
-
-
-def test_a_fibre_is_idle_that_changes_by_less_than_two_percent_of_its_range() -> None:
-    """Five presses of 20 readings, of which the first fibre moves by 0 to 1 V and the second by far less in one."""
     steps = np.array([[0.0, 1.0], [0.015, -1.0], [0.025, 0.03], [1.0, 0.05], [0.5, 0.5]])
     readings = np.zeros((200, 2))
     begun, lifted = np.arange(5) * 40 + 15, np.arange(5) * 40 + 36
@@ -93,15 +97,3 @@ def test_a_fibre_is_idle_that_changes_by_less_than_two_percent_of_its_range() ->
         readings[down:up] = step
     recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), begun, lifted)
     np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])
-
-
-def test_errors_of_measures_are_told_of_presses_of_which_they_are_known() -> None:
-    found = replace(off_by(0, 0, 0, 0), measures={"depth_mm": Measured(np.array([1.0, 2, 3, 4]), np.full(4, 0.15))})
-    depths = np.array([1.1, 2.0, 3.3, np.nan])
-    row = error_row(0, [found], PLACES, {"depth_mm": depths, "force_n": depths})
-    assert row["depth_mean_mm"] == pytest.approx(0.4 / 3)
-    assert row["depth_within_r90"] == pytest.approx(2 / 3)
-    assert not [key for key in row if key.startswith("force")]
-    assert not [key for key in error_row(0, [found], PLACES) if key.startswith("depth")]
-    assert conformal([found], PLACES, {"depth_mm": depths})[3] == pytest.approx(0.3 / 0.15)
-    assert conformal([found], PLACES)[3] == 1

@@ -15,7 +15,7 @@ from design.common.errors import InputError
 from sense import Recording
 from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
 from sense.settings import LocalizerSettings as Options
-from tests.helpers.door import call
+from tests.helpers.door import called
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
 
@@ -54,7 +54,9 @@ def document(recording: Recording) -> dict[str, Any]:
     return learning_curve(recording, QUICK)
 
 
-def test_what_more_presses_would_bring_is_said(document: dict[str, Any]) -> None:
+def test_it_is_said_what_more_presses_would_bring(
+    document: dict[str, Any], recording: Recording, tmp_path: Path
+) -> None:
     assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
     ahead = document["forecast"]
     assert ahead["presses"] == 510
@@ -62,33 +64,20 @@ def test_what_more_presses_would_bring_is_said(document: dict[str, Any]) -> None
     assert "255 more presses" in document["advice"]
     assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
     json.dumps(document, allow_nan=False)
-
-
-def test_the_command_finds_the_same_and_writes_a_document_and_a_figure(
-    recording: Recording,
-    document: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     recording.save(tmp_path / "rec", {})
-    monkeypatch.chdir(tmp_path)
-    Path("pad.toml").write_text("[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\n")
-    ended = call("sense", "learning-curve", "rec", "--out", "out", "--json")
-    assert ended.code == 0
+    (tmp_path / "pad.toml").write_text("[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\n")
+    ended = called("sense", "learning-curve", "rec", "--out", "out", "--json", cwd=tmp_path)
     found = json.loads(ended.out)
-    assert found == json.loads(Path("out/learning_curve.json").read_text())
+    assert (ended.code, found) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))
     assert found | {"provenance": None} == json.loads(json.dumps(document)) | {"provenance": None}
-    assert Path("out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_curve_of_too_few_presses_is_one_line(recording: Recording) -> None:
+def test_a_curve_of_too_few_presses_is_refused_and_one_broken_off_ends_at_once(recording: Recording) -> None:
     places = recording.presses_mm.copy()
     places[100:] = np.nan
     with pytest.raises(InputError, match="85 presses to learn from, expected at least 160"):
         learning_curve(replace(recording, presses_mm=places), QUICK)
-
-
-def test_a_curve_that_is_broken_off_ends_at_once(recording: Recording) -> None:
     long, heard = QUICK.model_copy(update={"epochs": 1000}), []
 
     def interrupted(done: int, total: int) -> None:

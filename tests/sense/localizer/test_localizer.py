@@ -14,25 +14,21 @@ from sense.localizer.locating import write_places
 from sense.localizer.normalization import Scaled
 
 
-def test_a_masked_fibre_changes_nothing(localizer: Localizer, recording: Recording) -> None:
+def test_a_fibre_masked_or_without_readings_does_nothing(localizer: Localizer, recording: Recording) -> None:
     presses = localizer.inputs(recording)
     spoilt = presses.inputs.copy()
     spoilt[:, 1] = np.nan
     masked = localizer.locate(presses, [1])
     assert np.array_equal(localizer.locate(Scaled(spoilt, presses.alive), [1]).places_mm, masked.places_mm)
     assert not np.array_equal(masked.places_mm, localizer.locate(presses).places_mm)
-
-
-def test_a_fibre_that_gave_no_readings_is_as_good_as_masked(localizer: Localizer, recording: Recording) -> None:
     readings = np.array(recording.readings)
     readings[:, 1] = np.nan
     found = localizer.locate(localizer.inputs(replace(recording, readings=readings)))
-    expected = localizer.locate(localizer.inputs(recording), [1])
-    assert np.array_equal(found.places_mm, expected.places_mm)
-    assert np.array_equal(found.r90_mm, expected.r90_mm)
+    assert np.array_equal(found.places_mm, masked.places_mm)
+    assert np.array_equal(found.r90_mm, masked.r90_mm)
 
 
-def test_a_press_without_any_fibre_may_be_anywhere(localizer: Localizer, recording: Recording) -> None:
+def test_less_is_known_with_fibres_lost_and_nothing_without_any(localizer: Localizer, recording: Recording) -> None:
     readings = np.array(recording.readings)
     readings[recording.begun[7] - 15 : recording.lifted[7] + 25] = np.nan
     found = localizer.locate(localizer.inputs(replace(recording, readings=readings)))
@@ -40,22 +36,9 @@ def test_a_press_without_any_fibre_may_be_anywhere(localizer: Localizer, recordi
     assert found.r50_mm[7] < found.r90_mm[7]
     assert found.r50_mm[7] > 0.5 * localizer.normalization.span_mm
     assert np.isfinite(found.places_mm).all()
-
-
-def test_the_radii_of_a_press_anywhere_hold_what_they_say() -> None:
     far = np.hypot(*np.random.default_rng(0).uniform(-1, 1, (2, 200_000)))
     assert np.mean(far <= UNKNOWN[1]) == pytest.approx(0.5, abs=0.005)
     assert np.mean(far <= UNKNOWN[2]) == pytest.approx(0.9, abs=0.005)
-
-
-def test_a_press_is_located_alone_as_among_others(localizer: Localizer, recording: Recording) -> None:
-    presses = localizer.inputs(recording)
-    found = localizer.locate(presses)
-    assert np.allclose(localizer.locate(presses[17:18]).places_mm, found.places_mm[17:18], atol=1e-4)
-    assert localizer.locate(presses[:0]).places_mm.shape == (0, 2)
-
-
-def test_less_is_known_with_fibres_lost(localizer: Localizer, recording: Recording) -> None:
     presses = localizer.inputs(recording)
     means = [localizer.locate(presses, range(lost)).r90_mm.mean() for lost in range(4)]
     assert means[:2] == sorted(means)[:2]
@@ -63,6 +46,9 @@ def test_less_is_known_with_fibres_lost(localizer: Localizer, recording: Recordi
     found = localizer.locate(presses)
     assert (found.r50_mm < found.r90_mm).all()
     assert (found.sd_mm > 0).all()
+    # alone as among others
+    assert np.allclose(localizer.locate(presses[17:18]).places_mm, found.places_mm[17:18], atol=1e-4)
+    assert localizer.locate(presses[:0]).places_mm.shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -73,9 +59,7 @@ def test_less_is_known_with_fibres_lost(localizer: Localizer, recording: Recordi
         ([0, 1, 2, 3], "all 4 fibres"),
     ],
 )
-def test_masks_that_cannot_be_are_refused(
-    localizer: Localizer, recording: Recording, lost: list[Any], message: str
-) -> None:
+def test_bad_masks_are_refused(localizer: Localizer, recording: Recording, lost: list[Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         localizer.locate(localizer.inputs(recording), lost)
 
@@ -87,21 +71,16 @@ def test_what_are_no_inputs_of_its_presses_is_refused(localizer: Localizer, reco
         localizer.inputs(replace(recording, readings=recording.readings[:, :3]))
 
 
-@pytest.mark.parametrize(("ratio", "suits"), [(0.74, False), (0.76, True), (1.24, True), (1.26, False)])
-def test_a_recording_is_up_to_a_quarter_faster_or_slower(
-    localizer: Localizer, recording: Recording, ratio: float, suits: bool
-) -> None:
-    other = replace(recording, times_s=recording.times_s / ratio)
-    if suits:
-        assert np.isfinite(localizer.locate(localizer.inputs(other)).places_mm).all()
-    else:
+def test_a_recording_is_up_to_a_quarter_faster_or_slower(localizer: Localizer, recording: Recording) -> None:
+    for ratio in (0.76, 1.24):
+        presses = localizer.inputs(replace(recording, times_s=recording.times_s / ratio))
+        assert np.isfinite(localizer.locate(presses).places_mm).all()
+    for ratio in (0.74, 1.26):
         with pytest.raises(InputError, match="readings a second"):
-            localizer.inputs(other)
+            localizer.inputs(replace(recording, times_s=recording.times_s / ratio))
 
 
-def test_depth_and_force_come_with_widths_that_grow_as_fibres_are_lost(
-    deep_localizer: Localizer, deep_recording: Recording
-) -> None:
+def test_depth_and_force_come_with_widths_that_grow(deep_localizer: Localizer, deep_recording: Recording) -> None:
     presses = deep_localizer.inputs(deep_recording)
     whole, fewer = (deep_localizer.locate(presses, lost).measures for lost in ((), (1, 2)))
     assert list(whole) == ["depth_mm", "force_n"]
@@ -109,17 +88,9 @@ def test_depth_and_force_come_with_widths_that_grow_as_fibres_are_lost(
     np.testing.assert_allclose(whole["force_n"].values, 3 * whole["depth_mm"].values, atol=2)
     assert (whole["depth_mm"].r90 > 0).all()
     assert fewer["depth_mm"].r90.mean() > whole["depth_mm"].r90.mean()
-
-
-def test_a_press_without_any_fibre_may_be_of_any_depth(deep_localizer: Localizer, deep_recording: Recording) -> None:
-    presses = deep_localizer.inputs(deep_recording)
     depth = deep_localizer.locate(Scaled(presses.inputs, np.zeros_like(presses.alive))).measures["depth_mm"]
     assert depth.values == pytest.approx(2.75, abs=0.05)
     assert depth.r90 == pytest.approx(2.25, abs=0.05)
-
-
-def test_parts_are_joined_press_by_press(deep_localizer: Localizer, deep_recording: Recording) -> None:
-    presses = deep_localizer.inputs(deep_recording)
     found = joined([deep_localizer.locate(presses[:5]), deep_localizer.locate(presses[5:9])])
     expected = deep_localizer.locate(presses[:9])
     np.testing.assert_allclose(found.places_mm, expected.places_mm, atol=1e-3)

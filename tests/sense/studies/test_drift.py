@@ -13,16 +13,7 @@ from sense import Recording, open_recording
 from sense.recordings.simulation.published_protocol import simulate
 from sense.settings import RigSettings
 from sense.studies.drift import study as drift
-from sense.studies.drift.study import (
-    AS_PUBLISHED,
-    FILTERS,
-    RAW,
-    SCHEMES,
-    SLOW_PRESSES,
-    drift_study,
-    scheme_inputs,
-    values,
-)
+from sense.studies.drift.study import FILTERS, SCHEMES, SLOW_PRESSES, drift_study, scheme_inputs, values
 from sense.studies.study import Study, run
 
 PAD = Morphology.random(2, knots=3, seed=5)
@@ -44,15 +35,8 @@ def recorded() -> Recording:
 def begin(recording: Recording, presses: int) -> Recording:
     """The first presses of a recording."""
     end = int(recording.lifted[presses - 1])
-    return replace(
-        recording,
-        readings=recording.readings[:end],
-        times_s=recording.times_s[:end],
-        presses_mm=recording.presses_mm[:presses],
-        begun=recording.begun[:presses],
-        lifted=recording.lifted[:presses],
-        depths_mm=recording.depths_mm[:presses],
-    )
+    first = {name: getattr(recording, name)[:presses] for name in ("presses_mm", "begun", "lifted", "depths_mm")}
+    return replace(recording, readings=recording.readings[:end], times_s=recording.times_s[:end], **first)
 
 
 def small(recorded: Recording) -> Study:
@@ -77,15 +61,12 @@ def errors(document: dict[str, Any], label: str, scheme: str, key: str = "mean_m
     return [row[key] for row in document["rows"] if (row["recording"], row["compensate"]) == (label, scheme)]
 
 
-def test_values_are_the_readings_10_30_and_50_of_the_published_cycle() -> None:
+def test_values_are_the_readings_10_30_and_50_of_the_cycle_and_of_a_short_one_stay_within_their_phase() -> None:
     readings = np.column_stack([np.arange(40.0 * CYCLES), -np.arange(40.0 * CYCLES)])
     taken = values(readings, BEGUN, LIFTED)
     assert taken.shape == (CYCLES, 2, 3)
     np.testing.assert_array_equal(taken[1], [[50, 70, 90], [-50, -70, -90]])
     np.testing.assert_array_equal(taken[-1, 0], [170, 190, 199])  # nothing was read after the last press
-
-
-def test_values_of_a_short_cycle_stay_within_their_phase() -> None:
     begun, lifted = np.array([3, 9, 15]), np.array([6, 12, 18])
     np.testing.assert_array_equal(
         values(np.arange(20.0)[:, None], begun, lifted)[:, 0], [[0, 5, 8], [6, 11, 14], [12, 17, 19]]
@@ -110,7 +91,8 @@ def test_schemes_take_off_what_they_say() -> None:
 
 
 @pytest.mark.slow
-def test_every_filter_goes_with_every_scheme(document: dict[str, Any]) -> None:
+def test_a_study_of_drift(document: dict[str, Any]) -> None:
+    """Errors are means over filters: two networks on presses that scatter may be off by a fifth with one."""
     ways = [(row["recording"], row["kind"], row["denoise"], row["compensate"]) for row in document["rows"]]
     kinds = {"winding": "simulated", "square": "simulated", "real": "recorded"}
     assert ways == [(label, kind, name, each) for label, kind in kinds.items() for name in FILTERS for each in SCHEMES]
@@ -118,11 +100,6 @@ def test_every_filter_goes_with_every_scheme(document: dict[str, Any]) -> None:
         assert 0 < row["median_mm"] < row["p95_mm"]
         assert row["std_mm"] >= 0
         assert (row["seconds_per_10000"] is None) == (row["denoise"] == "none")
-
-
-@pytest.mark.slow
-def test_under_strong_drift_taking_the_rest_off_wins(document: dict[str, Any]) -> None:
-    """In the mean over filters: two networks of 8 neurons on presses that scatter may be off by a fifth with one."""
     for key in ("mean_mm", "mean_last_mm"):
         bare, rest, slow = (
             np.mean(errors(document, "winding", scheme, key))
@@ -130,18 +107,11 @@ def test_under_strong_drift_taking_the_rest_off_wins(document: dict[str, Any]) -
         )
         assert rest < 0.7 * bare
         assert slow < bare
-
-
-@pytest.mark.slow
-def test_without_drift_there_is_nothing_to_take_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drift, "FILTERS", {name: FILTERS[name] for name in (RAW, AS_PUBLISHED)})
-    still = STRONG.model_copy(update={"drift_mv": 0.0})
-    document = run(drift_study({"winding": PAD}, {}, rig=still, presses=240, hidden=10, epochs=30), tmp_path)
-    assert errors(document, "winding", "none")[1] < 1.3 * errors(document, "winding", "rest taken off")[1]
-
-
-@pytest.mark.slow
-def test_the_square_grid_is_idle_as_often_as_published(document: dict[str, Any]) -> None:
+    assert [each["recording"] for each in document["stretches"]] == ["winding", "square", "real"]
+    for stretch in document["stretches"]:
+        times_s, _, filtered = np.array(stretch["stretch"])
+        for time_s, volts in np.array(stretch["marks"]).reshape(-1, 2):
+            assert filtered[np.flatnonzero(times_s == time_s)] == pytest.approx([volts])
     shares = {(each["label"], each["kind"]): each["idle_percent"] for each in document["idle"]}
     assert shares["square", "contact model"] == pytest.approx(70, abs=1)
     # Fibre i, a straight line, is touched by presses within 0.6 of it, of those over 1..4.
@@ -156,36 +126,22 @@ def test_the_square_grid_is_idle_as_often_as_published(document: dict[str, Any])
 
 
 @pytest.mark.slow
-def test_the_figure_shows_values_on_the_filtered_readings(document: dict[str, Any]) -> None:
-    assert [each["recording"] for each in document["stretches"]] == ["winding", "square", "real"]
-    for stretch in document["stretches"]:
-        times_s, _, filtered = np.array(stretch["stretch"])
-        for time_s, volts in np.array(stretch["marks"]).reshape(-1, 2):
-            assert filtered[np.flatnonzero(times_s == time_s)] == pytest.approx([volts])
+def test_without_drift_there_is_nothing_to_take_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drift, "FILTERS", {name: FILTERS[name] for name in (drift.RAW, drift.AS_PUBLISHED)})
+    still = STRONG.model_copy(update={"drift_mv": 0.0})
+    document = run(drift_study({"winding": PAD}, {}, rig=still, presses=240, hidden=10, epochs=30), tmp_path)
+    assert errors(document, "winding", "none")[1] < 1.3 * errors(document, "winding", "rest taken off")[1]
 
 
-@pytest.mark.slow
-def test_a_study_names_the_best_of_each_recording(document: dict[str, Any]) -> None:
-    text = "\n".join(document["text"])
-    for label in ("winding", "square", "real"):
-        best = min(row["mean_mm"] for row in document["rows"] if row["recording"] == label)
-        assert f"{best:.2f} mm off" in text
-    for each in document["idle"]:
-        assert f"{each['idle_percent']:.1f} % ({each['label']}" in text
-
-
-def test_results_of_another_recording_are_no_help(recorded: Recording) -> None:
-    other = replace(recorded, readings=recorded.readings + 0.1)
-    assert small(recorded).settings["recordings"] != small(other).settings["recordings"]
-
-
-def test_what_cannot_be_studied_is_refused(recorded: Recording) -> None:
+def test_what_cannot_be_studied_is_refused_and_results_of_another_recording_are_no_help(recorded: Recording) -> None:
     with pytest.raises(InputError, match="neither a morphology nor a recording"):
         drift_study({}, {})
     with pytest.raises(InputError, match="a: both a morphology and a recording are called so"):
         drift_study({"a": PAD}, {"a": recorded})
     with pytest.raises(InputError, match="few: recording has 3 presses of known place"):
         drift_study({}, {"few": begin(recorded, 3)})
+    other = replace(recorded, readings=recorded.readings + 0.1)
+    assert small(recorded).settings["recordings"] != small(other).settings["recordings"]
 
 
 @pytest.mark.slow

@@ -19,46 +19,38 @@ def force(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 @pytest.mark.slow
-def test_depth_and_force_are_found_better_than_guessed(force: dict) -> None:
+def test_depth_and_force_are_found_better_than_guessed_and_noise_costs_accuracy(force: dict) -> None:
     for row in force["rows"]:
         assert 0 < row["depth_mm"] < 0.7 * row["depth_guessed_mm"]
         assert 0 < row["force_percent"] < 0.7 * row["force_guessed_percent"]
         assert row["depth_mm"] == pytest.approx(11.25 * row["depth_grid"])
         assert row["place_mm"] < 11.25 * 0.38  # the middle of the pad is that far off on average
         assert row["place_one_depth_mm"] < row["place_mm"]
-
-
-@pytest.mark.slow
-def test_noise_costs_accuracy(force: dict) -> None:
     for quiet, loud in zip(force["rows"][::2], force["rows"][1::2], strict=True):
         assert quiet["pad"] == loud["pad"]
         assert quiet["depth_mm"] < loud["depth_mm"]
         assert quiet["place_one_depth_mm"] < loud["place_one_depth_mm"]
-
-
-@pytest.mark.slow
-def test_rows_are_alike_and_the_force_is_that_of_the_depth(force: dict) -> None:
     assert len({tuple(row) for row in force["rows"]}) == 1
-    assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == [
-        (label, noise) for label in PADS for noise in (1.0, 30.0)
-    ]
+    expected = [(label, noise) for label in PADS for noise in (1.0, 30.0)]
+    assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == expected
     curve, row, press = force["curves"][0], force["rows"][0], Indenter()
     made, found = (press.force_n(np.array(curve[key]) / 11.25, 11.25) for key in ("pressed_mm", "found_mm"))
     assert np.abs(found - made).mean() == pytest.approx(row["force_n"], rel=1e-3)
     assert len(curve["place_mm"]) == len(curve["middles_mm"])
 
 
-def test_depths_an_indenter_does_not_allow_are_refused() -> None:
-    with pytest.raises(InputError, match=r"depth is 0\.9, allowed is 0 to the sphere's radius"):
-        force_study(PADS, depths=(0.1, 0.9))
-
-
-def test_readings_are_whole_counts_within_the_full_scale() -> None:
+def test_readings_are_whole_counts_footprints_have_one_area_and_depths_are_checked() -> None:
     signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 2.0, 0.0]])
     read = readings(signals, np.array([0.5, 1.0, 0.0]), 0.0, np.random.default_rng(0))
     np.testing.assert_array_equal(read, [[0, 2048, 0], [2048, COUNTS, 0], [COUNTS, COUNTS, 0]])
     noisy = readings(np.full((4000, 1), 0.5), np.ones(1), 4.0, np.random.default_rng(0))
     assert noisy.std() == pytest.approx(4, rel=0.1)
+    for sides in FOOTPRINTS.values():
+        radius = _circumradius(sides)
+        area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
+        assert area == pytest.approx(np.pi)
+    with pytest.raises(InputError, match=r"depth is 0\.9, allowed is 0 to the sphere's radius"):
+        force_study(PADS, depths=(0.1, 0.9))
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +71,3 @@ def test_shapes_are_named_better_than_by_chance(shapes: dict) -> None:
         assert row["worst"] in SETS[row["shapes"]]
         assert 0 < row["place_mm"] < 11.25 * 0.38
         assert 0 < row["place_shape_known_mm"] < 11.25 * 0.38
-
-
-def test_footprints_of_a_size_have_one_area() -> None:
-    for sides in FOOTPRINTS.values():
-        radius = _circumradius(sides)
-        area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
-        assert area == pytest.approx(np.pi)

@@ -27,7 +27,7 @@ def places() -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels(document: dict) -> None:
+def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels_and_are_counted(document: dict) -> None:
     rows = {(row["pad"], row["way"]): row for row in document["rows"]}
     assert list(rows) == [(label, way) for label in PADS for way in [*WAYS, COUNTED]]
     assert len({tuple(row) for row in document["rows"]}) == 1
@@ -42,10 +42,6 @@ def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels(docu
             assert row["error_mm"] == pytest.approx(pad.pitch_mm * row["error_grid"])
             assert row["error_mm"] < row["midpoint_named_mm"]
             assert row["error_by_labels_mm"] is None
-
-
-@pytest.mark.slow
-def test_the_error_by_distance_has_the_mean_of_the_table(document: dict) -> None:
     located = [row for row in document["rows"] if row["way"] != COUNTED]
     for row, curve in zip(located, document["curves"], strict=True):
         assert (row["pad"], row["way"]) == (curve["pad"], curve["way"])
@@ -55,10 +51,6 @@ def test_the_error_by_distance_has_the_mean_of_the_table(document: dict) -> None
         if row["told_apart_from_mm"] is not None:
             at = curve["apart_mm"].index(row["told_apart_from_mm"])
             assert np.all(np.array(curve["error_mm"]) < np.array(curve["apart_mm"]) / 4, where=np.arange(16) >= at)
-
-
-@pytest.mark.slow
-def test_contacts_are_counted_better_than_guessed(document: dict) -> None:
     counted = [row for row in document["rows"] if row["way"] == COUNTED]
     for row, each in zip(counted, document["confusions"], strict=True):
         counts = np.array(each["counts"])
@@ -69,13 +61,15 @@ def test_contacts_are_counted_better_than_guessed(document: dict) -> None:
         assert row["error_mm"] is None
 
 
-def test_the_error_does_not_depend_on_which_contact_is_named_first(places: np.ndarray) -> None:
+def test_errors_and_moments_do_not_depend_on_which_contact_is_named_first(places: np.ndarray) -> None:
     found = np.random.default_rng(2).uniform(1, 4, places.shape)
     off = unordered_distances(found, places)
     np.testing.assert_allclose(unordered_distances(found[:, ::-1], places), off)
     np.testing.assert_allclose(unordered_distances(found, places[:, ::-1]), off)
     as_named = [np.linalg.norm(each - places, axis=2).mean(axis=1) for each in (found, found[:, ::-1])]
     np.testing.assert_allclose(off, np.minimum(*as_named))
+    np.testing.assert_array_equal(moments(places), moments(places[:, ::-1]))
+    assert unordered_distances(pairs_of_moments(moments(places)), places).max() < 1e-7
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -88,8 +82,3 @@ def test_what_is_learnt_without_an_order_does_not_depend_on_it(way: str, places:
             for each in (places, turned)
         )
     assert np.allclose(found, again, atol=1e-6) == (way != LABELLED)
-
-
-def test_moments_hold_all_of_a_pair_but_its_order(places: np.ndarray) -> None:
-    np.testing.assert_array_equal(moments(places), moments(places[:, ::-1]))
-    assert unordered_distances(pairs_of_moments(moments(places)), places).max() < 1e-7

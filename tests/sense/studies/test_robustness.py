@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from design import Contact, Morphology
-from design.evaluation.localisation_error import localisation_error
 from sense.studies import robustness
 from sense.studies.pads import load_pads
 from sense.studies.robustness import robustness_study
@@ -41,8 +40,10 @@ def rows_of(document: dict, **wanted) -> list[dict]:
     return [row for row in document["rows"] if wanted.items() <= row.items()]
 
 
-def test_robustness_tells_the_errors_of_every_set_of_lost_fibres(studied: tuple[Path, dict]) -> None:
-    document = studied[1]
+def test_robustness_tells_the_errors_of_every_set_of_lost_fibres_and_its_files_say_the_same(
+    studied: tuple[Path, dict],
+) -> None:
+    folder, document = studied
     assert [(row["pad"], row["lost"], row["subsets"]) for row in document["rows"]] == [
         (pad, lost, sets) for pad in PADS for lost, sets in ((0, 1), (1, 4), (2, 6))
     ]
@@ -56,17 +57,13 @@ def test_robustness_tells_the_errors_of_every_set_of_lost_fibres(studied: tuple[
         assert [each["lost"] for each in document["maps"] if each["pad"] == pad][2] == worst["lost"]
     # A map of the square grid without both horizontal fibres: off by the height, which nothing tells any more.
     assert rows_of(document, pad="square", lost=2)[0]["max"] > 0.2
-
-
-@pytest.mark.slow
-def test_robustness_agrees_with_evaluate(tmp_path: Path) -> None:
-    pads = {"random": PADS["random"]}
-    document = run(robustness_study(pads, lost=2, hidden=10, presses=144, test=300, rule="exact"), tmp_path)
-    found = localisation_error(PADS["random"], lost=(2,), hidden=10, presses=144, test=300)
-    (row,) = rows_of(document, pad="random", lost=2)
-    # Each of the six sets is trained three times here, and once there.
-    for key in ("mean", "std", "max"):
-        assert getattr(found[0], key) == pytest.approx(row[key], rel=0.25)
+    assert json.loads((folder / "robustness.json").read_text()) == json.loads(json.dumps(document))
+    with (folder / "robustness.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["mean"]) for row in table] == [row["mean"] for row in document["rows"]]
+    text = (folder / "robustness.md").read_text()
+    assert all(paragraph in text for paragraph in document["text"])
+    assert f"{document['rows'][0]['mean']:.4g}" in text
 
 
 @pytest.mark.slow
@@ -78,17 +75,6 @@ def test_published_errors_are_reproduced(published: Path, tmp_path: Path, monkey
     document = run(robustness_study(pads, lost=1), tmp_path)
     for name, errors in expected.items():
         assert [row["mean"] for row in rows_of(document, pad=name)] == pytest.approx(errors, rel=0.15)
-
-
-def test_files_of_a_study_say_the_same(studied: tuple[Path, dict]) -> None:
-    folder, document = studied
-    assert json.loads((folder / "robustness.json").read_text()) == json.loads(json.dumps(document))
-    with (folder / "robustness.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert [float(row["mean"]) for row in table] == [row["mean"] for row in document["rows"]]
-    text = (folder / "robustness.md").read_text()
-    assert all(paragraph in text for paragraph in document["text"])
-    assert f"{document['rows'][0]['mean']:.4g}" in text
 
 
 @pytest.mark.slow
@@ -129,14 +115,13 @@ def test_any_name_of_a_file_will_do(tmp_path: Path) -> None:
         assert "<b>" not in table
 
 
-def test_a_pad_that_no_press_touches_is_studied_all_the_same(tmp_path: Path) -> None:
+def test_a_pad_that_no_press_touches_is_studied_and_maps_are_as_wide_as_what_is_pressed(
+    tmp_path: Path,
+) -> None:
+    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
     document = run(least(PADS, test=300, contact=Contact(radius=1e-6)), tmp_path)
     # Nothing is told, so the middle of the pad is the best guess: half a grid unit off each way at most.
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
-
-
-def test_maps_are_as_wide_and_high_as_what_is_pressed(tmp_path: Path) -> None:
-    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
     pad = Morphology.straight((3, 2), (8.0, 15.0))
     document = run(robustness_study({"tall": pad}, lost=0, hidden=4, presses=16, test=10), tmp_path)
     left, right, low, high = document["maps"][0]["extent"]

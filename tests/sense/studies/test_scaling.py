@@ -17,9 +17,7 @@ def rows_of(document: dict, **wanted) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_one_network_for_all_tiles_keeps_its_error_as_the_surface_grows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_network_for_all_tiles_keeps_its_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("TEST", 600), ("HIDDEN", 30), ("EPOCHS", 30)):
         monkeypatch.setattr(scaling, name, value)
     document = run(scaling_study({"square": Morphology.straight(2)}, grids=(4, 16), side=32), tmp_path)
@@ -29,12 +27,9 @@ def test_one_network_for_all_tiles_keeps_its_error_as_the_surface_grows(
     assert len(rows_of(document, way="published")) == len(rows_of(document, way="spread")) == 2
 
 
-def test_shares_of_a_family_add_up_and_silence_has_none() -> None:
+def test_shares_surroundings_and_presses_of_tiles() -> None:
     given = np.array([[1.0, 3.0, 0.0, 0.0], [0.0, 2.0, 5.0, 5.0]])
     np.testing.assert_allclose(shares(given), [[0.25, 0.75, 0, 0, 4, 0], [0, 1, 0.5, 0.5, 2, 10]])
-
-
-def test_what_is_around_a_press_is_the_same_in_every_tile() -> None:
     pad = Morphology.random(2, 3, 1).tiled(6)
     place = np.array([[5.2, 7.1]])
     here, origin = around(signals(pad, place), 2)
@@ -42,14 +37,8 @@ def test_what_is_around_a_press_is_the_same_in_every_tile() -> None:
     np.testing.assert_allclose(here, there, atol=1e-9)
     np.testing.assert_array_equal(moved - origin, [[2.0, -4.0]])
     assert here.shape == (1, 12)
-
-
-def test_presses_are_spread_over_all_cells() -> None:
     places = spread_presses(((1, 1), (9, 9)), 8, 0)
     assert set(map(tuple, np.floor(places - 1).astype(int))) == {(x, y) for x in range(8) for y in range(8)}
-
-
-def test_tiles_that_do_not_fill_a_grid_or_are_no_squares_are_refused() -> None:
     with pytest.raises(InputError, match="grids has 6, expected multiples of 4"):
         scaling_study({"square": Morphology.straight(4)}, grids=(4, 6))
     with pytest.raises(InputError, match=r"wide has 1 \+ 2 fibres, pitch 8 mm, expected tiles of M \+ M fibres"):
@@ -57,9 +46,7 @@ def test_tiles_that_do_not_fill_a_grid_or_are_no_squares_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_larger_object_is_located_better_and_a_strange_one_worse(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_larger_object_is_located_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("SIDE", 16), ("TEST", 300), ("MEMBERS", 2), ("HIDDEN", 15)):
         monkeypatch.setattr(sensitivity, name, value)
     document = run(sensitivity_study({"square": Morphology.straight(3)}, radii=(0.6, 1.0), sides=(4, 30)), tmp_path)

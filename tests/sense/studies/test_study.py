@@ -26,18 +26,14 @@ from sense.studies.multicontact.study import multicontact_study
 from sense.studies.pads import described, load_pads
 from sense.studies.robustness import robustness_study
 from sense.studies.study import Findings, Study, Task, run, study_lines
-from tests.helpers.door import call
+from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 LEAST: dict[str, Callable[[], Study]] = {
     "robustness": lambda: robustness_study(PADS, lost=1, hidden=4, presses=16, test=20),
     "drift": lambda: drift.drift_study(
-        {"random": PADS["random"]},
-        {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))},
-        rig=RigSettings(drift_mv=300),
-        presses=40,
-        hidden=4,
-        epochs=2,
+        *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
+        **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},
     ),
     "force": lambda: force_study(PADS, noise_counts=(1.0,), learning=Learning(60, 40, hidden=4, epochs=3)),
     "shape": lambda: shape_study(PADS, presses=100, test=60, hidden=4, epochs=3),
@@ -53,9 +49,7 @@ def stop(done: int, total: int, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LEAST)
-def test_a_study_broken_off_goes_on_ends_the_same_and_is_told(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_study_broken_off_ends_the_same(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drift, "MEMBERS", 2)
     monkeypatch.setattr(drift, "FILTERS", {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)})
     for module in (scaling, sensitivity):
@@ -91,15 +85,9 @@ def one(name: str = "x", seed: int = 0, make: Callable[[], dict] = lambda: {"a":
     return Study(name, "X", {"seed": seed}, [Task("a", make)] * tasks, conclude, lambda document: Figure())
 
 
-def test_other_settings_or_tasks_are_no_help_to_a_study_broken_off(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        run(one(tasks=3), tmp_path, jobs=1, progress=stop)
-    for other, said in ((one(seed=1, tasks=3), "begun with x seed 0, now 1"), (one(tasks=4), "begun with x tasks")):
-        with pytest.raises(InputError, match=said):
-            run(other, tmp_path, resume=True)
-
-
-def test_a_folder_in_which_the_same_study_is_at_work_is_refused(tmp_path: Path) -> None:
+def test_a_folder_in_which_a_study_is_at_work_or_one_of_other_settings_was_broken_off_is_refused(
+    tmp_path: Path,
+) -> None:
     def meet() -> dict:
         with pytest.raises(InputError, match="a x study is at work there"):
             run(one(), tmp_path)
@@ -107,6 +95,11 @@ def test_a_folder_in_which_the_same_study_is_at_work_is_refused(tmp_path: Path) 
 
     run(one(make=meet), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
+    with pytest.raises(KeyboardInterrupt):
+        run(one(tasks=3), tmp_path, jobs=1, progress=stop)
+    for other, said in ((one(seed=1, tasks=3), "begun with x seed 0, now 1"), (one(tasks=4), "begun with x tasks")):
+        with pytest.raises(InputError, match=said):
+            run(other, tmp_path, resume=True)
 
 
 def test_a_lock_that_goes_while_it_is_taken_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,14 +157,8 @@ def test_a_lock_that_is_no_file_is_neither_waited_for_nor_followed(tmp_path: Pat
         (["scaling", "square@3", "--grids", "4"], "grids has 4, expected multiples of 3"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(
-    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    ended = call("study", *arguments, "--out", "out")
-    assert (ended.code, len(ended.err.splitlines())) == (2, 1)
-    assert said in ended.err
-    assert not list(tmp_path.iterdir())
+def test_mistakes_are_one_line_and_leave_nothing(arguments: list[str], said: str, tmp_path: Path) -> None:
+    assert said in refused("study", *arguments, "--out", "out", cwd=tmp_path)
 
 
 @pytest.mark.slow
@@ -200,7 +187,7 @@ def test_an_interrupt_ends_at_once_and_keeps_what_was_finished(tmp_path: Path) -
     assert list(out.glob("robustness-unfinished/start_*.npz"))
 
 
-def test_pads_are_told_by_file_or_by_name(tmp_path: Path) -> None:
+def test_pads_are_told_by_file_or_by_name_and_described(tmp_path: Path) -> None:
     winding = Morphology.random(2, 3, 0)
     path = tmp_path / "mine" / "morphology.json"
     path.parent.mkdir()
@@ -215,6 +202,9 @@ def test_pads_are_told_by_file_or_by_name(tmp_path: Path) -> None:
         winding.save(path)
     # no label is a formula of a spreadsheet
     assert list(load_pads([str(path) for path in paths], seed=0)) == ["x", "1+1", "mine"]
+    told = described({"square": Morphology.straight(2), "wide": Morphology.straight((1, 3), (8.0, 15.0))})
+    assert (told["square"]["grid"], told["square"]["pitch_mm"]) == (2, 11.25)
+    assert (told["wide"]["fibres"], told["wide"]["pitch_mm"]) == ([1, 3], (8.0, 15.0))
 
 
 def test_pads_are_searched_for_with_so_many_knots_by_either_method(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,9 +223,3 @@ def test_pads_are_searched_for_with_so_many_knots_by_either_method(monkeypatch: 
     for name in ("genetic", "optimised-0", "square-5"):
         with pytest.raises(InputError, match="none of square, optimised, random-N, optimised-N, genetic-N"):
             load_pads((name,), seed=0)
-
-
-def test_what_is_said_of_a_square_pad_has_its_grid_and_of_another_one_its_fibres() -> None:
-    told = described({"square": Morphology.straight(2), "wide": Morphology.straight((1, 3), (8.0, 15.0))})
-    assert (told["square"]["grid"], told["square"]["pitch_mm"]) == (2, 11.25)
-    assert (told["wide"]["fibres"], told["wide"]["pitch_mm"]) == ([1, 3], (8.0, 15.0))

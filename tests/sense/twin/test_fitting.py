@@ -28,14 +28,11 @@ def fitted(start, answers):
     return fit(fit(start, answers, Freedom()).pad, answers, FREE)
 
 
-def test_a_fit_explains_presses_it_has_not_seen(printed, start, fitted):
+def test_a_fit_explains_fresh_presses_and_is_nearer_to_the_truth_than_the_plan_is(printed, start, fitted, answers):
     fresh = responses_of(printed, 300, seed=1)
     explained = fresh.explained(fitted.pad.predict(fresh.places_mm))
     assert explained.min() > 0.97
     assert explained.mean() > fresh.explained(fit(start, fresh, Freedom()).pad.predict(fresh.places_mm)).mean()
-
-
-def test_fibres_are_found_nearer_to_where_they_lie_than_the_plan_is(printed, fitted):
     off, planned = [], []
     for channel, fibre in enumerate(fitted.pad.fibres):
         plan = fitted.pad.plan
@@ -45,19 +42,14 @@ def test_fibres_are_found_nearer_to_where_they_lie_than_the_plan_is(printed, fit
         off.append(((fitted.pad.course(channel)[0] - true) * across).sum(axis=1)[inside])
         planned.append(((plan.course[fibre] - true) * across).sum(axis=1)[inside])
     assert np.std(np.concatenate(off)) < 0.7 * np.std(np.concatenate(planned))
-
-
-def test_where_nothing_may_differ_nothing_does(start, answers):
     pad = fit(start, answers, Freedom()).pad
     assert not pad.own[:, AWAY].any()
     assert not pad.own[:, COUNTS].any()
     assert not pad.weights(np.linspace(0, 1, 9))[1].any()
-
-
-def test_caution_keeps_fibres_nearer_to_their_plan_and_is_less_sure(answers, fitted):
     cautious = fit(fitted.pad, answers, FREE, caution=20.0)
     assert np.square(cautious.pad.own[:, AWAY]).sum() < np.square(fitted.pad.own[:, AWAY]).sum()
     assert cautious.unsure(0).mean() > fitted.unsure(0).mean()
+    assert response_scatter(start, responses_of(printed, 20), np.ones(len(start.fibres))).share == 0.0
 
 
 @pytest.mark.slow
@@ -85,25 +77,18 @@ def test_share_common_and_floor_of_the_scatter_are_found(printed, fitted, share,
         assert found.common == pytest.approx(common, abs=0.15)
 
 
-def test_too_few_presses_tell_nothing_that_grows(printed, start) -> None:
-    assert response_scatter(start, responses_of(printed, 20), np.ones(len(start.fibres))).share == 0.0
-
-
 PLACES = np.random.default_rng(0).uniform(-20, 20, (500, 2))
 NOISE = np.random.default_rng(1).standard_normal((500, 2))
 FUNCTION = 3 * np.sin(PLACES[:, 0] / 9) + np.cos(PLACES[:, 1] / 7)
 
 
-def test_noise_is_told_from_a_function_of_place():
+def test_noise_is_told_from_a_function_of_place_and_what_is_missing_does_not_count():
     found = smooth_function(
         Responses(PLACES, np.column_stack([FUNCTION + 0.2 * NOISE[:, 0], NOISE[:, 1]]), np.ones((500, 2), bool)), 10
     )
     assert found.noise == pytest.approx([0.2, 1.0], rel=0.12)
     assert found.certainty[0] > 100
     assert found.certainty[1] < 5
-
-
-def test_what_is_missing_does_not_count():
     there = np.ones((500, 2), bool)
     there[::2, 0] = False
     there[:, 1] = np.arange(500) < 9

@@ -1,7 +1,10 @@
 """Identification of pads whose truth is known, and of recordings that tell nothing."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -21,24 +24,22 @@ from sense.twin.identified_pad import Identification
 from .conftest import PLAN
 
 
-@pytest.fixture
-def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two wirings are fitted, of six that are refined; pads that are asked for in full have 8 of 24."""
-    monkeypatch.setattr(identification, "TRIED", 2)
-    monkeypatch.setattr(wiring, "REFINED", 6)
-
-
 @pytest.fixture(scope="module")
 def recording(printed: Twin) -> Recording:
     return simulate(printed, RigSettings(presses=300, seed=3))
 
 
+@contextmanager
+def few_tries() -> Iterator[None]:
+    """Two wirings are fitted, of six that are refined; pads that are asked for in full have 8 of 24."""
+    with patch.object(identification, "TRIED", 2), patch.object(wiring, "REFINED", 6):
+        yield
+
+
 @pytest.fixture(scope="module")
+@few_tries()
 def found(recording: Recording) -> Identification:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(identification, "TRIED", 2)
-        patched.setattr(wiring, "REFINED", 6)
-        return identify(recording, PLAN, seed=1)
+    return identify(recording, PLAN, seed=1)
 
 
 def require_printed(found: Identification, printed: Twin) -> None:
@@ -56,25 +57,14 @@ def require_printed(found: Identification, printed: Twin) -> None:
     assert not found.doubts
 
 
-def test_wiring_frame_and_reach_are_found(printed: Twin, found: Identification) -> None:
+def test_the_pad_is_found_and_its_twin_answers_as_was_measured(printed: Twin, found: Identification) -> None:
     require_printed(found, printed)
-
-
-@pytest.mark.slow
-def test_wiring_frame_and_reach_are_found_among_all_that_are_tried(printed: Twin) -> None:
-    require_printed(identify(simulate(printed, RigSettings(presses=500, seed=3)), PLAN, seed=1), printed)
-
-
-def test_gains_and_noise_are_those_of_the_pad(printed: Twin, found: Identification) -> None:
     for channel, true in zip(found.twin().channels, printed.channels, strict=True):
         if true.fibre is not None:
             assert channel.gain_v == pytest.approx(true.gain_v, rel=0.25)
             # 255 presses know it within 9 %, and the pad that is fitted takes up some 5 % of it; what the rest drifts
             # within a press comes on top
             assert 0.8 * true.noise_v < channel.noise_v < 3 * true.noise_v
-
-
-def test_the_twin_answers_as_was_measured(found: Identification) -> None:
     twin, presses = found.twin(), found.held_out
     signals = twin.laid_stretch(presses.places_mm)
     columns = [(twin.channels[channel].gain_v, twin.channels[channel].fibre) for channel in found.live]
@@ -83,7 +73,12 @@ def test_the_twin_answers_as_was_measured(found: Identification) -> None:
     assert told == pytest.approx(fitted, abs=0.05 * np.abs(fitted).max())
 
 
-@pytest.mark.usefixtures("few_tries")
+@pytest.mark.slow
+def test_wiring_frame_and_reach_are_found_among_all_that_are_tried(printed: Twin) -> None:
+    require_printed(identify(simulate(printed, RigSettings(presses=500, seed=3)), PLAN, seed=1), printed)
+
+
+@few_tries()
 def test_what_a_symmetric_pad_cannot_tell_is_a_doubt_and_always_the_same() -> None:
     pad = Morphology.straight(2)
     printed = printed_pad(pad, np.random.default_rng(0), laid_mm=0.2, dead=0)
@@ -95,16 +90,15 @@ def test_what_a_symmetric_pad_cannot_tell_is_a_doubt_and_always_the_same() -> No
     assert abs(found.fit.pad.frame.turn_deg) < 20  # of all that are as good, the least turned
 
 
-@pytest.mark.usefixtures("few_tries")
+@few_tries()
 def test_channels_that_are_missing_are_said_to_read_nothing(recording: Recording, printed: Twin) -> None:
     live = next(channel.channel for channel in printed.channels if channel.fibre is not None)
     readings = recording.readings.copy()
     readings[:, live] = np.nan
     found = identify(replace(recording, readings=readings), PLAN).twin()
     assert found.channels[live].fibre is None
-    assert [c.fibre for c in found.channels if c.channel != live] == [
-        c.fibre for c in printed.channels if c.channel != live
-    ]
+    others, expected = ([c.fibre for c in twin.channels if c.channel != live] for twin in (found, printed))
+    assert others == expected
 
 
 def of_59(one: Recording) -> dict[str, np.ndarray]:
@@ -129,38 +123,26 @@ def test_recordings_that_tell_nothing_are_refused(recording: Recording, spoil, p
         identify(replace(recording, **spoil(recording)), pad)
 
 
-TOLD = {
-    "presses": 10,
-    "channels": [],
-    "explained": 0.9,
-    "explained_on_plan": 0.8,
-    "noise": 0.01,
-    "doubts": 0,
-    "explained_by_straight": None,
-}
+TOLD = {"presses": 10, "channels": [], "explained": 0.9, "explained_on_plan": 0.8, "noise": 0.01, "doubts": 0}
 
 
-@pytest.mark.parametrize(
-    ("found", "told", "side"),
-    [
-        (False, None, "as planned"),
-        (True, None, "turned over"),
-        (True, False, "turned over"),
-        (False, True, "turned over, as [rig] mirrored says"),
-        (True, True, "as planned, which [rig] mirrored denies"),
-    ],
-)
-def test_how_the_pad_lay_counts_what_rig_had_said_of_it(found: bool, told: bool | None, side: str) -> None:
+def test_how_the_pad_lay_counts_what_rig_had_said_of_it() -> None:
     """A mirrored rig has taken places to the plan already: its twin is mirrored only where that was wrong."""
-    frame = {"mirrored": found, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
-    document = TOLD | {"frame": frame} | ({} if told is None else {"rig_mirrored": told})
-    assert f"laid {side}, turned 0.0 degrees, shifted 0.0, 0.0 mm, scale 1.000" in identification_lines(
-        document, Path()
-    )
+    said = {(False, None): "as planned", (True, None): "turned over", (True, False): "turned over"}
+    said |= {(False, True): "turned over, as [rig] mirrored", (True, True): "as planned, which [rig] mirrored denies"}
+    for (found, told), side in said.items():
+        frame = {"mirrored": found, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
+        document = (
+            TOLD
+            | {"frame": frame, "explained_by_straight": None}
+            | ({"rig_mirrored": told} if told is not None else {})
+        )
+        (line,) = (line for line in identification_lines(document, Path()) if line.strip().startswith("laid "))
+        assert line.strip().startswith(f"laid {side}")
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_tries")
+@few_tries()
 def test_a_rectangle_is_identified_whichever_way_it_lay() -> None:
     """Turned by a quarter, presses span its height where its width was planned."""
     plan = Morphology.random((1, 2), 3, 3, (8.0, 12.0))

@@ -22,7 +22,7 @@ def pad() -> LaidPad:
     return replace(laid, values=laid.values + 0.03 * np.random.default_rng(0).standard_normal(laid.values.size))
 
 
-def test_derivatives_are_those_of_the_prediction(pad):
+def test_derivatives_and_steepness_are_those_of_the_prediction(pad):
     rates = pad.parts(PLACES)[1]
     for at in range(len(pad.values)):
         step = np.zeros(len(pad.values))
@@ -33,24 +33,23 @@ def test_derivatives_are_those_of_the_prediction(pad):
             columns = np.concatenate([np.arange(SHARED), own_values(channel)])
             found = rates[channel][:, columns == at].sum(axis=1)
             assert slope[:, channel] == pytest.approx(found, abs=1e-6)
-
-
-def test_steepness_is_how_far_volts_change_with_the_place(pad):
     far, mm = np.zeros((40, 3)), 1e-3
     for step in mm * np.eye(2):
         far += ((pad.predict(PLACES + step) - pad.predict(PLACES)) / mm) ** 2
     assert pad.steepness(PLACES) == pytest.approx(far.mean(axis=0), rel=0.05)
 
 
-def test_the_reach_is_1_at_its_largest_whatever_was_fitted(pad):
+def test_reach_gains_rests_and_frame_take_what_is_theirs(pad):
     scaled = pad.values.copy()
     scaled[4:SHARED] *= 3
     moved = pad.at(scaled)
     assert np.abs(moved.weights(np.linspace(0, moved.end, 101))[0]).max() == pytest.approx(1)
     assert moved.predict(PLACES) == pytest.approx(replace(pad, values=scaled).predict(PLACES))
-
-
-def test_what_all_fibres_share_of_their_way_is_the_frames(pad):
+    own = pad.own[:, :2].copy()
+    answers = Responses(PLACES, pad.predict(PLACES), np.ones((40, 3), bool))
+    other = pad.values.copy()
+    other[SHARED:].reshape(-1, OWN)[:, :2] = [1.0, 0.0]
+    assert replace(pad, values=other).with_gains(answers).own[:, :2] == pytest.approx(own)
     shared = pad.values.copy()
     rows = shared[SHARED:].reshape(-1, OWN)
     rows[:, AWAY] = np.repeat([0.2, -0.1], ASIDE)
@@ -61,14 +60,6 @@ def test_what_all_fibres_share_of_their_way_is_the_frames(pad):
     assert turned.predict(PLACES) == pytest.approx(pad.predict(PLACES), abs=0.02 * np.ptp(pad.predict(PLACES)))
     assert settled.predict(PLACES) == pytest.approx(off.predict(PLACES), abs=1e-9)
     assert settled.frame.shift_mm == pytest.approx([1.0 - 0.2 * PLAN.unit_mm, -2.0 + 0.1 * PLAN.unit_mm], abs=0.5)
-
-
-def test_gains_and_rests_are_those_of_the_answers(pad):
-    own = pad.own[:, :2].copy()
-    answers = Responses(PLACES, pad.predict(PLACES), np.ones((40, 3), bool))
-    other = pad.values.copy()
-    other[SHARED:].reshape(-1, OWN)[:, :2] = [1.0, 0.0]
-    assert replace(pad, values=other).with_gains(answers).own[:, :2] == pytest.approx(own)
 
 
 @pytest.fixture
@@ -89,13 +80,10 @@ def case() -> dict[str, np.ndarray]:
     }
 
 
-def test_a_fibre_that_is_moved_as_a_whole_answers_as_the_press_moved_back(case):
+def test_a_fibre_answers_as_it_is_moved_as_long_as_it_is_and_not_beyond_its_reach(case):
     moved = {**case, "aside": np.tile([[0.3], [-0.2]], J)}
     back = {**case, "aside": np.zeros((2, J)), "places": case["places"] - [0.3, -0.2]}
     assert channel_response(**moved, step=STEP)[0] == pytest.approx(channel_response(**back, step=STEP)[0], abs=1e-12)
-
-
-def test_a_fibre_that_is_laid_longer_counts_for_its_length(case):
     straight = {**case, "course": np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])}
     straight |= {"tangent": np.tile([1.0, 0.0], (F, 1)), "length": np.full(F, 1 / F), "sensitivity": np.zeros((1, J))}
     straight |= {"profile": np.ones((2, K)) * [[1.0], [0.0]], "places": np.array([[0.5, 0.0]])}
@@ -104,15 +92,9 @@ def test_a_fibre_that_is_laid_longer_counts_for_its_length(case):
     # within one step of the press all splines of weight 1 add up to 1, so the signal is the length
     assert channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
     assert channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
-
-
-def test_nothing_is_felt_beyond_the_end_of_the_reach(case):
     far = {**case, "places": np.array([[2.0, 0.4 + 0.5 + (K + 1) * STEP]])}
     far["aside"] = np.zeros((2, J))
     assert not any(np.any(part) for part in channel_response(**far, step=STEP))
-
-
-def test_a_curve_along_a_fibre_can_be_constant_and_changes_as_it_says():
     (value, change), _, _ = along_fibre(np.array([np.full(J, 2.0), np.arange(J, dtype=float)]), F)
     assert value[0] == pytest.approx(2.0)
     assert change[0] == pytest.approx(0.0, abs=1e-12)
