@@ -12,8 +12,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-# a worker a core leaves nothing for the threads that numpy would take besides; to be said before it is imported
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# a worker a core leaves nothing for the threads that numpy and torch would take besides; said before they are imported
+for library in ("OMP", "OPENBLAS"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # as padforge has it, also where tests load onnxruntime first
 
 # a shell has what runs behind it ignore Ctrl-C, and programs that tests start would inherit that: they never ended
@@ -57,7 +58,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """The tests of a file go to one worker, which makes what they share; a test may be marked for another group."""
     for item in items if config.pluginmanager.hasplugin("xdist") else ():
         if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+            item.add_marker(pytest.mark.xdist_group(f"{item.path.parent.name}/{item.path.stem}"))
 
 
 @pytest.fixture(scope="session")

@@ -36,7 +36,7 @@ EXTRAS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Factors on predicted spreads, and what is added to them, among which the likeliest is chosen."""
 LEAST_SCALE = 1e-3
 """Least spread of what is new in a rest: where nothing is, nothing is divided by it."""
-_MEDIAN_T = 0.7267
+MEDIAN_T = 0.7267
 _FAR_T = 6.869
 """Median, and what one in a thousand lies beyond, of the absolute value of Student's t with `FREEDOM` degrees."""
 
@@ -83,7 +83,7 @@ class FaultLikelihoods:
         honest = np.hypot(spread * scale, extra)
         rest = ((targets - mean) / honest)[:, :, -1]
         persistence = np.clip([(rest[1:] * rest[:-1]).mean() / (rest**2).mean()], 0.0, 0.95)
-        new = np.array([np.median(np.abs(rest[1:] - persistence * rest[:-1])) / _MEDIAN_T])
+        new = np.array([np.median(np.abs(rest[1:] - persistence * rest[:-1])) / MEDIAN_T])
         library = rng.choice(len(traces), LIBRARY)
         return cls(
             scale=scale,
@@ -95,7 +95,7 @@ class FaultLikelihoods:
             noise_centre=centre,
             noise_spread=np.maximum(np.median(np.abs(logs - centre), axis=0) / 0.6745, 0.1),
             constant=(_constant(traces).sum(axis=0) + 1) / (len(traces) + 2),
-            filters=_step_filters(traces, usual),
+            filters=step_filters(traces, usual),
             persistence=persistence,
             innovation=np.maximum(new, LEAST_SCALE),
         )
@@ -201,7 +201,7 @@ def _constant(traces: Array) -> Mask:
     return np.ptp(traces, axis=-1) == 0
 
 
-def _step_filters(traces: Array, noise: Array) -> Array:
+def step_filters(traces: Array, noise: Array) -> Array:
     """Filters that answer 1 to the spread of a healthy trace and most to a step: step' S^-1 / sqrt(step' S^-1 step).
 
     S is the second moment of healthy answers (D. O. North, 1943). What lies out further, where the probe touches, is

@@ -130,24 +130,24 @@ def _laid(plan: Plan, aside: float, rng: np.random.Generator) -> list[Array]:
 
 
 @cache
-def _pad(world: str) -> Twin:
+def printed(world: str) -> Twin:
     reach, laid_mm, dead = WORLDS[world]
     plan = Morphology.random(GRID, knots=KNOTS, seed=0)
     return printed_pad(plan, np.random.default_rng(0), reach=reach, laid_mm=laid_mm, dead=dead)
 
 
 @cache
-def _recording(world: str, presses: int) -> Recording:
-    return simulate(_pad(world), RigSettings(presses=presses, seed=presses))
+def recorded(world: str, presses: int) -> Recording:
+    return simulate(printed(world), RigSettings(presses=presses, seed=presses))
 
 
 def _identified(world: str, presses: int) -> Identification:
-    return identify(_recording(world, presses), _pad(world).morphology)
+    return identify(recorded(world, presses), printed(world).morphology)
 
 
 def _believed(world: str, presses: int) -> Predict:
     """The plan as it is, its gains fitted."""
-    pad, recording = _pad(world), _recording(world, presses)
+    pad, recording = printed(world), recorded(world, presses)
     fibres = [channel.fibre for channel in pad.channels]
     answers = responses(recording, np.ones(presses, bool))
 
@@ -173,7 +173,7 @@ def _believed(world: str, presses: int) -> Predict:
 
 def _smoothed(world: str, presses: int) -> Predict:
     """Ridge regression on bumps over the pad, as the localizer's model of responses has it."""
-    pad, recording = _pad(world), _recording(world, presses)
+    pad, recording = printed(world), recorded(world, presses)
     answers = responses(recording, np.ones(presses, bool))
     half_mm = max(pad.sensed_mm) / 2
     known = bumps(answers.places_mm / half_mm)
@@ -184,7 +184,7 @@ def _smoothed(world: str, presses: int) -> Predict:
 
 def _judged(world: str, found: Identification | Predict) -> Mapping[str, float | None]:
     """Error of responses at fresh places, share of their spread; and of an identification what else it found."""
-    pad = _pad(world)
+    pad = printed(world)
     places_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (FRESH, 2)) * pad.sensed_mm
     signals_there, live = pad.laid_stretch(places_mm), [c for c in pad.channels if c.fibre is not None]
     true = np.column_stack([channel.gain_v * signals_there[:, channel.fibre] for channel in live])

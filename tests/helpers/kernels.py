@@ -45,7 +45,6 @@ def design_kernels() -> None:
         check_rules,
         indented_signals,
         published_objective,
-        score,
         search,
         signals,
         signals_quantized,
@@ -72,7 +71,6 @@ def design_kernels() -> None:
     indented_signals(pad, presses, 0.1, Indenter())
     check_rules(pad, RulesSettings())
     for contact in (Contact(), PUBLISHED_CONTACT):
-        score(pad, contact, lost=1)
         search(PadSettings(grid=1), contact, SearchSettings(knots=1, starts=1, steps=2, lost=1))
     with tempfile.TemporaryDirectory() as folder:
         build(Morphology.straight(1), folder, ["stl"])

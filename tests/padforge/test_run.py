@@ -105,7 +105,7 @@ def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.Monke
         ("epochs = 4", "epochs = 5", (), "fibres, mould, recording, contacts", set()),
         ("presses = 80", "presses = 90", (), "fibres, mould, contacts", {"recording"}),
         ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "fibres, recording, contacts, calibration", {"mould.stl"}),
-        ("", "", ("--seed", "1"), "", {"recording"}),
+        pytest.param("", "", ("--seed", "1"), "", {"recording"}, marks=pytest.mark.slow),
     ],
 )
 def test_what_was_made_of_other_settings_is_made_anew(
@@ -127,6 +127,7 @@ def test_a_file_that_is_gone_or_another_one_is_made_anew(folder: Path) -> None:
     assert digests(folder) == before
 
 
+@pytest.mark.slow
 def test_a_broken_off_calibration_is_all_that_is_done_again(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +140,7 @@ def test_a_broken_off_calibration_is_all_that_is_done_again(
     assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_from_its_states(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +166,7 @@ def test_a_search_goes_on_from_its_states(
     assert not (tmp_path / "out" / "pad" / "search").exists()
 
 
+@pytest.mark.slow
 def test_fibres_of_another_search_are_not_kept(folder: Path) -> None:
     """One that was made in the folder meanwhile, with other settings than the run has."""
     before = digests(folder)
@@ -201,7 +204,10 @@ def test_an_interrupted_run_keeps_the_recording_of_the_one_before(folder: Path) 
 
 @pytest.mark.parametrize(
     ("wrong", "said"),
-    [("[rules]\nmin_gap_mm = 30\n", "min_gap_mm"), ("[printer]\nbed_mm = [30, 30, 30]\n", "bed")],
+    [
+        pytest.param("[rules]\nmin_gap_mm = 30\n", "min_gap_mm", marks=pytest.mark.slow),
+        ("[printer]\nbed_mm = [30, 30, 30]\n", "bed"),
+    ],
 )
 def test_a_run_that_breaks_a_rule_or_a_check_ends_in_exit_1(folder: Path, wrong: str, said: str) -> None:
     (folder / "pad.toml").write_text(SMALL + wrong)

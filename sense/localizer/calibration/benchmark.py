@@ -49,13 +49,13 @@ def trials() -> Iterator[BenchTrial]:
 
 
 @cache
-def _recording() -> Recording:
+def recorded() -> Recording:
     return simulate(Morphology.random(3, knots=5, seed=0), settings.RigSettings(presses=PRESSES, seed=0))
 
 
 def _trainings(features: str) -> Iterator[BenchTrial]:
     scaling, table, inputs, targets = _scaled(features)
-    places_mm = _recording().presses_mm[-TEST:]
+    places_mm = recorded().presses_mm[-TEST:]
     flat = inputs.reshape(len(inputs), -1).astype(np.float64)
     x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
 
@@ -166,7 +166,7 @@ def _predictions() -> Iterator[BenchTrial]:
 
 def _scaled(features: str) -> tuple[Normalization, Floats, Floats, Floats]:
     """Scaling and table of the presses to learn from, and inputs and targets of all."""
-    recording = _recording()
+    recording = recorded()
     raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
     scaling, table = Normalization.fit(raw[:-TEST], recording.presses_mm[:-TEST])
     return scaling, table, scaling.inputs(raw).inputs, scaling.targets(recording.presses_mm)

@@ -152,11 +152,11 @@ def learn(
     levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
     presses, places_mm = scaling.inputs(raw[proving]), recording.presses_mm[proving]
     if observer is not None:
-        localizer = _proven(localizer, presses, places_mm, levels)
+        localizer = proven(localizer, presses, places_mm, levels)
     return replace(localizer, factors=radii(localizer, presses, places_mm, levels, _of(measures, proving)))
 
 
-def _proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Localizer:
+def proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Localizer:
     """One whose members expect the errors that they make of presses never learnt from, and so count as they deserve.
 
     Of few presses, or badly placed ones, an observer is far surer than it may be: it finds the presses of training,

@@ -142,7 +142,7 @@ def _retrained(
     progress(len(found), len(subsets))
     options = options.model_copy(update={"method": "published", "features": "published"})
     missing = [lost for lost in subsets if lost not in found]
-    trainings = ((lost, partial(_train_without, lost, recording, training, test, options)) for lost in missing)
+    trainings = ((lost, partial(train_without, lost, recording, training, test, options)) for lost in missing)
     with one_torch_thread():
         for lost, result in run_tasks(trainings):
             found[lost] = result
@@ -152,7 +152,7 @@ def _retrained(
     return found
 
 
-def _train_without(
+def train_without(
     lost: Lost, recording: Recording, training: Indices, test: Indices, options: settings.LocalizerSettings
 ) -> Found:
     """Train on the other fibres alone, and find the test presses; the same whatever else is trained, and when."""

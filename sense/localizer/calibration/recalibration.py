@@ -76,7 +76,7 @@ def recalibrate(
     measures = {each.name: recording.measures[each.name][rows] for each in localizer.normalization.measures}
     levels = range(len(localizer.factors))
     subsets = [subset for level in levels for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
-    validation = _CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
+    validation = CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
     before = validation.found([localizer] * FOLDS)
     now, after, changes = _changed(localizer, validation, before, seed, progress)
     gain, error = validation.gain(before, after)
@@ -106,7 +106,7 @@ def recalibrate(
 
 def _changed(
     localizer: Localizer,
-    validation: "_CrossValidation",
+    validation: "CrossValidation",
     before: FoundByLoss,
     seed: int,
     progress: Callable[[int, int], None],
@@ -160,7 +160,7 @@ def _adapted(
     return replace(localizer, weights=weights, corrector=corrector)
 
 
-class _CrossValidation:
+class CrossValidation:
     """Cross-validation on the new presses.
 
     Args:

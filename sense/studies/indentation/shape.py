@@ -117,11 +117,11 @@ def _printed(pad: Morphology, places: Array, shape: Indices, size: Indices) -> A
     for index, sides in enumerate(FOOTPRINTS.values()):
         for each, radius in enumerate(SIZES):
             own = (shape == index) & (size == each)
-            given[own] = signals(pad, places[own], Contact(radius=radius * _circumradius(sides), sides=sides))
+            given[own] = signals(pad, places[own], Contact(radius=radius * circumradius(sides), sides=sides))
     return given
 
 
-def _circumradius(sides: int | None) -> float:
+def circumradius(sides: int | None) -> float:
     """Of a regular polygon that has the area of a circle of radius 1."""
     return 1.0 if sides is None else float(np.sqrt(2 * np.pi / (sides * np.sin(2 * np.pi / sides))))
 

@@ -91,13 +91,13 @@ def searched(method: str, run: SearchRun) -> SearchResult:
     return search(PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False), run=run)
 
 
-@given(st.sampled_from(["descent", "genetic"]), st.integers(0, 3), damages)
-@settings(max_examples=6)
-def test_damaged_states_are_gone_on_with_or_refused(begun, tmp_path_factory, method, number, damage) -> None:
+@given(st.sampled_from(["descent", "genetic"]), damages)
+@settings(max_examples=5)
+def test_damaged_states_are_gone_on_with_or_refused(begun, tmp_path_factory, method, damage) -> None:
     folder = tmp_path_factory.mktemp("search")
     for name, content in begun[method].items():
         (folder / name).write_bytes(content)
-    name = sorted(begun[method])[number % len(begun[method])]
+    name = "start_0000.npz"
     run = SearchRun(keep_in=folder, resume=True)
     found = read_damaged(folder / name, begun[method][name], damage, lambda path: searched(method, run))
     assert found is None or np.isfinite(list(found.terms.values())).all()

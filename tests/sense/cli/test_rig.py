@@ -97,6 +97,7 @@ def test_nothing_moves_before_the_tool_is_known(
 HAND = '[pad]\ngrid = 2\n[rig]\npresses = 2\nreadings_per_press = 10\nport = "/dev/nosuch"\n'
 
 
+@pytest.mark.slow
 def test_a_finger_records_through_the_drivers(padforge_sense) -> None:
     """In real time, which the board needs."""
     Path("pad.toml").write_text(HAND)
@@ -126,6 +127,7 @@ def test_each_device_is_looked_over_where_the_other_is_not_there(padforge_sense)
     assert "fail arm: [rig] tcp_mm is unknown" in out
 
 
+@pytest.mark.slow
 def test_the_board_alone_is_looked_over_for_a_hand(padforge_sense) -> None:
     Path("pad.toml").write_text(HAND)
     code, out, _ = padforge_sense("doctor", "--rig", "hand", "--through-drivers")

@@ -150,7 +150,7 @@ def test_step_filters_answer_a_step_of_healthy_noise_by_its_spread() -> None:
     """White noise: the filter answers 1 to the spread of what is healthy, or its far quantile that of Student's t."""
     rng = np.random.default_rng(2)
     traces = rng.standard_normal((4000, 1, TRACE))
-    (filters,) = fault_likelihoods._step_filters(traces, np.array([0.01]))
+    (filters,) = fault_likelihoods.step_filters(traces, np.array([0.01]))
     answers = (traces - traces[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(answers.std(axis=0), 1, rtol=0.05)
     for number, at in enumerate(fault_likelihoods.STEPS):
@@ -158,10 +158,10 @@ def test_step_filters_answer_a_step_of_healthy_noise_by_its_spread() -> None:
         step -= step[:REST].mean()
         assert np.argmax(np.abs(filters @ step) / 1) in range(max(number - 2, 0), number + 3)
     wild = traces * np.where(rng.random(4000) < 0.01, 30.0, 1.0)[:, None, None]
-    (filters,) = fault_likelihoods._step_filters(wild, np.array([0.01]))
+    (filters,) = fault_likelihoods.step_filters(wild, np.array([0.01]))
     answers = (wild - wild[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(np.quantile(np.abs(answers), 0.999, axis=0), student.ppf(0.9995, 5), rtol=1e-3)
-    assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == fault_likelihoods._MEDIAN_T
+    assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == fault_likelihoods.MEDIAN_T
 
 
 @settings(max_examples=10)

@@ -174,6 +174,7 @@ def box_of(browser: Chromium, part: str) -> list[float]:
     return browser.ask(f"({box})(document.querySelector('{part}').getBBox())")
 
 
+@pytest.mark.slow
 def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     page.show(VIEW)
     browser.open(page.url)
@@ -204,6 +205,7 @@ HAND |= {"said": "press x 1, y -2 mm", "told": HOSTILE, "phase": "press", "progr
 HAND |= {"target": [1.0, -2.0], "refused": None}
 
 
+@pytest.mark.slow
 def test_a_browser_shows_where_to_press_on_the_pad_as_it_lies_and_says_what_is_said(
     asking: LivePage, browser: Chromium
 ) -> None:

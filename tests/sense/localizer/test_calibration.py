@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from design.common.errors import InputError
 from sense import Localizer, Recording, calibrate, evaluate, import_mat, locate
 from sense.health.monitor import FibreFault
-from sense.localizer.calibration.calibration import _proven, learnable, left_out, split_presses
+from sense.localizer.calibration.calibration import learnable, left_out, proven, split_presses
 from sense.localizer.network import learnt
 from sense.settings import LocalizerSettings as Options
 
@@ -251,7 +251,7 @@ def test_members_expect_the_errors_that_they_make(recording: Recording, localize
     bias[:, :, 2:] -= np.log(50)
     proud = replace(localizer, corrector={**localizer.corrector, "last.b": bias})
     presses, test = proud.inputs(recording), np.array(proud.test)
-    put_right = _proven(proud, presses[test], recording.presses_mm[test], 2)
+    put_right = proven(proud, presses[test], recording.presses_mm[test], 2)
     shift = put_right.corrector["last.b"] - bias
     assert not shift[:, :, :2].any()
     assert shift[0, 0, 2] == shift[0, 0, 3] == pytest.approx(np.log(50), abs=0.7)

@@ -96,13 +96,13 @@ def stop_at(number: int) -> Callable[[int, int], None]:
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     """The sets of lost fibres that networks have been trained for since."""
-    real, trained = loss_study._train_without, []
+    real, trained = loss_study.train_without, []
 
     def counted(lost: tuple[int, ...], *rest: object) -> object:
         trained.append(lost)
         return real(lost, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(loss_study, "_train_without", counted)
+    monkeypatch.setattr(loss_study, "train_without", counted)
     return trained
 
 

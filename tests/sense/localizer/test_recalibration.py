@@ -14,7 +14,7 @@ from sense.localizer.calibration import fine_tuning
 from sense.localizer.calibration.affine_correction import fit_correction
 from sense.localizer.calibration.fine_tuning import adapt
 from sense.localizer.calibration.networks.training_presses import TrainingPresses
-from sense.localizer.calibration.recalibration import _CrossValidation, recalibrate
+from sense.localizer.calibration.recalibration import CrossValidation, recalibrate
 from sense.localizer.evaluation import distances
 from sense.localizer.localizer import Found
 from sense.localizer.response.response_model import looked_up
@@ -59,9 +59,9 @@ def off_by(*amounts: float, radius: float = 1.0) -> Found:
     return Found(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
 
 
-def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> _CrossValidation:
+def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> CrossValidation:
     places = np.zeros((4, 2))
-    return _CrossValidation(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
+    return CrossValidation(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
 
 
 def test_what_presses_left_out_say_of_a_change() -> None:

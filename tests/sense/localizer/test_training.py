@@ -70,11 +70,10 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
         return looked_up(table, places, xp)
 
     monkeypatch.setattr(masked_network, "looked_up", spy)
-    options = Options(hidden=8, layers=1, lost=0, batch=256)
+    options = Options(members=1, hidden=8, layers=1, lost=0, batch=256, epochs=1)
     monkeypatch.setattr(training, "MOVED", 0.1)
-    member = training._Training(samples, np.zeros((3, 3, 1, 1), np.float32), options, 0)
-    for _ in range(8):
-        member._loss()
+    table = np.zeros((3, 3, 1, 1), np.float32)
+    training.train_members(samples, table, options, np.random.default_rng(0), lambda done, total: None)
     inwards = np.abs(corners[0]) - torch.cat(seen[1:]).abs().cpu().numpy()
     assert inwards.min() >= -1e-6
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)

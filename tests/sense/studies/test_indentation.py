@@ -6,7 +6,7 @@ import pytest
 from design import InputError, Morphology
 from design.pad.indentation import Indenter
 from sense.studies.indentation.force import COUNTS, Learning, force_study, readings
-from sense.studies.indentation.shape import FOOTPRINTS, SETS, _circumradius, shape_study
+from sense.studies.indentation.shape import FOOTPRINTS, SETS, circumradius, shape_study
 from sense.studies.study import run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
@@ -46,7 +46,7 @@ def test_readings_are_whole_counts_footprints_have_one_area_and_depths_are_check
     noisy = readings(np.full((4000, 1), 0.5), np.ones(1), 4.0, np.random.default_rng(0))
     assert noisy.std() == pytest.approx(4, rel=0.1)
     for sides in FOOTPRINTS.values():
-        radius = _circumradius(sides)
+        radius = circumradius(sides)
         area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
         assert area == pytest.approx(np.pi)
     with pytest.raises(InputError, match=r"depth is 0\.9, allowed is 0 to the sphere's radius"):
