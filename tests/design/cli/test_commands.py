@@ -169,6 +169,19 @@ def test_rules_that_cannot_be_are_told_before_an_import_writes_anything(here):
     assert sorted(path.name for path in here.iterdir()) == ["pad.toml", "plan.svg"]
 
 
+def test_a_plan_has_x_to_the_right_and_y_upwards():
+    axes = draw_plan(Morphology.straight(2), Contact()).axes[0]
+    assert axes.get_xlim()[0] < 0 < axes.get_xlim()[1]
+    assert axes.get_ylim()[0] < 0 < axes.get_ylim()[1]
+
+
+def test_a_pad_is_checked_by_the_keep_outs_and_the_rules_of_its_settings(here):
+    Morphology.straight(2).save(here / "pad.json")
+    for settings, code in (("", 0), ("[pad]\nkeep_out_mm = [[[-9, 3], [-3, 3], [-3, 8], [-9, 8]]]\n", 1)):
+        (here / "pad.toml").write_text(f"[pad]\ngrid = 2\n{settings.removeprefix('[pad]')}")
+        assert CliRunner().invoke(design, ["check", "pad.json"]).exit_code == code
+
+
 @pytest.mark.parametrize("pitch_mm", [5.0, (20.0, 8.0)])
 def test_a_plan_shows_keep_outs_as_stated_and_to_where_half_of_the_contact_is_felt_in_mm(pitch_mm):
     holes = [((-3.0, 1.0), (2.0, 1.0), (0.0, 4.0)), [[5, 5], [6, 5], [6, 6], [5, 6]]]

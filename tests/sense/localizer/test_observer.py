@@ -160,3 +160,12 @@ def test_presses_at_one_place_or_on_a_line_will_do(places: np.ndarray) -> None:
     found, told = observer(linear(places), np.ones((9, FIBRES), dtype=bool))
     np.testing.assert_allclose(found, places, atol=0.02)
     assert np.isfinite(told).all()
+
+
+def test_places_may_be_called_otherwise_more_than_once(observed: Fitted) -> None:
+    observer, inputs, _ = observed
+    turn, shift, alive = np.array([[0.9, -0.2], [0.3, 1.1]]), np.array([0.1, -0.4]), np.ones((30, FIBRES), dtype=bool)
+    place, told = observer(inputs[:30], alive)
+    moved, as_before = observer.moved(turn, shift).moved(turn, shift)(inputs[:30], alive)
+    np.testing.assert_allclose(moved, (place @ turn.T + shift) @ turn.T + shift, atol=1e-6)
+    assert np.array_equal(told, as_before)

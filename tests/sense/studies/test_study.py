@@ -80,9 +80,11 @@ def test_a_study_broken_off_ends_the_same(name: str, tmp_path: Path, monkeypatch
     assert all(any(label in line for line in lines) for label in ("square", "random") if label in str(whole["rows"]))
 
 
-def one(name: str = "x", seed: int = 0, make: Callable[[], dict] = lambda: {"a": np.ones(1)}, tasks: int = 1) -> Study:
+def one(
+    name: str = "x", seed: int = 0, make: Callable[[], dict] = lambda: {"a": np.ones(1)}, tasks: str = "a"
+) -> Study:
     conclude = lambda states: Findings([{"a": 1}], [])  # noqa: E731
-    return Study(name, "X", {"seed": seed}, [Task("a", make)] * tasks, conclude, lambda document: Figure())
+    return Study(name, "X", {"seed": seed}, [Task(task, make) for task in tasks], conclude, lambda document: Figure())
 
 
 def test_a_folder_in_which_a_study_is_at_work_or_one_of_other_settings_was_broken_off_is_refused(
@@ -96,8 +98,9 @@ def test_a_folder_in_which_a_study_is_at_work_or_one_of_other_settings_was_broke
     run(one(make=meet), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
     with pytest.raises(KeyboardInterrupt):
-        run(one(tasks=3), tmp_path, jobs=1, progress=stop)
-    for other, said in ((one(seed=1, tasks=3), "begun with x seed 0, now 1"), (one(tasks=4), "begun with x tasks")):
+        run(one(tasks="abc"), tmp_path, jobs=1, progress=stop)
+    others = (one(seed=1, tasks="abc"), one(tasks="abcd"), one(tasks="bac"))
+    for other, said in zip(others, ("begun with x seed 0, now 1", *["begun with x tasks"] * 2), strict=True):
         with pytest.raises(InputError, match=said):
             run(other, tmp_path, resume=True)
 
@@ -129,10 +132,10 @@ def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> No
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run(replace(one(tasks=0), draw=draw), tmp_path)
+        run(replace(one(tasks=""), draw=draw), tmp_path)
     unwritable = Findings([{"a": 1}], [], {"map": object()})
     with pytest.raises(TypeError, match="JSON"):
-        run(replace(one(tasks=0), conclude=lambda states: unwritable), tmp_path)
+        run(replace(one(tasks=""), conclude=lambda states: unwritable), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
