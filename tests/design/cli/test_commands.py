@@ -69,7 +69,7 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
 def twin(tmp_path_factory):
     """Of a pad of grid 2 and pitch 10 mm, pressed somewhat beyond its outer fibres."""
     path = tmp_path_factory.mktemp("twin") / "twin.json"
-    gains = enumerate(((2, 0.1), (0, -0.1), (1, 0.4)))
+    gains = enumerate(((2, -0.1), (0, -0.1), (1, 0.4)))
     channels = tuple(TwinChannel(channel, fibre, gain, abs(gain) / 5, 0.9) for channel, (fibre, gain) in gains)
     reach = np.array([0.0, 2, 5, 8, 11, 15]), np.array([1, 0.95, 0.6, 0.25, 0.05, 0])
     line = np.array([[-15.0, -5], [15, -5]])

@@ -93,6 +93,15 @@ def test_a_star_of_crossings_needs_one_level_more():
     assert max(fibre_levels((5, 5), star, deep_horizontal=True)) == 2
 
 
+def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
+    plan = Plan(Morphology.random(3, 3, seed=3))
+    levels = plan.levels
+    assert max(levels) >= 2
+    crossing = {tuple(sorted((c.first, c.second), key=lambda fibre: levels[fibre])) for c in plan.crossings}
+    assert any(levels[deep] - levels[shallow] > 1 for shallow, deep in crossing)
+    assert {(each.shallow, each.deep) for each in plan.common_tracks} >= crossing
+
+
 def test_crossing_fibres_of_a_family_lie_a_step_apart_and_the_pad_is_thickened_for_them():
     plan = Plan(level_pad(1.8, 1.2))
     assert plan.heights_mm == (0.4, 1.2, 2.0)

@@ -1,5 +1,6 @@
 """Devices by their names, their ports, and processes that run padforge's own code."""
 
+import os
 import subprocess
 import sys
 from importlib.metadata import EntryPoint, EntryPoints
@@ -48,6 +49,7 @@ def test_code_in_the_current_folder_is_not_run(
     else:
         monkeypatch.setenv("PYTHONPATH", python_path)
     process = start("sense.rig.arms.ur5.child_process", "127.0.0.1", stderr=subprocess.PIPE)
+    assert os.getsid(process.pid) == process.pid, "an interrupt from the keyboard would reach it"
     _, said = process.communicate(timeout=20)  # the end of its stdin ends it
     assert not (tmp_path / "pwned").exists(), said
     assert process.returncode == 0, said

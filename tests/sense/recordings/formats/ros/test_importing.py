@@ -115,7 +115,8 @@ def lab() -> Iterator[Message]:
         yield "/skin/all", time, array("Float32MultiArray", np.array([number, step, 512], np.float32))
         yield "/skin/1", time, make("Int16", number)
         yield "/skin/2", time + 0.001, make("Float64", step / 2)
-        yield "/at/y", time, make("UInt8", number)
+        if step % 2 == 0:
+            yield "/at/y", time, make("UInt8", step // 2 % 7)
         yield "/at/x", time + 0.001, make("Float32", step)
 
 
@@ -142,7 +143,7 @@ def test_topics_of_one_number_are_fibres_too_and_hold_until_the_next(tmp_path: P
     np.testing.assert_allclose(found.readings[60], [0.01, 59 / 200])  # the second one comes after the first
     assert np.isnan(found.readings[0, 1])
     middle = (found.begun + found.lifted) // 2
-    np.testing.assert_allclose(found.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 50)]))
+    np.testing.assert_allclose(found.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 2 % 7)]))
 
 
 @pytest.mark.parametrize(
