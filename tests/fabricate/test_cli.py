@@ -46,7 +46,8 @@ def test_people_get_a_summary_with_what_to_look_at(tmp_path):
     assert "ml of silicone" in result.output
     assert "warn same_family_crossings: 2 crossings" in result.output
     assert (tmp_path / "tracks.svg").exists()
-    checked = invoke("check", tmp_path / "crossed.json")
+    Morphology.straight(2, 4.0).save(tmp_path / "narrow.json")
+    checked = invoke("check", tmp_path / "narrow.json")
     assert (checked.exit_code, "warn" in checked.output) == (0, True)
 
 

@@ -107,11 +107,11 @@ def test_terraces_are_whole_layers_with_steps_no_printer_places():
 
 @pytest.mark.parametrize("shrinkage", [0.013, 0.2])
 def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
-    hole = {"keep_out_mm": [[[0, 0], [3, 0], [0, 4]]]}
-    asked = with_settings({"border_mm": 1.5}, pad=hole, silicone={"shrinkage": shrinkage})
+    hole = [[[0, 0], [3, 0], [0, 4]]]
+    asked = with_settings({"border_mm": 1.5}, pad={"keep_out_mm": hole}, silicone={"shrinkage": shrinkage})
     mould = asked.enlarged().mould
     corners = np.array(asked.enlarged().pad.keep_out_mm) * (1 - shrinkage)
-    np.testing.assert_allclose(corners, hole["keep_out_mm"], rtol=1e-12)
+    np.testing.assert_allclose(corners, hole, rtol=1e-12)
     for key in ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm"):
         assert getattr(mould, key) * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), rel=1e-12)
     for key in ("floor_mm", "wall_mm", "wall_draft_deg", "tolerance_mm", "min_silicone_mm", "lead_mm"):
