@@ -56,6 +56,7 @@ WRONG = [
     (lambda k: k[:, [0, 2, 1]], "horizontal fibre 1: knots do not ascend"),
     (lambda k: np.concatenate([k[:3], k[3:, [0, 2, 1]]]), "vertical fibre 2: knots do not ascend"),
     (lambda k: np.where(np.arange(3)[:, None] == 0, k + 0.1, k), "must run from"),
+    (lambda k: k - 0.1 * (np.arange(24).reshape(4, 3, 2) == 5), "must run from"),  # the height of its far end
 ]
 PAD = Morphology.straight(1)
 ODD: Any = None, [1], {1: 2}, "a", 1.5

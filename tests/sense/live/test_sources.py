@@ -9,7 +9,7 @@ import pytest
 import sense.live.sources
 from design import Morphology
 from design.common.errors import InputError
-from design.settings import PUBLISHED_CONTACT
+from design.settings import PUBLISHED_CONTACT, Contact
 from sense import Recording
 from sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
 from sense.recordings.recorder import FORMAT, START
@@ -92,6 +92,17 @@ def test_the_simulated_rig_presses_the_pad_that_was_recorded() -> None:
     swings = np.abs(volts - volts[0]).sum(axis=1)
     assert (np.diff((swings > swings.max() / 5).astype(int)) == 1).sum() == round(len(volts) / 40)
     assert 0.5 < np.abs(volts - volts[0]).max() / np.abs(recorded.readings - volts[0]).max() < 2
+
+
+def test_the_simulated_rig_presses_to_its_depths_in_turn() -> None:
+    rig = RigSettings(presses=4, seed=4, noise_mv=0.0, drift_mv=0.0, depths_mm=(0.5, 5.0), readings_per_press=20)
+    time = Time(least_s=0)
+    converter = SimulatedConverter(Morphology.straight(2), rig, Contact(), time)
+    converter.connect()
+    time.sleep(4.01 * 20 / rig.rate_hz)
+    volts = converter.read().volts
+    swings = [np.ptp(volts[20 * press : 20 * press + 20], axis=0).sum() for press in range(4)]
+    assert max(swings[0::2]) < 0.5 * min(swings[1::2])
 
 
 @pytest.mark.parametrize(

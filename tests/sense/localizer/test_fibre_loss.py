@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from design.common.errors import InputError
 from sense import Localizer, Recording, evaluate
 from sense.localizer.calibration import fibre_loss_study as loss_study
 from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
+from sense.report import fibre_loss_figure
 from sense.settings import LocalizerSettings as Options
 from tests.helpers.door import Ended, call
 
@@ -168,3 +170,16 @@ def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatc
     ended = loss(*command)
     assert (ended.code, len(trained)) == (0, 5), ended
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
+
+
+def test_maps_of_errors_have_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(fibre_loss_figure, "save_figure", lambda figure, path: drawn.append(figure))
+    errors = {"errors": [{"lost": 0, "subsets": 1, "mean_mm": 1.0}], "by_subset": [{"lost": [], "mean_mm": 1.0}]}
+    cells = [{"x_mm": 0.0, "y_mm": y_mm, "mean_mm": mean_mm} for y_mm, mean_mm in ((-5.0, 1.0), (5.0, 9.0))]
+    ways = {"one network": errors | {"maps": [{"lost": [], "by_place": cells}]}}
+    fibre_loss_figure.draw_fibre_loss({"ways": ways, "test_presses": 2}, Path("none.png"))
+    (image,) = (image for axes in drawn[0].axes for image in axes.images)
+    assert image.origin == "lower"
+    assert np.asarray(image.get_array())[-1, 0] == 9.0
+    assert image.get_extent()[3] > 5

@@ -115,6 +115,8 @@ def test_a_remade_pad_is_followed(localizer: Localizer, recording: Recording, fo
     assert again.recalibrated_by == (known_only(pad, NEW).digest,)
     assert np.array_equal(again.locate(again.inputs(pad)).places_mm, now.locate(now.inputs(pad)).places_mm)
     json.dumps(document, allow_nan=False)
+    twice = replace(again, recalibrated_by=("of before", *again.recalibrated_by))
+    assert recalibrate(twice, known_only(pad, NEW))[0].recalibrated_by[:2] == twice.recalibrated_by
     with pytest.raises(InputError, match="recalibrated by"):
         evaluate(now, known_only(pad, NEW))
 
