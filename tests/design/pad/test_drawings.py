@@ -81,6 +81,7 @@ def test_curves_become_fibres_whose_ends_are_put_right_within_the_tolerance(tmp_
         (PATHS, 'viewBox="-20 -18 40 36" width="4cm" height="3.6cm"'),
         (PATHS, 'viewBox="-20 -18 40 36" width="1.5748031in" height="1.4173228in"'),
         (f'<g transform="translate(7 3) rotate(90) rotate(-90) matrix(1 0 0 1 -7 -3)">{PATHS}</g>', HEAD),
+        (f'<g transform="scale(2)"><g transform="matrix(.5 0 0 .5 0 0)">{PATHS}</g></g>', HEAD),
         (f'<g transform="scale(2 .5)"><g transform="scale(.5,2)">{PATHS}</g></g>', HEAD),
         (f'<defs><g id="all">{PATHS}</g></defs><use href="#all"/>', HEAD),
         (f'<symbol id="all">{PATHS}</symbol><use xlink:href="#all" x="0" y="0"/>', HEAD),

@@ -58,6 +58,7 @@ def test_it_is_said_what_more_presses_would_bring(
     document: dict[str, Any], recording: Recording, tmp_path: Path
 ) -> None:
     assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
+    assert all(0.02 < point["standard_error_mm"] / point["mean_mm"] < 0.2 for point in document["points"])
     ahead = document["forecast"]
     assert ahead["presses"] == 510
     assert 0 < ahead["low_mm"] <= ahead["mean_mm"] <= ahead["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
