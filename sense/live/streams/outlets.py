@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
-from design.common.errors import InputError
+from design.common.errors import InputError, shown
 from design.common.page.local_page.listening import END_S, POLL_S, ConnectionServer, listening, refuse_open
 from sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
@@ -198,7 +198,10 @@ class Lsl:
 
         Raises:
             ModuleNotFoundError: pylsl is not installed.
+            InputError: a name that is no text.
         """
+        if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes of a command line that are no text
+            raise InputError(f"the name of a stream is {shown(name)}, expected text")
         volts = {f"fibre {fibre}": "V" for fibre in range(1, fibres + 1)}
         self._readings = _outlet(f"{name} readings", volts, rate_hz)
         self._touches = _outlet(f"{name} touches", PLACE, 0.0)

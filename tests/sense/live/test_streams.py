@@ -245,6 +245,13 @@ def test_osc_goes_on_while_its_network_is_away(monkeypatch: pytest.MonkeyPatch) 
     assert sent_to[0] in ("127.0.0.1", "::1")
 
 
+def test_a_stream_whose_name_is_no_text_is_refused() -> None:
+    from sense.live.streams.outlets import Lsl
+
+    with pytest.raises(InputError, match="the name of a stream is"):
+        Lsl("\udc80", 2, 13.0)
+
+
 def test_lsl_tells_readings_and_touches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of its own, which looks for streams on this machine alone."""
     (tmp_path / "lsl.cfg").write_text("[multicast]\nResolveScope = machine\n[log]\nlevel = -3\n")
