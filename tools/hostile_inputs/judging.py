@@ -50,6 +50,7 @@ def violations(ended: Ended, changed: Sequence[Path], temporary: Sequence[Path])
         said = [line for line in ended.err.splitlines() if line.startswith(_REFUSED)]
         if len(said) != 1:
             found.append(f"refused in {len(said)} lines: {ended.err[-300:]!r}")
+        changed = [path for path in changed if "search" not in path.parts]  # found for nobody, kept to be gone on with
         if changed:
             found.append(f"refused, and changed {', '.join(map(_name, changed[:5]))}")
     found += [f"left {_name(path)}" for path in changed if path.name.startswith(".") and os.path.lexists(path)]
