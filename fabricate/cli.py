@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from design.common.command_line import (
+from padforge.design.common.command_line import (
     json_option,
     load_spec,
     out_option,
@@ -17,8 +16,8 @@ from design.common.command_line import (
 )
 
 if TYPE_CHECKING:
-    from design.common.settings import Spec
-    from design.pad.morphology import Morphology
+    from padforge.design.common.settings import Spec
+    from padforge.design.pad.morphology import Morphology
 
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
@@ -75,8 +74,8 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
 
     The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
     """
-    from design.common.files import claimed
-    from design.pad.morphology import Morphology
+    from padforge.design.common.files import claimed
+    from padforge.design.pad.morphology import Morphology
 
     from .export import build as build_files
     from .settings import FabricationSettings
@@ -121,9 +120,9 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     padforge fabricate check out/pad/mould.stl
     padforge fabricate check out/pad/morphology.json --picture found.png
     """
-    from design.common.files import atomic
-    from fabricate.checks.plan_checks import inspect_file
-    from fabricate.report.pictures import draw_findings
+    from padforge.design.common.files import atomic
+    from padforge.fabricate.checks.plan_checks import inspect_file
+    from padforge.fabricate.report.pictures import draw_findings
 
     from .settings import FabricationSettings
 

@@ -12,17 +12,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common import profiling
-from design.common.errors import InputError, instance, path, shown
-from design.common.files import provenance, read_json, require_file, sha256, staged, unchanged, write_json, writing
-from design.pad.morphology import Morphology
-from fabricate.checks.findings import Finding, verdict
-from fabricate.checks.mesh_checks import SOUND, sound
-from fabricate.checks.plan_checks import inspect
-from fabricate.dispensing.files import LANGUAGES, dispensing
-from fabricate.materials import PLASTICS
-from fabricate.mould.assembly import (
+from padforge.design.common import profiling
+from padforge.design.common.errors import InputError, instance, path, shown
+from padforge.design.common.files import (
+    provenance,
+    read_json,
+    require_file,
+    sha256,
+    staged,
+    unchanged,
+    write_json,
+    writing,
+)
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.checks.findings import Finding, verdict
+from padforge.fabricate.checks.mesh_checks import SOUND, sound
+from padforge.fabricate.checks.plan_checks import inspect
+from padforge.fabricate.dispensing.files import LANGUAGES, dispensing
+from padforge.fabricate.materials import PLASTICS
+from padforge.fabricate.mould.assembly import (
     bed_frame,
     conductive_body,
     conductive_plan,
@@ -32,11 +40,11 @@ from fabricate.mould.assembly import (
     mould_body,
     sizes,
 )
-from fabricate.mould.plan import Plan
-from fabricate.mould.prisms import Body
-from fabricate.report.laying import guide, orientation
-from fabricate.report.pictures import draw_mould, draw_tracks
-from fabricate.report.track_drawings import tracks_dxf, tracks_svg
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.mould.prisms import Body
+from padforge.fabricate.report.laying import guide, orientation
+from padforge.fabricate.report.pictures import draw_mould, draw_tracks
+from padforge.fabricate.report.track_drawings import tracks_dxf, tracks_svg
 
 from .mesh_files import write_3mf, write_stl, write_utf8
 from .settings import DEFAULTS, FabricationSettings
@@ -185,7 +193,7 @@ def _bodies(plan: Plan) -> list[tuple[str, Body]]:
 
 
 def _meshed(name: str, body: Body) -> Printed:
-    from fabricate.mould.mesh import arrays, mesh
+    from padforge.fabricate.mould.mesh import arrays, mesh
 
     solid = mesh(body)
     return Printed(name, solid, *arrays(solid))
@@ -225,8 +233,8 @@ def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
     Raises:
         InputError: a CAD solid is not valid, or not of its mesh.
     """
-    from fabricate.mould.cad.model import assembly, models
-    from fabricate.mould.cad.step_file import write_step
+    from padforge.fabricate.mould.cad.model import assembly, models
+    from padforge.fabricate.mould.cad.step_file import write_step
 
     made = models(plan, dict(_bodies(plan)))
     apart = [model.apart(body.mesh) for model, body in zip(made, printed, strict=True)]

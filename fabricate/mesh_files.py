@@ -11,12 +11,11 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError
-from design.common.errors import path as as_path
-from design.common.files import require_file
-from design.pad.knots import Array
-from fabricate.mould.prisms import COLOURS
+from padforge.design.common.errors import InputError
+from padforge.design.common.errors import path as as_path
+from padforge.design.common.files import require_file
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.prisms import COLOURS
 
 Numbers = NDArray[np.int64]
 

@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
+from padforge.design.common.errors import InputError, instance
+from padforge.design.common.settings import Settings, Spec, as_tuple, none_as
+from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 from pydantic import BeforeValidator, Field, field_validator
-
-from design.common.errors import InputError, instance
-from design.common.settings import Settings, Spec, as_tuple, none_as
-from design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 from .materials import FibreSettings, SiliconeSettings
 

@@ -1,63 +1,37 @@
-"""padforge: the front door. `import padforge` hands out all there is; the command line chains the stages.
+"""From an idea to a calibrated soft strain-sensor pad.
 
-`padforge.design`, `padforge.fabricate` and `padforge.sense` are the packages, and whatever these three hand out is here
-as well: `padforge.search`, `padforge.build`, `padforge.calibrate`, with the settings they take.
+`padforge.design`, `padforge.fabricate` and `padforge.sense` are the three stages. What they export is here as well
+(`padforge.search`, `padforge.build`, `padforge.calibrate`, with the settings that these take) and is loaded on first use.
 """
 
-import sys
-from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
-from types import ModuleType
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import design
-import fabricate
-import sense
-
-from .commands import cli, main
-from .report import write_report
-
 if TYPE_CHECKING:
-    from design import *  # noqa: F403  what an editor completes `padforge.` with
-    from fabricate import *  # noqa: F403
-    from sense import *  # noqa: F403
+    from padforge.design import *  # noqa: F403  for completion in editors
+    from padforge.fabricate import *  # noqa: F403
+    from padforge.sense import *  # noqa: F403
 
-__all__ = ["cli", "main", "write_report"]
+STAGES = ("design", "fabricate", "sense")
 
-PACKAGES = {"design": design, "fabricate": fabricate, "sense": sense}
+# a checkout has the stages beside this package, a wheel has them inside it
+if not (Path(__file__).parent / "design").is_dir():
+    __path__.append(str(Path(__file__).parents[1]))
 
 
 def __getattr__(name: str) -> Any:
-    for package in PACKAGES.values():
+    if name.startswith("__"):
+        raise AttributeError(name)
+    if name in STAGES:
+        return import_module(f"padforge.{name}")
+    for stage in STAGES:
+        package = import_module(f"padforge.{stage}")
         if name in package.__all__:
             return getattr(package, name)
     raise AttributeError(f"module 'padforge' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *(name for package in PACKAGES.values() for name in package.__all__)})
-
-
-class _Packages(MetaPathFinder, Loader):
-    """Finds `padforge.design.pad` where it lies, in `design.pad`: one module by two names, not two modules."""
-
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """What makes an alias, for the names of the packages and all below."""
-        top, _, name = fullname.partition(".")
-        return ModuleSpec(fullname, self) if top == "padforge" and name.partition(".")[0] in PACKAGES else None
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """The module itself; its own specification is kept for `exec_module`."""
-        module = import_module(spec.name.removeprefix("padforge."))
-        spec.loader_state = module.__spec__
-        return module
-
-    def exec_module(self, module: ModuleType) -> None:
-        """Nothing but what importing by another name has changed: it ran when it was imported."""
-        assert module.__spec__ is not None
-        module.__spec__ = module.__spec__.loader_state
-
-
-sys.meta_path.insert(0, _Packages())
+    packages = [import_module(f"padforge.{stage}") for stage in STAGES]
+    return sorted({*globals(), *STAGES, *(name for package in packages for name in package.__all__)})

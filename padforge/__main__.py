@@ -1,5 +1,5 @@
 """`python -m padforge`: the command line."""
 
-from . import main
+from padforge.cli import main
 
 main()

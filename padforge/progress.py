@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from design.common.files import as_written, read_json, sha256, write_json
+from padforge.design.common.files import as_written, read_json, sha256, write_json
 
 FORMAT, NAME = "padforge-run/1", "run.json"
 

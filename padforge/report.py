@@ -3,8 +3,8 @@
 from functools import cache
 from pathlib import Path
 
-from design.common.errors import Fault, InputError
-from design.common.errors import path as as_path
+from padforge.design.common.errors import Fault, InputError
+from padforge.design.common.errors import path as as_path
 
 
 def write_report(folder: Path) -> Path:
@@ -14,13 +14,13 @@ def write_report(folder: Path) -> Path:
         InputError: no stage has left anything, or a file is damaged.
         Fault: there are files of another pad or recording among them, which the page tells first.
     """
-    from design.common.files import as_written, settle, write_text
-    from design.common.page.elements import PageSection, page
-    from design.report.contact_section import contact_sections
-    from design.report.sections import design_sections, provenance_row, provenance_section, stage_pages
-    from fabricate.report.sections import fabrication_sections
-    from sense.report import sections as sensed
-    from sense.report.identification_results import identification_sections
+    from padforge.design.common.files import as_written, settle, write_text
+    from padforge.design.common.page.elements import PageSection, page
+    from padforge.design.report.contact_section import contact_sections
+    from padforge.design.report.sections import design_sections, provenance_row, provenance_section, stage_pages
+    from padforge.fabricate.report.sections import fabrication_sections
+    from padforge.sense.report import sections as sensed
+    from padforge.sense.report.identification_results import identification_sections
 
     folder = as_path("folder", folder)
     settle(folder)

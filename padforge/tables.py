@@ -4,38 +4,38 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from design.common.settings import Settings
+    from padforge.design.common.settings import Settings
 
 SECTIONS = {
-    "pad": "design.settings:PadSettings",
-    "contact": "design.settings:Contact",
-    "search": "design.settings:SearchSettings",
-    "rules": "design.settings:RulesSettings",
-    "mould": "fabricate.settings:MouldSettings",
-    "printer": "fabricate.settings:PrinterSettings",
-    "silicone": "fabricate.materials:SiliconeSettings",
-    "fibre": "fabricate.materials:FibreSettings",
-    "dispenser": "fabricate.settings:DispenserSettings",
-    "rig": "sense.settings:RigSettings",
-    "localizer": "sense.settings:LocalizerSettings",
+    "pad": "padforge.design.settings:PadSettings",
+    "contact": "padforge.design.settings:Contact",
+    "search": "padforge.design.settings:SearchSettings",
+    "rules": "padforge.design.settings:RulesSettings",
+    "mould": "padforge.fabricate.settings:MouldSettings",
+    "printer": "padforge.fabricate.settings:PrinterSettings",
+    "silicone": "padforge.fabricate.materials:SiliconeSettings",
+    "fibre": "padforge.fabricate.materials:FibreSettings",
+    "dispenser": "padforge.fabricate.settings:DispenserSettings",
+    "rig": "padforge.sense.settings:RigSettings",
+    "localizer": "padforge.sense.settings:LocalizerSettings",
 }
 """The sections of a `pad.toml`, and where the settings of each are."""
 
-PRESETS = {"published": "design.settings:PUBLISHED"}
+PRESETS = {"published": "padforge.design.settings:PUBLISHED"}
 """Settings other than the defaults, by section, that `padforge init` can write."""
 
 EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
 """What of `pyproject.toml` each stage needs to be installed; what chains stages needs all of it."""
 
 BENCHES = {
-    "contact": "design.pad.benchmark:BENCH",
-    "objective": "design.criteria.benchmark:BENCH",
-    "search": "design.optimisers.benchmark:BENCH",
-    "networks": "design.evaluation.benchmark:BENCH",
-    "filter": "sense.recordings.processing.benchmark:BENCH",
-    "localizer": "sense.localizer.calibration.benchmark:BENCH",
-    "twin": "sense.twin.benchmark:BENCH",
-    "mould": "fabricate.mould.benchmark:BENCH",
+    "contact": "padforge.design.pad.benchmark:BENCH",
+    "objective": "padforge.design.criteria.benchmark:BENCH",
+    "search": "padforge.design.optimisers.benchmark:BENCH",
+    "networks": "padforge.design.evaluation.benchmark:BENCH",
+    "filter": "padforge.sense.recordings.processing.benchmark:BENCH",
+    "localizer": "padforge.sense.localizer.calibration.benchmark:BENCH",
+    "twin": "padforge.sense.twin.benchmark:BENCH",
+    "mould": "padforge.fabricate.mould.benchmark:BENCH",
 }
 """Where each bench is, imported when it is asked for."""
 

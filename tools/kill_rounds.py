@@ -20,9 +20,10 @@ from importlib import import_module
 from itertools import count
 from pathlib import Path
 
-from design.common.errors import InputError
-from design.common.files import read_json, settle, sha256
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import read_json, settle, sha256
+from padforge.sense.recordings.recording import Recording
+
 from tools.kills import KILLED, forked, kill_at
 
 SETTINGS = """
@@ -65,10 +66,10 @@ _TOGETHER = (
     {"out.mcap"},
     {"dataset"},
 )
-_OF_DESIGN = ("torch", "matplotlib.figure", "design.report.files")
+_OF_DESIGN = ("torch", "matplotlib.figure", "padforge.design.report.files")
 _OF_OTHERS = (
     *("build123d", "shapely", "trimesh", "h5py", "rosbags.rosbag2", "pyarrow", "numba"),
-    *("fabricate.export", "sense.localizer.calibration.training", "sense.report.sections"),
+    *("padforge.fabricate.export", "padforge.sense.localizer.calibration.training", "padforge.sense.report.sections"),
 )
 
 

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
-
-from design.common.command_line import json_option, out_option, progress, show_result
-from design.common.errors import InputError
+from padforge.design.common.command_line import json_option, out_option, progress, show_result
+from padforge.design.common.errors import InputError
 
 
 def bench_command(benches: Mapping[str, str]) -> click.Command:

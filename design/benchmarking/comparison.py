@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError
-from design.common.files import read_json
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import read_json
 
 from .harness import TrialKey
 from .table import FORMAT, SUMMARY_FORMAT

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from design.common.files import refuse_unwritable, write_json
+from padforge.design.common.files import refuse_unwritable, write_json
 
 from .comparison import SLOWER, Worsening, worsenings
 from .harness import Bench, BenchListener, BenchRounds, TrialKey, measure_round

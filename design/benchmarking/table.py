@@ -12,9 +12,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-from design.common.figures import CURVES, FAINT, INK, save_figure
-from design.common.files import provenance, write_json, write_text
+from padforge.design.common.figures import CURVES, FAINT, INK, save_figure
+from padforge.design.common.files import provenance, write_json, write_text
 
 from .harness import Bench, BenchRounds
 

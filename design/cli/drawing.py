@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-
-from design.common.command_line import (
+from padforge.design.common.command_line import (
     force_option,
     json_option,
     load_spec,
@@ -49,11 +48,11 @@ def import_(
     [pad] of the settings says which fibres there are and where they end. Taken are curves in layers or groups whose
     names begin with fibre, horizontal or vertical, else all open ones; what is named pad is its border.
     """
-    from design.common.files import check_replaceable, provenance, staged
-    from design.criteria.rules import check_rules
-    from design.pad.courses.drawings.plan import import_plan
-    from design.pad.morphology import Morphology
-    from design.settings import PadSettings, RulesSettings
+    from padforge.design.common.files import check_replaceable, provenance, staged
+    from padforge.design.criteria.rules import check_rules
+    from padforge.design.pad.courses.drawings.plan import import_plan
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.settings import PadSettings, RulesSettings
 
     settings = load_spec(spec)
     size, rules = settings.section(PadSettings), settings.section(RulesSettings)

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-
-from design.common.command_line import force_option, load_spec, out_option, pad_folder, spec_option
+from padforge.design.common.command_line import force_option, load_spec, out_option, pad_folder, spec_option
 
 PORT = 8322
 _LOOK_S = 0.2
@@ -31,11 +30,11 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     Knots are dragged, or chosen with Tab and moved with the arrow keys. Saving (Ctrl+S in the page) replaces no file
     that was there before but the one that --out names. Ctrl-C here ends it.
     """
-    from design.common.errors import InputError
-    from design.common.files import refuse_unwritable
-    from design.common.page.local_page.local_page import LocalPage, page_text
-    from design.pad.morphology import Morphology
-    from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+    from padforge.design.common.errors import InputError
+    from padforge.design.common.files import refuse_unwritable
+    from padforge.design.common.page.local_page.local_page import LocalPage, page_text
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
     from .editor.answers import Answers
     from .editor.session import Session
@@ -48,7 +47,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     layout = settings.section(PadSettings).layout if pad is None else Morphology.load(pad).layout
     size = settings.section(PadSettings, **layout.settings)
     judged = Answers(size, settings.section(RulesSettings), settings.section(Contact), settings.section(SearchSettings))
-    text = page_text("design.cli.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
+    text = page_text("padforge.design.cli.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
     with ExitStack() as stack:
         session = Session(judged, pad, out, lambda view: page.show(view), force)
         page = LocalPage(port, text, {"/edit": session.edit, "/save": session.save})

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-
-from design.common.command_line import (
+from padforge.design.common.command_line import (
     INTERRUPTED,
     force_option,
     json_option,
@@ -24,7 +23,7 @@ from .drawing import import_
 from .editing import edit
 
 if TYPE_CHECKING:
-    from design.report.comparison import Making
+    from padforge.design.report.comparison import Making
 
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 twin_option = click.option(
@@ -85,11 +84,11 @@ def design(
     """
     if context.invoked_subcommand is not None:
         return
-    from design.common.computing import cluster
-    from design.common.files import claimed
-    from design.optimisers.search import SearchRun
-    from design.pad.twin import Twin
-    from design.report.files import run_search, search_lines
+    from padforge.design.common.computing import cluster
+    from padforge.design.common.files import claimed
+    from padforge.design.optimisers.search import SearchRun
+    from padforge.design.pad.twin import Twin
+    from padforge.design.report.files import run_search, search_lines
 
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with claimed(out), cluster(scheduler) as executor:
@@ -112,8 +111,8 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     padforge design show out/pad/morphology.json                  into out/pad/plan.svg
     padforge design show out/pad/morphology.json --out plan.png
     """
-    from design.pad.morphology import Morphology
-    from design.report.files import write_plan
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.report.files import write_plan
 
     path = out or pad_folder(morphology) / "plan.svg"
     write_plan(load_spec(spec), Morphology.load(morphology), path)
@@ -131,9 +130,9 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     \b
     padforge design check out/pad/morphology.json
     """
-    from design.criteria.rules import check_rules
-    from design.pad.morphology import Morphology
-    from design.settings import PadSettings, RulesSettings
+    from padforge.design.criteria.rules import check_rules
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.settings import PadSettings, RulesSettings
 
     pad, settings = Morphology.load(morphology), load_spec(spec)
     size = settings.section(PadSettings, **pad.layout.settings)
@@ -157,12 +156,12 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     padforge design score out/pad/morphology.json
     padforge design score out/pad/morphology.json --twin out/pad/twin.json
     """
-    from design.criteria.rules import check_rules
-    from design.criteria.score import score as score_terms
-    from design.evaluation.expected_error import error_terms, expected_errors
-    from design.pad.morphology import Morphology
-    from design.report.twin_settings import settings_for_twin
-    from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+    from padforge.design.criteria.rules import check_rules
+    from padforge.design.criteria.score import score as score_terms
+    from padforge.design.evaluation.expected_error import error_terms, expected_errors
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.report.twin_settings import settings_for_twin
+    from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
     settings, pad = load_spec(spec), Morphology.load(morphology)
     if twin is not None:
@@ -210,9 +209,9 @@ def compare_command(making: "Making") -> click.Command:
 
         Every variant is designed into a folder of its own, with its mould; morphologies are taken as they are.
         """
-        from design.common.files import claimed
-        from design.optimisers.search import SearchRun
-        from design.report.comparison import compare, comparison_lines, variants
+        from padforge.design.common.files import claimed
+        from padforge.design.optimisers.search import SearchRun
+        from padforge.design.report.comparison import compare, comparison_lines, variants
 
         pads = variants(sources, vary, load_spec)
         with claimed(out):

@@ -5,13 +5,12 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from padforge.design.benchmarking.harness import Bench, BenchTrial
+from padforge.design.pad.benchmark import KNOTS, PUBLISHED, SAMPLES, plain_signals
+from padforge.design.pad.contact import signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT
 from scipy.interpolate import PchipInterpolator
-
-from design.benchmarking.harness import Bench, BenchTrial
-from design.pad.benchmark import KNOTS, PUBLISHED, SAMPLES, plain_signals
-from design.pad.contact import signals
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT
 
 from .information import disorder_area, joint_entropy, published_sharpness, quantize
 from .published_objective import published_objective, published_presses

@@ -6,15 +6,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from padforge.design.common import profiling
+from padforge.design.pad.contact import note_reach, press_shape
+from padforge.design.pad.kernels.exact_gradient import signals_gradient
+from padforge.design.pad.kernels.exact_signals import exact_signals
+from padforge.design.pad.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
+from padforge.design.pad.kernels.press import Ends, Law, family_strays
+from padforge.design.settings import Contact
 from torch import Tensor
-
-from design.common import profiling
-from design.pad.contact import note_reach, press_shape
-from design.pad.kernels.exact_gradient import signals_gradient
-from design.pad.kernels.exact_signals import exact_signals
-from design.pad.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
-from design.pad.kernels.press import Ends, Law, family_strays
-from design.settings import Contact
 
 Array = NDArray[np.float64]
 PressShape = tuple[tuple[Array, Array], Array, Law]

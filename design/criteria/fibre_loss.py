@@ -4,8 +4,7 @@ import itertools
 import math
 
 import numpy as np
-
-from design.pad.knots import Array
+from padforge.design.pad.knots import Array
 
 DRAWS = 2  # random losses of each size a step of the search looks at
 

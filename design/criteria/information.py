@@ -2,14 +2,13 @@
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.pad.contact import fibre_axes, signals
-from design.pad.kernels.pchip import population_slopes, sample_curves
-from design.pad.kernels.published import information as kernels
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Contact, between_fibres
-from design.settings.search import LEVELS
+from padforge.design.pad.contact import fibre_axes, signals
+from padforge.design.pad.kernels.pchip import population_slopes, sample_curves
+from padforge.design.pad.kernels.published import information as kernels
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, between_fibres
+from padforge.design.settings.search import LEVELS
 
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:

@@ -11,13 +11,12 @@ from itertools import combinations, product
 import numpy as np
 import shapely
 import torch
+from padforge.design.common.errors import InputError
+from padforge.design.pad.courses.common_length import common_stretches
+from padforge.design.pad.courses.keep_out import keep_outs
+from padforge.design.pad.kernels.lying_beside import lying_beside
+from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 from torch import Tensor
-
-from design.common.errors import InputError
-from design.pad.courses.common_length import common_stretches
-from design.pad.courses.keep_out import keep_outs
-from design.pad.kernels.lying_beside import lying_beside
-from design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 from .differentiable import pchip_sample, span_samples
 

@@ -5,15 +5,14 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from design.common.computing import in_chunks
-from design.common.errors import InputError, instance, reals, whole
-from design.common.settings import or_default
-from design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, grid_unit_mm, press_shape
-from design.pad.kernels.published.information import published_terms as terms_kernel
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, Contact, Counts, Layout, between_fibres
-from design.settings.search import LEVELS, MOST_LEVELS, SIDE, WEIGHTS
+from padforge.design.common.computing import in_chunks
+from padforge.design.common.errors import InputError, instance, reals, whole
+from padforge.design.common.settings import or_default
+from padforge.design.pad.contact import as_presses, as_samples, boustrophedon, fibre_axes, grid_unit_mm, press_shape
+from padforge.design.pad.kernels.published.information import published_terms as terms_kernel
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, Contact, Counts, Layout, between_fibres
+from padforge.design.settings.search import LEVELS, MOST_LEVELS, SIDE, WEIGHTS
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,30 @@ from functools import lru_cache
 
 import numpy as np
 import shapely
-
-from design.common.errors import instance
-from design.common.settings import or_default
-from design.pad.courses.bending import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, traced_curve
-from design.pad.courses.common_length import common_stretches
-from design.pad.courses.curves import Crossing, beziers, crossing_angles, crossings, flatten, lengths, slope_beziers
-from design.pad.courses.keep_out import keep_outs
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
+from padforge.design.common.errors import instance
+from padforge.design.common.settings import or_default
+from padforge.design.pad.courses.bending import (
+    UNFOLDED,
+    bend_radius,
+    extreme_headings,
+    fold_gap,
+    rolled_turns,
+    traced_curve,
+)
+from padforge.design.pad.courses.common_length import common_stretches
+from padforge.design.pad.courses.curves import (
+    Crossing,
+    beziers,
+    crossing_angles,
+    crossings,
+    flatten,
+    lengths,
+    slope_beziers,
+)
+from padforge.design.pad.courses.keep_out import keep_outs
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 _TOLERANCE_MM = 1e-3
 _REMEMBERED = 256

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from design.common.errors import InputError, instance
-from design.common.settings import or_default
-from design.pad.contact import boustrophedon, lattice, relative_stretch, signals, signals_quantized
-from design.pad.courses.keep_out import outside
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import (
+from padforge.design.common.errors import InputError, instance
+from padforge.design.common.settings import or_default
+from padforge.design.pad.contact import boustrophedon, lattice, relative_stretch, signals, signals_quantized
+from padforge.design.pad.courses.keep_out import outside
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import (
     PUBLISHED_CONTACT,
     Contact,
     PadSettings,
@@ -125,8 +125,7 @@ def all_terms(
 ) -> dict[str, float]:
     """What `score` gives for a pad of that size, whose `ambiguities` are known to be `spread`."""
     import torch
-
-    from design.pad.contact import fibre_axes
+    from padforge.design.pad.contact import fibre_axes
 
     from .penalties import penalties
 

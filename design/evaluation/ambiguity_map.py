@@ -1,19 +1,18 @@
 """Where a pad confuses presses: the localisation ambiguity place by place, so soon that a person sees it while drawing.
 
-The mean over all places is what `design.criteria.score.ambiguities` has.
+The mean over all places is what `padforge.design.criteria.score.ambiguities` has.
 """
 
 import numpy as np
-
-from design.criteria.fibre_loss import loss_shares, lost_subsets
-from design.criteria.score import MOST_LOSSES
-from design.pad.contact import fibre_axes, press_shape, signals
-from design.pad.courses.curves import lengths
-from design.pad.kernels.measured_signals import element_signals, fibre_elements, spacing_of
-from design.pad.kernels.pchip import population_slopes
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Contact
+from padforge.design.criteria.fibre_loss import loss_shares, lost_subsets
+from padforge.design.criteria.score import MOST_LOSSES
+from padforge.design.pad.contact import fibre_axes, press_shape, signals
+from padforge.design.pad.courses.curves import lengths
+from padforge.design.pad.kernels.measured_signals import element_signals, fibre_elements, spacing_of
+from padforge.design.pad.kernels.pchip import population_slopes
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact
 
 from .kernels.ambiguity import ambiguity_by_place
 

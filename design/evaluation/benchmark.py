@@ -5,14 +5,13 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.benchmarking import harness
-from design.common.computing import one_torch_thread
-from design.criteria.fibre_loss import lost_subsets
-from design.pad.contact import signals
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT
+from padforge.design.benchmarking import harness
+from padforge.design.common.computing import one_torch_thread
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.pad.contact import signals
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT
 
 from .levenberg_marquardt import LEARN, VALIDATE, ColumnScale, Network, first_weights
 from .localisation_error import Loss, PressSets

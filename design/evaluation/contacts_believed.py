@@ -4,14 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-
-from design.common.errors import whole
-from design.criteria.fibre_loss import lost_subsets
-from design.pad.contact import relative_stretch
-from design.pad.courses.keep_out import outside
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, PadSettings, Scatter
+from padforge.design.common.errors import whole
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.pad.contact import relative_stretch
+from padforge.design.pad.courses.keep_out import outside
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, PadSettings, Scatter
 
 from .expected_error import straight_full_scale
 from .localisation_error import LossError, PressSets, fresh_presses, training_presses

@@ -32,15 +32,23 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from padforge.design.common.computing import one_torch_thread
+from padforge.design.criteria.fibre_loss import loss_masks, loss_shares
+from padforge.design.pad.contact import lattice, relative_stretch
+from padforge.design.pad.courses.keep_out import outside
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import (
+    Contact,
+    Layout,
+    PadSettings,
+    Rectangle,
+    Scatter,
+    SearchSettings,
+    Sensed,
+    sensed_rectangle,
+)
 from torch import Tensor
-
-from design.common.computing import one_torch_thread
-from design.criteria.fibre_loss import loss_masks, loss_shares
-from design.pad.contact import lattice, relative_stretch
-from design.pad.courses.keep_out import outside
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Contact, Layout, PadSettings, Rectangle, Scatter, SearchSettings, Sensed, sensed_rectangle
 
 SEARCHED, JUDGED, WINDOW = 12, 14, 5.0
 """Presses along a side of a window's lattice, in a search and where a pad is judged, and its longest side, grid units.

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from design.common.errors import InputError
-from design.pad.knots import Array
+from padforge.design.common.errors import InputError
+from padforge.design.pad.knots import Array
 
 if TYPE_CHECKING:
     from torch import Tensor

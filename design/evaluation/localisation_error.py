@@ -7,15 +7,14 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError, instance, shown, whole
-from design.common.settings import or_default
-from design.criteria.fibre_loss import lost_subsets
-from design.pad.contact import boustrophedon, signals
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from padforge.design.common.computing import one_torch_thread, run_tasks
+from padforge.design.common.errors import InputError, instance, shown, whole
+from padforge.design.common.settings import or_default
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.pad.contact import boustrophedon, signals
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 from .levenberg_marquardt import Network, best_device, fit_many
 

@@ -5,10 +5,10 @@ from concurrent.futures import Executor, Future
 from functools import partial
 from typing import Any
 
-from design.benchmarking.harness import Bench, BenchTrial
-from design.criteria.rules import check_rules
-from design.evaluation.localisation_error import localisation_error
-from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
+from padforge.design.benchmarking.harness import Bench, BenchTrial
+from padforge.design.criteria.rules import check_rules
+from padforge.design.evaluation.localisation_error import localisation_error
+from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
 
 from .search import SearchResult, SearchRun, search
 

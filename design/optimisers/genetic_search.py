@@ -5,18 +5,17 @@ import math
 from typing import Any
 
 import numpy as np
+from padforge.design.common.checkpoints import State
+from padforge.design.criteria.published_objective import published_presses, published_terms
+from padforge.design.pad.courses.curves import refine
+from padforge.design.pad.knots import MARGIN, Array, assemble
+from padforge.design.pad.morphology import Morphology
 from pymoo.algorithms.soo.nonconvex.ga import GA
 from pymoo.core.population import Population
 from pymoo.core.problem import Problem as PymooProblem
 from pymoo.core.repair import Repair
 from pymoo.core.termination import NoTermination
 from pymoo.operators.sampling.rnd import FloatRandomSampling
-
-from design.common.checkpoints import State
-from design.criteria.published_objective import published_presses, published_terms
-from design.pad.courses.curves import refine
-from design.pad.knots import MARGIN, Array, assemble
-from design.pad.morphology import Morphology
 
 from .problem import SearchProblem
 

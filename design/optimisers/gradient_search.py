@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-
-from design.common.checkpoints import State
-from design.criteria.ambiguity import sharpness
-from design.criteria.differentiable import arc_lengths, pchip_slopes, press_signals
-from design.criteria.fibre_loss import draw_losses, loss_shares
-from design.criteria.penalties import penalties
-from design.evaluation.expected_error import (
+from padforge.design.common.checkpoints import State
+from padforge.design.criteria.ambiguity import sharpness
+from padforge.design.criteria.differentiable import arc_lengths, pchip_slopes, press_signals
+from padforge.design.criteria.fibre_loss import draw_losses, loss_shares
+from padforge.design.criteria.penalties import penalties
+from padforge.design.evaluation.expected_error import (
     SEARCHED,
     confusable,
     drawn_window,
@@ -29,9 +27,10 @@ from design.evaluation.expected_error import (
     straight_full_scale,
     window_presses,
 )
-from design.pad.contact import boustrophedon
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
+from padforge.design.pad.contact import boustrophedon
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from torch import Tensor
 
 from .parametrization import Fibres, border_of, first_course
 from .problem import SearchProblem
@@ -39,7 +38,7 @@ from .problem import SearchProblem
 LOUDER = 2.0  # scatter of the first step as a multiple of the last one's
 RATE = 0.04
 PENALTY = (1.0, 300.0)  # weight of the rules, raised from first to last step
-MARGIN = 1.05  # on the limits of the rules
+RULE_MARGIN = 1.05  # on the limits of the rules
 NOTED_STEPS = 10  # between entries of the history
 REPAIR_STEPS, REPAIR_CHECKS = 600, 20  # after the last step, until the exact check passes; steps between checks
 REPAIR_MARGIN = 0.01  # added to the margin at each check that does not pass
@@ -136,7 +135,7 @@ class GradientSearch:
         total = self._expected_error(travel, cross, LOUDER ** (1 - progress))
         self.objective = total.item()
         if rules.enforce:
-            total = total + PENALTY[0] * (PENALTY[1] / PENALTY[0]) ** progress * self._penalty(travel, cross, MARGIN)
+            total = total + PENALTY[0] * (PENALTY[1] / PENALTY[0]) ** progress * self._penalty(travel, cross, RULE_MARGIN)
         self._follow(total, rate)
         self.step += 1
         if self.step % NOTED_STEPS == 0 or self.step == search.steps:
@@ -155,7 +154,7 @@ class GradientSearch:
         repairs = self.step - self.problem.search.steps
         checks = repairs // REPAIR_CHECKS
         rate = min(REPAIR_RATE * REPAIR_FASTER**checks, REPAIR_FASTEST)
-        self._follow(self._penalty(*self.fibres.axes(), MARGIN + REPAIR_MARGIN * checks), rate)
+        self._follow(self._penalty(*self.fibres.axes(), RULE_MARGIN + REPAIR_MARGIN * checks), rate)
         self.step += 1
         if (repairs + 1) % REPAIR_CHECKS == 0:
             self.done = repairs + 1 >= REPAIR_STEPS or not self._broken()

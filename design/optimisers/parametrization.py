@@ -2,13 +2,12 @@
 
 import numpy as np
 import torch
+from padforge.design.pad.courses.curves import refine
+from padforge.design.pad.courses.passing import passing, straight_course
+from padforge.design.pad.knots import MARGIN, Array, assemble, axes, kernel_ends
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Layout, PadSettings, RulesSettings
 from torch import Tensor
-
-from design.pad.courses.curves import refine
-from design.pad.courses.passing import passing, straight_course
-from design.pad.knots import MARGIN, Array, assemble, axes, kernel_ends
-from design.pad.morphology import Morphology
-from design.settings import Layout, PadSettings, RulesSettings
 
 KNOTS_PER_TURN = 3  # before, at and after: a turn of given radius needs its shoulders
 OTHER_START = 3  # the last of the default's

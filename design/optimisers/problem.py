@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import Any
 
-from design.common.errors import MOST_VALUES, InputError, instance
-from design.criteria.fibre_loss import loss_shares
-from design.criteria.rules import Violation, check_rules
-from design.criteria.score import free_presses
-from design.pad.courses.keep_out import require_free_ends
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.common.errors import MOST_VALUES, InputError, instance
+from padforge.design.criteria.fibre_loss import loss_shares
+from padforge.design.criteria.rules import Violation, check_rules
+from padforge.design.criteria.score import free_presses
+from padforge.design.pad.courses.keep_out import require_free_ends
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 
 @dataclass(frozen=True)

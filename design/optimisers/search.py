@@ -15,20 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common import profiling
-from design.common.checkpoints import Checkpoints, State
-from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError, instance, real, shown
-from design.common.errors import path as as_path
-from design.common.settings import or_default
-from design.criteria.fibre_loss import loss_shares
-from design.criteria.rules import Violation
-from design.criteria.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms, sharpness_of
-from design.evaluation.expected_error import error_terms, expected_errors
-from design.pad.courses.passing import straight_course
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.common import profiling
+from padforge.design.common.checkpoints import Checkpoints, State
+from padforge.design.common.computing import one_torch_thread, run_tasks
+from padforge.design.common.errors import InputError, instance, real, shown
+from padforge.design.common.errors import path as as_path
+from padforge.design.common.settings import or_default
+from padforge.design.criteria.fibre_loss import loss_shares
+from padforge.design.criteria.rules import Violation
+from padforge.design.criteria.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms, sharpness_of
+from padforge.design.evaluation.expected_error import error_terms, expected_errors
+from padforge.design.pad.courses.passing import straight_course
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .problem import SearchProblem, posed
 from .start import StartSlice, advance_start, finish

@@ -4,9 +4,9 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from design.common.checkpoints import State
-from design.common.computing import one_torch_thread
-from design.pad.morphology import Morphology
+from padforge.design.common.checkpoints import State
+from padforge.design.common.computing import one_torch_thread
+from padforge.design.pad.morphology import Morphology
 
 from .problem import SearchProblem
 

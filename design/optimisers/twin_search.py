@@ -9,12 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-from design.common.profiling import stage
-from design.evaluation.contacts_believed import errors_by_contact
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.common.profiling import stage
+from padforge.design.evaluation.contacts_believed import errors_by_contact
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .problem import posed
 from .search import SearchListener, SearchResult, SearchRun, score_result, search

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path as Outline
 from numba import njit
+from padforge.design.benchmarking.harness import Bench, BenchTrial
+from padforge.design.pad.kernels.pchip import pchip_sample
+from padforge.design.settings import PUBLISHED_CONTACT, Contact
 from scipy.interpolate import PchipInterpolator
-
-from design.benchmarking.harness import Bench, BenchTrial
-from design.pad.kernels.pchip import pchip_sample
-from design.settings import PUBLISHED_CONTACT, Contact
 
 from .contact import quantized_and_samples, signals_and_spans, signals_sparse
 from .knots import Array

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common import profiling
-from design.common.computing import in_chunks
-from design.common.errors import MOST_VALUES, InputError, instance, reals, whole
-from design.common.settings import or_default
-from design.pad.kernels import press
-from design.pad.kernels.exact_signals import exact_signals
-from design.pad.kernels.pchip import population_slopes
-from design.pad.kernels.published.sampled_signals import quantized_signals
-from design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
+from padforge.design.common import profiling
+from padforge.design.common.computing import in_chunks
+from padforge.design.common.errors import MOST_VALUES, InputError, instance, reals, whole
+from padforge.design.common.settings import or_default
+from padforge.design.pad.kernels import press
+from padforge.design.pad.kernels.exact_signals import exact_signals
+from padforge.design.pad.kernels.pchip import population_slopes
+from padforge.design.pad.kernels.published.sampled_signals import quantized_signals
+from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
 from .courses.curves import lengths
 from .knots import FARTHEST, LEAST_SPAN, Array, Ints, axes, kernel_ends, layout_of

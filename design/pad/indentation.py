@@ -21,11 +21,10 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.computing import in_chunks
-from design.common.errors import InputError, instance, real, reals, shown
-from design.pad.kernels.indentation import CONE, FLAT, SPHERE, lengthenings
-from design.pad.kernels.pchip import population_slopes
+from padforge.design.common.computing import in_chunks
+from padforge.design.common.errors import InputError, instance, real, reals, shown
+from padforge.design.pad.kernels.indentation import CONE, FLAT, SPHERE, lengthenings
+from padforge.design.pad.kernels.pchip import population_slopes
 
 from .contact import as_presses, fibre_axes, require_room
 from .knots import FARTHEST, Array

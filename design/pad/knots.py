@@ -5,10 +5,9 @@ Where no layout is told, arrays are those of a square pad of one pitch: as many 
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from design.common.errors import InputError, reals
-from design.pad.kernels.press import Ends
-from design.settings import Layout
+from padforge.design.common.errors import InputError, reals
+from padforge.design.pad.kernels.press import Ends
+from padforge.design.settings import Layout
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError, instance, mapping, reals, shown, whole
-from design.common.errors import path as as_path
-from design.common.files import read_json, write_json
-from design.settings import MOST_FIBRES, Counts, Layout, Pitch
+from padforge.design.common.errors import InputError, instance, mapping, reals, shown, whole
+from padforge.design.common.errors import path as as_path
+from padforge.design.common.files import read_json, write_json
+from padforge.design.settings import MOST_FIBRES, Counts, Layout, Pitch
 
 from .knots import FARTHEST, LEAST_SPAN, MARGIN, Array, assemble
-from .knots import of_parameters as knots_of_parameters
+from .knots import of_parameters
 
 SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"
 """Of a square pad of one pitch, which every version reads, and of any other one."""
@@ -125,7 +124,7 @@ class Morphology:
     @classmethod
     def from_parameters(cls, parameters: ArrayLike, pitch_mm: Pitch = 11.25) -> "Morphology":
         """From the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals, their y."""
-        return cls(knots_of_parameters(parameters), pitch_mm)
+        return cls(of_parameters(parameters), pitch_mm)
 
     def tiled(self, times: int) -> "Morphology":
         """A pad of M `times` fibres a family, this one's course repeated over its surface, times x times.

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError, instance, mapping, real, reals, shown, whole
-from design.common.errors import path as as_path
-from design.common.files import read_json, write_json
-from design.settings import Contact
+from padforge.design.common.errors import InputError, instance, mapping, real, reals, shown, whole
+from padforge.design.common.errors import path as as_path
+from padforge.design.common.files import read_json, write_json
+from padforge.design.settings import Contact
 
 from .contact import as_presses
 from .courses.curves import lengths

@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from design.common.errors import InputError, shown
-from design.common.figures import CURVES, FAINT, INK, canvas, explain, head, save_figure, tidy
-from design.common.files import provenance, write_json
-from design.common.profiling import stage
-from design.common.settings import Spec
-from design.evaluation.contacts_believed import beside_straight, errors_by_contact
-from design.optimisers.search import SearchRun
-from design.pad.courses.curves import crossings, lengths
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.common.errors import InputError, shown
+from padforge.design.common.figures import CURVES, FAINT, INK, canvas, explain, head, save_figure, tidy
+from padforge.design.common.files import provenance, write_json
+from padforge.design.common.profiling import stage
+from padforge.design.common.settings import Spec
+from padforge.design.evaluation.contacts_believed import beside_straight, errors_by_contact
+from padforge.design.optimisers.search import SearchRun
+from padforge.design.pad.courses.curves import crossings, lengths
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .contact_section import contact_of
 from .files import run_search

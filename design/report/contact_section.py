@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from design.common.files import provenance, write_json
-from design.common.page.elements import PageSection, paragraph, table
-from design.common.profiling import stage
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, SearchSettings
+from padforge.design.common.files import provenance, write_json
+from padforge.design.common.page.elements import PageSection, paragraph, table
+from padforge.design.common.profiling import stage
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, SearchSettings
 
 if TYPE_CHECKING:
-    from design.common.settings import Spec
+    from padforge.design.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
@@ -30,7 +30,7 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     Returns:
         The document: rows of contact, pad and mean errors in mm with 0, 1, ... fibres lost.
     """
-    from design.evaluation.contacts_believed import beside_straight, contacts_in_question, errors_by_contact
+    from padforge.design.evaluation.contacts_believed import beside_straight, contacts_in_question, errors_by_contact
 
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)

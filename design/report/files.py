@@ -5,27 +5,34 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from design.common.checkpoints import Checkpoints
-from design.common.command_line import progress
-from design.common.errors import InputError
-from design.common.figures import save_figure
-from design.common.files import as_written, check_replaceable, provenance, read_json, sha256, staged, write_json
-from design.common.profiling import stage
-from design.criteria.rules import Violation, check_rules
-from design.optimisers.search import SearchResult, SearchRun, search
-from design.optimisers.twin_search import search_for_twin, state_folders
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.command_line import progress
+from padforge.design.common.errors import InputError
+from padforge.design.common.figures import save_figure
+from padforge.design.common.files import (
+    as_written,
+    check_replaceable,
+    provenance,
+    read_json,
+    sha256,
+    staged,
+    write_json,
+)
+from padforge.design.common.profiling import stage
+from padforge.design.criteria.rules import Violation, check_rules
+from padforge.design.optimisers.search import SearchResult, SearchRun, search
+from padforge.design.optimisers.twin_search import search_for_twin, state_folders
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .contact_section import contact_of
 from .plan_drawing import draw_plan
 from .twin_settings import settings_for_twin
 
 if TYPE_CHECKING:
+    from padforge.design.common.settings import Spec
+    from padforge.design.optimisers.search import SearchListener
     from rich.progress import Progress, TaskID
-
-    from design.common.settings import Spec
-    from design.optimisers.search import SearchListener
 
 SURE = 0.05
 """Share by which expected errors must differ to say which pad a trained network will locate better by."""

@@ -6,14 +6,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import NDArray
-
-from design.common.errors import InputError, instance, reals, shown
-from design.common.figures import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
-from design.criteria.rules import Violation
-from design.pad.courses.curves import crossings, flatten
-from design.pad.morphology import Morphology
-from design.settings import Contact
-from design.settings import Polygon as Corners
+from padforge.design.common.errors import InputError, instance, reals, shown
+from padforge.design.common.figures import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
+from padforge.design.criteria.rules import Violation
+from padforge.design.pad.courses.curves import crossings, flatten
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact
+from padforge.design.settings import Polygon as Corners
 
 
 def draw_plan(

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from design.common.files import as_written, read_json, unchanged
-from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
-from design.settings import PadSettings, RulesSettings, sensed_rectangle
+from padforge.design.common.files import as_written, read_json, unchanged
+from padforge.design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
+from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
 _TERMS = {
     "information": "mutual information of places and signals, bits",

@@ -4,15 +4,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.evaluation.expected_error import straight_full_scale
-from design.pad.morphology import Morphology
-from design.pad.twin import Twin
-from design.settings import Contact, Layout, PadSettings, SearchSettings
+from padforge.design.common.errors import InputError
+from padforge.design.evaluation.expected_error import straight_full_scale
+from padforge.design.pad.morphology import Morphology
+from padforge.design.pad.twin import Twin
+from padforge.design.settings import Contact, Layout, PadSettings, SearchSettings
 
 if TYPE_CHECKING:
-    from design.common.settings import Spec
+    from padforge.design.common.settings import Spec
 
 KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
 """Of `[pad]`, that say where fibres end."""

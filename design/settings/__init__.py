@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from design.common.settings import Settings
+from padforge.design.common.settings import Settings
 
 from .contact import MEASURED_REACH, PUBLISHED_CONTACT, Contact
 from .layout import DEFAULT_PITCH_MM, MOST_FIBRES, Counts, Layout, Pitch

@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from padforge.design.common.settings import Settings, as_python, as_tuple, none_as
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
-
-from design.common.settings import Settings, as_python, as_tuple, none_as
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from design.common.errors import InputError, real, shown, whole
+from padforge.design.common.errors import InputError, real, shown, whole
 
 if TYPE_CHECKING:
     import numpy as np

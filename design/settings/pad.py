@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+from padforge.design.common.settings import Settings, as_tuple, none_as
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
-
-from design.common.settings import Settings, as_tuple, none_as
 
 from .layout import DEFAULT_PITCH_MM, Layout
 

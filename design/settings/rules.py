@@ -2,9 +2,8 @@
 
 from typing import Annotated
 
+from padforge.design.common.settings import Settings, none_as
 from pydantic import Field
-
-from design.common.settings import Settings, none_as
 
 TRACK_WIDTH_MM = 0.4
 """Width of a track where the mould does not say another."""

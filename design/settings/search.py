@@ -3,9 +3,8 @@
 import math
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
+from padforge.design.common.settings import Settings, as_tuple
 from pydantic import BeforeValidator, Field, field_validator
-
-from design.common.settings import Settings, as_tuple
 
 from .contact import PUBLISHED_CONTACT, Contact
 

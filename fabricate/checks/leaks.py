@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
+from padforge.fabricate.mould.plan import areas, overlap, without
 from shapely.geometry.base import BaseGeometry
-
-from fabricate.mould.plan import areas, overlap, without
 
 from .findings import Finding, verdict
 from .slices import Slab

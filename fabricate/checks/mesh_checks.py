@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import instance, real, whole
-from fabricate.mesh_files import read_mesh
-from fabricate.settings import DEFAULTS, PrinterSettings
+from padforge.design.common.errors import instance, real, whole
+from padforge.fabricate.mesh_files import read_mesh
+from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
 from . import self_intersections
 from .findings import Finding, verdict

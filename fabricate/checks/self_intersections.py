@@ -16,9 +16,8 @@ import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import NDArray
-
-from design.pad.knots import Array
-from fabricate.mould.plan import SNAP_MM
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.plan import SNAP_MM
 
 PENETRATION_MM = 1e-3
 """Triangles that reach less far into each other only touch: a thousand times what writing an STL moves a corner."""

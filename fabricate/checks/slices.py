@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import shapely
+from padforge.fabricate.mould.plan import areas, overlap, without
 from shapely.geometry.base import BaseGeometry
-
-from fabricate.mould.plan import areas, overlap, without
 
 from .surface import Surface
 

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from padforge.fabricate.mould.plan import without
+from padforge.fabricate.settings import PrinterSettings
 from shapely.geometry.base import BaseGeometry
-
-from fabricate.mould.plan import without
-from fabricate.settings import PrinterSettings
 
 from .findings import Finding, Place, Status, verdict
 from .slices import Slab, least_width, section, spare_width, tested_width, too_narrow

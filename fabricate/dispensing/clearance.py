@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-
-from design.pad.knots import Array
-from fabricate.checks.findings import Finding, verdict
-from fabricate.mould.plan import Plan, without
+from padforge.design.pad.knots import Array
+from padforge.fabricate.checks.findings import Finding, verdict
+from padforge.fabricate.mould.plan import Plan, without
 
 from .course import Step, Stroke, turned_over
 

@@ -16,11 +16,10 @@ from functools import cached_property
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-
-from design.pad.knots import Array
-from fabricate.mould.plan import Plan
-from fabricate.report.fibre_layers import Layer, layers
-from fabricate.settings import DispenserSettings
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.report.fibre_layers import Layer, layers
+from padforge.fabricate.settings import DispenserSettings
 
 TOLERANCE_MM = 0.005
 """How far the straight pieces of a course may lie from the curve: a tenth of what a fine gantry repeats."""

@@ -4,8 +4,8 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from fabricate.checks.findings import Finding
-from fabricate.mould.plan import Plan
+from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.mould.plan import Plan
 
 from .clearance import check_course
 from .course import laying_steps

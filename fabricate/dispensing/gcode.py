@@ -5,7 +5,7 @@ G0 is left out: GRBL goes it as fast as the machine can, whatever speed is said,
 
 from collections.abc import Iterable, Iterator
 
-from fabricate.settings import DispenserSettings
+from padforge.fabricate.settings import DispenserSettings
 
 from .program import Go, Instruction, Lay, Pause, Place
 

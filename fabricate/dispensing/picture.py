@@ -3,11 +3,10 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-
-from design.common.figures import ALARM, FAINT, INK
-from design.pad.knots import Array
-from fabricate.mould.plan import Plan, polygon_rings
-from fabricate.report.fibre_layers import FAMILIES
+from padforge.design.common.figures import ALARM, FAINT, INK
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.plan import Plan, polygon_rings
+from padforge.fabricate.report.fibre_layers import FAMILIES
 
 from .course import Step, turned_over
 

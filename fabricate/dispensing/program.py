@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from fabricate.mould.plan import Plan
-from fabricate.report.fibre_layers import fibre_name
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.report.fibre_layers import fibre_name
 
 from .course import Step, Stroke
 

@@ -4,9 +4,8 @@ import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-
-from design.pad.knots import Array
-from fabricate.settings import DispenserSettings
+from padforge.design.pad.knots import Array
+from padforge.fabricate.settings import DispenserSettings
 
 from .course import TOLERANCE_MM, Stroke
 from .program import Go, Instruction, Pause

@@ -11,11 +11,10 @@ import numpy as np
 import shapely
 from build123d import Edge, GeomType, PositionMode
 from numpy.typing import NDArray
-
-from design.benchmarking.harness import Bench, BenchTrial
-from design.pad.courses.curves import flatten
-from design.pad.morphology import Morphology
-from fabricate.settings import DEFAULTS, MouldSettings
+from padforge.design.benchmarking.harness import Bench, BenchTrial
+from padforge.design.pad.courses.curves import flatten
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
 from .assembly import mould_body, plan_mesh
 from .cad.bodies import body_solid

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from design.common.figures import HORIZONTAL, VERTICAL
-from fabricate.mould.plan import Plan
+from padforge.design.common.figures import HORIZONTAL, VERTICAL
+from padforge.fabricate.mould.plan import Plan
 
 FAMILIES = ("horizontal", "vertical")
 COLOURS = (HORIZONTAL, VERTICAL)

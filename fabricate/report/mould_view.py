@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.page.shipped import resource
-from fabricate.mesh_files import read_mesh
+from padforge.design.common.page.shipped import resource
+from padforge.fabricate.mesh_files import read_mesh
 
 from .fibre_layers import COLOURS, FAMILIES
 
@@ -112,7 +111,7 @@ def view(mesh: Packed, document: Mapping[str, Any]) -> str:
 
 def script() -> str:
     """JavaScript that draws the view of a page and turns it."""
-    return resource("fabricate.report", "mould_view.js")
+    return resource("padforge.fabricate.report", "mould_view.js")
 
 
 def _packed(vertices: NDArray[np.floating], triangles: NDArray[np.integer], tolerance_mm: float) -> Packed:

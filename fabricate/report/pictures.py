@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.figures import ALARM, FAINT, INK, PAPER
-from fabricate.checks.findings import Finding
-from fabricate.mould.plan import INTO_WALL_MM, Plan, overlap, polygon_rings
+from padforge.design.common.figures import ALARM, FAINT, INK, PAPER
+from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.mould.plan import INTO_WALL_MM, Plan, overlap, polygon_rings
 
 from .fibre_layers import COLOURS, FAMILIES, Layer, layers
 from .laying.orientation import sentence
@@ -223,7 +222,7 @@ class _Sheet:
 
     def save(self, path: Path, handles: list[Any]) -> None:
         """Write the picture with its legend as PNG."""
-        from design.common.figures import save_figure
+        from padforge.design.common.figures import save_figure
 
         width, height = self.figure.get_size_inches() * _DPI
         below = _LINE * len(self.note)

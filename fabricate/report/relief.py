@@ -7,11 +7,10 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.assembly import mould_body
+from padforge.fabricate.mould.plan import Plan, polygon_rings
 from shapely.geometry.base import BaseGeometry
-
-from design.pad.knots import Array
-from fabricate.mould.assembly import mould_body
-from fabricate.mould.plan import Plan, polygon_rings
 
 Ints = NDArray[np.intp]
 

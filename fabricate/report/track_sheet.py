@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-
-from design.pad.courses.curves import beziers
-from design.pad.knots import Array
-from fabricate.mould.plan import Plan
+from padforge.design.pad.courses.curves import beziers
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.plan import Plan
 
 from .fibre_layers import COLOURS
 from .laying.orientation import sentence

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import click
-
-from design.common import command_line as common
-from design.common.errors import InputError
+from padforge.design.common import command_line as common
+from padforge.design.common.errors import InputError
 
 from .options import FOLDER, FibreNumbers, fibre_indices, lost_option, model_option, recording_argument, reported
 
@@ -26,11 +25,11 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
     if it did not, places are found as before. The old model is written over only where --out says so.
     """
-    from design.common.files import check_replaceable, refuse_unwritable, staged, write_json
-    from sense.health.model_folder import health_files, health_in
-    from sense.localizer.calibration import recalibration
-    from sense.localizer.localizer import Localizer
-    from sense.recordings.import_export import open_recording
+    from padforge.design.common.files import check_replaceable, refuse_unwritable, staged, write_json
+    from padforge.sense.health.model_folder import health_files, health_in
+    from padforge.sense.localizer.calibration import recalibration
+    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.recordings.import_export import open_recording
 
     target = out or common.pad_folder(recording)
     if out is None and target.resolve() == model.resolve():
@@ -79,13 +78,13 @@ def fibre_loss(
     worst set of each size, and without those fibres that --failed names. Retrained networks that are done are
     kept when it is broken off, and the same command goes on from them.
     """
-    from design.common.checkpoints import Checkpoints
-    from design.common.files import refuse_unwritable, staged, write_json
-    from sense.localizer.calibration.fibre_loss_study import fibre_loss_lines, fibre_loss_study
-    from sense.localizer.localizer import Localizer
-    from sense.recordings.import_export import open_recording
-    from sense.report.fibre_loss_figure import draw_fibre_loss
-    from sense.settings import LocalizerSettings
+    from padforge.design.common.checkpoints import Checkpoints
+    from padforge.design.common.files import refuse_unwritable, staged, write_json
+    from padforge.sense.localizer.calibration.fibre_loss_study import fibre_loss_lines, fibre_loss_study
+    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.recordings.import_export import open_recording
+    from padforge.sense.report.fibre_loss_figure import draw_fibre_loss
+    from padforge.sense.settings import LocalizerSettings
 
     if not (model or retrain):
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
@@ -127,11 +126,11 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 
     Writes learning_curve.json and learning_curve.png.
     """
-    from design.common.files import refuse_unwritable, staged, write_json
-    from sense.localizer.calibration import learning_curve as study
-    from sense.recordings.import_export import open_recording
-    from sense.report.learning_curve_figure import draw_learning_curve
-    from sense.settings import LocalizerSettings
+    from padforge.design.common.files import refuse_unwritable, staged, write_json
+    from padforge.sense.localizer.calibration import learning_curve as study
+    from padforge.sense.recordings.import_export import open_recording
+    from padforge.sense.report.learning_curve_figure import draw_learning_curve
+    from padforge.sense.settings import LocalizerSettings
 
     target = out or common.pad_folder(recording)
     refuse_unwritable(target)

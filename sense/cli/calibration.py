@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from design.common import command_line as common
+from padforge.design.common import command_line as common
 
 from .options import FEATURES, METHODS, lost_option, model_option, read_recording, recording_argument, reported
 
 if TYPE_CHECKING:
-    from design.common.settings import Spec
-    from sense.recordings.recording import Recording
+    from padforge.design.common.settings import Spec
+    from padforge.sense.recordings.recording import Recording
 
 
 @click.command()
@@ -48,8 +47,8 @@ def calibrate(
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
     error_map.png and error_by_loss.png.
     """
-    from design.common.files import claimed
-    from sense.report.calibration_results import calibration_lines
+    from padforge.design.common.files import claimed
+    from padforge.sense.report.calibration_results import calibration_lines
 
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     folder = out or common.pad_folder(recording)
@@ -69,8 +68,8 @@ def run_calibration(
     force: bool = False,
 ) -> dict[str, Any]:
     """Calibrate into `out` with the settings of `spec`, and say on stderr how far it is; returns `calibration.json`."""
-    from sense.report.calibration_results import calibrate_into
-    from sense.settings import LocalizerSettings
+    from padforge.sense.report.calibration_results import calibrate_into
+    from padforge.sense.settings import LocalizerSettings
 
     options = spec.section(LocalizerSettings, **overrides)
     with reported("training") as report:
@@ -99,9 +98,9 @@ def evaluate(model: Path, recording: Path, lost: int, as_json: bool) -> None:
 
     Of the recording the model was trained on, only the presses that were held back count.
     """
-    from sense.localizer.evaluation import evaluate as test
-    from sense.localizer.localizer import Localizer
-    from sense.report.calibration_results import calibration_lines
+    from padforge.sense.localizer.evaluation import evaluate as test
+    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.report.calibration_results import calibration_lines
 
     localizer = Localizer.load(model)
     levels = range(min(lost, localizer.fibres - 1) + 1)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import click
-
-from design.common import command_line as common
+from padforge.design.common import command_line as common
 
 from .options import FILE, read_recording, recording_argument
 
@@ -26,9 +25,9 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     Writes twin.json, for padforge design --twin and padforge sense record --rig simulated --twin; identification.json,
     twin_plan.png and twin_responses.png.
     """
-    from design.common.files import claimed
-    from design.pad.morphology import Morphology
-    from sense.report.identification_results import identification_lines, identify_into
+    from padforge.design.common.files import claimed
+    from padforge.design.pad.morphology import Morphology
+    from padforge.sense.report.identification_results import identification_lines, identify_into
 
     folder = out or common.pad_folder(recording)
     pad = Morphology.load(morphology)

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-
-from design.common.command_line import (
+from padforge.design.common.command_line import (
     json_option,
     load_spec,
     out_option,
@@ -15,7 +14,7 @@ from design.common.command_line import (
     show_result,
     spec_option,
 )
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 from .options import FibreNumbers, fibre_indices, model_option, read_recording, recording_argument, reported
 
@@ -37,9 +36,9 @@ def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path | None
     deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
     of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
-    from sense.health.model_folder import examined, has_health
-    from sense.localizer import locating
-    from sense.localizer.localizer import Localizer
+    from padforge.sense.health.model_folder import examined, has_health
+    from padforge.sense.localizer import locating
+    from padforge.sense.localizer.localizer import Localizer
 
     file = out or pad_folder(recording) / "places.csv"
     localizer = Localizer.load(model)
@@ -68,8 +67,8 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     """
     from dataclasses import asdict
 
-    from sense.health.model_folder import examined
-    from sense.health.monitor import fault_lines
+    from padforge.sense.health.model_folder import examined
+    from padforge.sense.health.monitor import fault_lines
 
     opened = read_recording(recording)
     known, findings = examined(model, opened)
@@ -120,8 +119,8 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     learnt from tell how far off it is, beside the model and, where that looks at the release, one that does not,
     trained for this. [localizer] says for how long they learn.
     """
-    from design.common.files import refuse_unwritable, sha256
-    from sense.localizer.localizer import Localizer
+    from padforge.design.common.files import refuse_unwritable, sha256
+    from padforge.sense.localizer.localizer import Localizer
 
     path, recording = files[-1], files[0] if len(files) == 2 else None
     if len(files) > 2:
@@ -135,14 +134,14 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     refuse_unwritable(path.parent)
     localizer, digest = Localizer.load(model), sha256(model / "localizer.json")
     if path.suffix == ".onnx":
-        from sense.live.deployment.onnx_file import export_onnx, onnx_line
+        from padforge.sense.live.deployment.onnx_file import export_onnx, onnx_line
 
         opened = None if recording is None else read_recording(recording)
         click.echo(f"{onnx_line(export_onnx(localizer, digest, path, opened))} -> {path}")
         return
-    from sense.live.deployment.budget import Budget
-    from sense.live.deployment.c_header import export_header, header_lines
-    from sense.settings import LocalizerSettings
+    from padforge.sense.live.deployment.budget import Budget
+    from padforge.sense.live.deployment.c_header import export_header, header_lines
+    from padforge.sense.settings import LocalizerSettings
 
     if recording is None:
         raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")

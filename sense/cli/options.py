@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from design.common.command_line import progress
-from design.common.errors import InputError
+from padforge.design.common.command_line import progress
+from padforge.design.common.errors import InputError
 
 if TYPE_CHECKING:
-    from sense.recordings.recording import Recording
+    from padforge.sense.recordings.recording import Recording
 
 METHODS, FEATURES = ("masked", "published"), ("full", "causal", "early", "published")
 SHOWN_HZ = 15
@@ -52,7 +51,7 @@ def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:
 
 def read_recording(path: Path) -> "Recording":
     """The recording in a folder or file, with a line on stderr where its end is torn off or cut off."""
-    from sense.recordings.import_export import open_recording
+    from padforge.sense.recordings.import_export import open_recording
 
     recording = open_recording(path)
     if recording.torn_presses:

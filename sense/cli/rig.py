@@ -6,18 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from design.common import command_line as common
-from design.common.errors import InputError
+from padforge.design.common import command_line as common
+from padforge.design.common.errors import InputError
 
 from .options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
 
 if TYPE_CHECKING:
-    from design.pad.morphology import Morphology
-    from design.pad.twin import Twin
-    from design.settings import PadSettings
-    from sense.recordings.recording import Recording
-    from sense.rig.planning.setup import Setup
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.pad.twin import Twin
+    from padforge.design.settings import PadSettings
+    from padforge.sense.recordings.recording import Recording
+    from padforge.sense.rig.planning.setup import Setup
 
 rig_option = click.option(
     "--rig",
@@ -81,11 +80,11 @@ def record(
     A recording that broke off keeps every finished press; --resume makes the others.
     Software is not the emergency stop: keep the robot's own one within reach.
     """
-    from design.settings import Contact, PadSettings
-    from sense.rig import operation
-    from sense.rig.devices.processes import require_rig_system
-    from sense.rig.planning.setup import Setup
-    from sense.settings import RigSettings
+    from padforge.design.settings import Contact, PadSettings
+    from padforge.sense.rig import operation
+    from padforge.sense.rig.devices.processes import require_rig_system
+    from padforge.sense.rig.planning.setup import Setup
+    from padforge.sense.settings import RigSettings
 
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
     target = out or folder / "recording"
@@ -115,7 +114,7 @@ def record(
 
 
 def _twin(path: Path | None, at_once: bool) -> "Twin | None":
-    from design.pad.twin import Twin
+    from padforge.design.pad.twin import Twin
 
     if path and not at_once:
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --through-drivers")
@@ -134,8 +133,8 @@ def _record_with(
     rig: str, setup: "Setup", model: Path | None, dry_run: bool, resume: bool, through_drivers: bool
 ) -> "Recording | None":
     """Record with an arm, or by hand."""
-    from sense.recordings.recorder import START
-    from sense.rig import operation
+    from padforge.sense.recordings.recorder import START
+    from padforge.sense.rig import operation
 
     if resume and not (setup.out / START).exists():
         _warn(f"{setup.out}: nothing to resume, a new recording begins")
@@ -150,11 +149,11 @@ def _record_with(
 
 def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording":
     """Show a person where to press, on a page and in the terminal, and take what is said on both."""
-    from sense.live.by_hand.session import WORDS, record_by_hand
-    from sense.live.by_hand.view import pad_view, view_lines
-    from sense.live.page_server import LivePage
-    from sense.rig.emulators.finger import pressed_by_finger
-    from sense.rig.operation import opened_board
+    from padforge.sense.live.by_hand.session import WORDS, record_by_hand
+    from padforge.sense.live.by_hand.view import pad_view, view_lines
+    from padforge.sense.live.page_server import LivePage
+    from padforge.sense.rig.emulators.finger import pressed_by_finger
+    from padforge.sense.rig.operation import opened_board
 
     words = {each["key"]: each["word"] for each in WORDS}
     with ExitStack() as stack:
@@ -193,7 +192,7 @@ def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording"
 
 
 def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
-    from design.pad.morphology import Morphology
+    from padforge.design.pad.morphology import Morphology
 
     return Morphology.load(morphology) if morphology else Morphology.straight(of_pad.layout)
 
@@ -218,11 +217,11 @@ def doctor(
     """
     from dataclasses import asdict
 
-    from design.settings import Contact, PadSettings
-    from sense.rig.devices.processes import require_rig_system
-    from sense.rig.operation import look_over
-    from sense.rig.planning.setup import Setup
-    from sense.settings import RigSettings
+    from padforge.design.settings import Contact, PadSettings
+    from padforge.sense.rig.devices.processes import require_rig_system
+    from padforge.sense.rig.operation import look_over
+    from padforge.sense.rig.planning.setup import Setup
+    from padforge.sense.settings import RigSettings
 
     require_rig_system()
     settings = common.load_spec(spec)

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from sense.recordings.processing.limits import Array
+from padforge.sense.recordings.processing.limits import Array
 
 from .fault_likelihoods import HYPOTHESES
 

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from design.common.errors import InputError
-from design.common.files import read_json
-from design.common.settings import validated
-from sense.recordings.processing.limits import Array, Indices, as_numbers, stream_of
-from sense.recordings.recording import rate_of
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import read_json
+from padforge.design.common.settings import validated
+from padforge.sense.recordings.processing.limits import Array, Indices, as_numbers, stream_of
+from padforge.sense.recordings.recording import rate_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import HYPOTHESES, FaultLikelihoods

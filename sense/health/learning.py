@@ -6,11 +6,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-
-from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError, instance, mapping, real, shown, whole
-from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask, as_numbers
-from sense.recordings.recording import Recording, rate_of
+from padforge.design.common.computing import one_torch_thread, run_tasks
+from padforge.design.common.errors import InputError, instance, mapping, real, shown, whole
+from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask, as_numbers
+from padforge.sense.recordings.recording import Recording, rate_of
 
 from .alarm_thresholds import Tail
 from .fault_likelihoods import FaultLikelihoods
@@ -38,7 +37,9 @@ def learn_health(
     Raises:
         InputError: too few presses, no living fibre, or an argument of another kind.
     """
-    from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
+    from padforge.sense.recordings.processing.press_alignment import (
+        as_detected,  # compiled, which takes a moment to load
+    )
 
     learnt = np.ones(len(instance("recording", recording, Recording).presses_mm), dtype=bool)
     away = as_numbers(held_back, np.int64, "held_back")

@@ -3,9 +3,9 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from design.common.files import resolve_exchange
-from sense.recordings.formats.assembly import FOUND
-from sense.recordings.recording import Recording
+from padforge.design.common.files import resolve_exchange
+from padforge.sense.recordings.formats.assembly import FOUND
+from padforge.sense.recordings.recording import Recording
 
 from .health_model import COMMANDED, DETECTED, HealthModel
 from .monitor import FibreFault, examine

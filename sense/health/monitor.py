@@ -7,9 +7,16 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-
-from design.common.errors import InputError, instance, whole
-from sense.recordings.processing.limits import MAX_VOLTS, Array, Floats, Indices, Mask, as_numbers, refuse_beyond
+from padforge.design.common.errors import InputError, instance, whole
+from padforge.sense.recordings.processing.limits import (
+    MAX_VOLTS,
+    Array,
+    Floats,
+    Indices,
+    Mask,
+    as_numbers,
+    refuse_beyond,
+)
 
 from .alarm_thresholds import climb
 from .fault_likelihoods import HYPOTHESES, MOST, noise_of

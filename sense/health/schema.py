@@ -5,10 +5,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from padforge.design.common.settings import Settings
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
 from pydantic import Field, JsonValue
-
-from design.common.settings import Settings
-from sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
 
 from .fault_likelihoods import HYPOTHESES, LIBRARY, STEPS
 from .fibre_prediction import COMPONENTS, HIDDEN, INPUTS, MEMBERS, TARGETS, TRACE

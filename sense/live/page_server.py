@@ -4,9 +4,9 @@ import contextlib
 import queue
 from collections.abc import Collection
 
-from design.common.errors import InputError
-from design.common.page.local_page.listening import HOST
-from design.common.page.local_page.local_page import LocalPage, page_text
+from padforge.design.common.errors import InputError
+from padforge.design.common.page.local_page.listening import HOST
+from padforge.design.common.page.local_page.local_page import LocalPage, page_text
 
 _MOST_WORDS = 16
 """That wait to be taken: a button may be hit again and again."""
@@ -27,7 +27,7 @@ class LivePage(LocalPage):
             InputError: as `LocalPage`.
         """
         self._words, self._said = frozenset(words), queue.Queue[str](_MOST_WORDS)
-        text = page_text("sense.live", f"pages/{page}", "pages/common.css", "pages/common.js")
+        text = page_text("padforge.sense.live", f"pages/{page}", "pages/common.css", "pages/common.js")
         super().__init__(port, text, {"/say": self._hear}, host=host, token=token)
 
     def said(self) -> list[str]:

@@ -11,17 +11,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, instance, real, shown, whole
-from sense.health.health_model import HealthModel
-from sense.health.monitor import FibreFault, Monitor
-from sense.health.trained_model import refuse_other_pad
-from sense.localizer.features import REST, SIZES, bridged, press_inputs
-from sense.localizer.localizer import Localizer
-from sense.localizer.locating import MEASURED
-from sense.localizer.normalization import Scaled
-from sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
-from sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+from padforge.design.common.errors import InputError, instance, real, shown, whole
+from padforge.sense.health.health_model import HealthModel
+from padforge.sense.health.monitor import FibreFault, Monitor
+from padforge.sense.health.trained_model import refuse_other_pad
+from padforge.sense.localizer.features import REST, SIZES, bridged, press_inputs
+from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.locating import MEASURED
+from padforge.sense.localizer.normalization import Scaled
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
+from padforge.sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
 
 from .press_buffer import DONE, NEEDS, Press, Ring
 

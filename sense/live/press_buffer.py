@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-
-from sense.health.fibre_prediction import RELEASED
-from sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
-from sense.recordings.processing.limits import Array
+from padforge.sense.health.fibre_prediction import RELEASED
+from padforge.sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
+from padforge.sense.recordings.processing.limits import Array
 
 HISTORY = SLOW[-1]
 """Readings before a press that its localizer looks at, as far as there are so many."""

@@ -7,20 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from design.common.errors import InputError, real
-from design.common.files import read_json
-from design.common.settings import validated
-from design.settings import Contact, PadSettings
-from sense.recordings.processing.limits import Array
-from sense.recordings.recorder import FORMAT, START
-from sense.recordings.recording import Recording, is_mirrored
-from sense.rig.devices.protocols import Converter
-from sense.rig.session.averaging import Averager
-from sense.settings import RigSettings
+from padforge.design.common.errors import InputError, real
+from padforge.design.common.files import read_json
+from padforge.design.common.settings import validated
+from padforge.design.settings import Contact, PadSettings
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recorder import FORMAT, START
+from padforge.sense.recordings.recording import Recording, is_mirrored
+from padforge.sense.rig.devices.protocols import Converter
+from padforge.sense.rig.session.averaging import Averager
+from padforge.sense.settings import RigSettings
 
 if TYPE_CHECKING:
-    from sense.rig.emulators.live_pad import SimulatedConverter
+    from padforge.sense.rig.emulators.live_pad import SimulatedConverter
 
 Block = tuple[Array, Array]
 """Times (n,) in s, and readings (n, C) in V."""
@@ -109,8 +108,8 @@ def simulated(model: Path) -> "SimulatedConverter":
     Raises:
         InputError: its recording is not beside it, or of another kind.
     """
-    from design.pad.morphology import Morphology  # needs what only other jobs need
-    from sense.rig.emulators.live_pad import SimulatedConverter
+    from padforge.design.pad.morphology import Morphology  # needs what only other jobs need
+    from padforge.sense.rig.emulators.live_pad import SimulatedConverter
 
     path = model / RECORDED / START
     if not path.is_file():

@@ -6,11 +6,10 @@ from math import ceil, isnan
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, instance, shown, whole
-from design.criteria.fibre_loss import lost_subsets
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, instance, shown, whole
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
 
 from .features import bridged, window_inputs
 from .localizer import Found, Localizer, Measured

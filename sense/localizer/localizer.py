@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError, instance, shown
-from design.common.files import read_json
-from sense.health.trained_model import files_of, refuse_other_pad
-from sense.recordings.processing.limits import Array, Floats, Mask
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, instance, shown
+from padforge.design.common.files import read_json
+from padforge.sense.health.trained_model import files_of, refuse_other_pad
+from padforge.sense.recordings.processing.limits import Array, Floats, Mask
+from padforge.sense.recordings.recording import Recording
 
 from .features import Inputs, press_inputs
 from .network import Weights, learnt, pooled, refuse_unsound

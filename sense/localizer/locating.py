@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError, instance, shown
-from design.common.files import write_text, writing
-from sense.health.monitor import FibreFault
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, instance, shown
+from padforge.design.common.files import write_text, writing
+from padforge.sense.health.monitor import FibreFault
+from padforge.sense.recordings.recording import Recording
 
 from .localizer import Found, Localizer
 

@@ -10,9 +10,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
-
-from design.common.errors import InputError
-from sense.recordings.processing.limits import Array, Floats, Mask
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.processing.limits import Array, Floats, Mask
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and

@@ -4,12 +4,18 @@ from collections.abc import Mapping, Sequence
 from reprlib import repr as shortened
 from typing import Annotated, Any, Literal
 
+from padforge.design.common.errors import InputError
+from padforge.design.common.settings import Settings
+from padforge.sense.recordings.processing.limits import (
+    LEAST_SPREAD_V,
+    MAX_FIBRES,
+    MAX_MM,
+    MAX_RATE_HZ,
+    MAX_VOLTS,
+    MIN_RATE_HZ,
+)
+from padforge.sense.settings import Features, Method, Split
 from pydantic import Field, JsonValue, ValidationError
-
-from design.common.errors import InputError
-from design.common.settings import Settings
-from sense.recordings.processing.limits import LEAST_SPREAD_V, MAX_FIBRES, MAX_MM, MAX_RATE_HZ, MAX_VOLTS, MIN_RATE_HZ
-from sense.settings import Features, Method, Split
 
 from .features import PASTS, PHASES, SIZES
 

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from design.common.errors import InputError
-from design.common.errors import path as as_path
-from design.pad.published_files.matlab import load_mat
-from sense.recordings.processing.limits import Array
+from padforge.design.common.errors import InputError
+from padforge.design.common.errors import path as as_path
+from padforge.design.pad.published_files.matlab import load_mat
+from padforge.sense.recordings.processing.limits import Array
 
 from .block_file import read_blocks
 from .formats.csv_recording import export_csv, import_csv

@@ -6,9 +6,9 @@ from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any, NamedTuple
 
-from design.common.errors import InputError
-from design.common.files import open_in_place, read_bytes
-from sense.recordings.processing.limits import MAX_INDEX, MAX_MM, MAX_N
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import open_in_place, read_bytes
+from padforge.sense.recordings.processing.limits import MAX_INDEX, MAX_MM, MAX_N
 
 
 class Press(NamedTuple):

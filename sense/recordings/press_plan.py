@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError
-from design.common.settings import or_default
-from design.pad.courses.keep_out import keep_outs, outside
-from design.pad.morphology import Morphology
-from design.settings import PadSettings
-from sense.recordings.formats.csv_table import CsvTable
-from sense.recordings.processing.limits import MAX_MM, Array, Indices, Mask, as_numbers, refuse_beyond
-from sense.settings import RigSettings
+from padforge.design.common.errors import InputError
+from padforge.design.common.settings import or_default
+from padforge.design.pad.courses.keep_out import keep_outs, outside
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PadSettings
+from padforge.sense.recordings.formats.csv_table import CsvTable
+from padforge.sense.recordings.processing.limits import MAX_MM, Array, Indices, Mask, as_numbers, refuse_beyond
+from padforge.sense.settings import RigSettings
 
 COLUMNS = ("x_mm", "y_mm", "depth_mm")
 LEAST_FREE = 0.01

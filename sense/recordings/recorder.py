@@ -17,10 +17,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError, mapping, shown, whole
-from design.common.errors import path as as_path
-from design.common.files import (
+from padforge.design.common.errors import InputError, mapping, shown, whole
+from padforge.design.common.errors import path as as_path
+from padforge.design.common.files import (
     UNFINISHED,
     lock,
     open_in_place,
@@ -31,7 +30,7 @@ from design.common.files import (
     write_json,
     writing,
 )
-from sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, read_blocks, write_at
 from .press_journal import cut_torn_line, read_journal

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError, instance, shown
-from design.common.errors import path as as_path
-from design.common.files import held, read_json, scratch, sync, writing
-from sense.recordings.processing import limits
-from sense.recordings.processing.limits import Array, Indices, Mask
+from padforge.design.common.errors import InputError, instance, shown
+from padforge.design.common.errors import path as as_path
+from padforge.design.common.files import held, read_json, scratch, sync, writing
+from padforge.sense.recordings.processing import limits
+from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
 from .block_file import read_blocks
 from .press_journal import Press, read_journal

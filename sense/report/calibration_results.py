@@ -4,14 +4,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError
-from design.common.files import check_replaceable, refuse_unwritable, staged, write_json
-from design.common.profiling import stage
-from sense.health.learning import learn_health
-from sense.health.model_folder import health_files
-from sense.localizer.calibration.calibration import calibrate, left_out
-from sense.recordings.recording import Recording
-from sense.settings import LocalizerSettings
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import check_replaceable, refuse_unwritable, staged, write_json
+from padforge.design.common.profiling import stage
+from padforge.sense.health.learning import learn_health
+from padforge.sense.health.model_folder import health_files
+from padforge.sense.localizer.calibration.calibration import calibrate, left_out
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.settings import LocalizerSettings
 
 FILES = (
     *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.figures import FAINT, HORIZONTAL, INK, VERTICAL, explain, save_figure, tidy
+from padforge.design.common.figures import FAINT, HORIZONTAL, INK, VERTICAL, explain, save_figure, tidy
 
 _WIDTH = 0.36
 

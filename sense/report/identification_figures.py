@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-
-from design.common.figures import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, head, save_figure, tidy
-from design.pad.courses.curves import flatten
-from sense.twin.identified_pad import Identification
+from padforge.design.common.figures import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, head, save_figure, tidy
+from padforge.design.pad.courses.curves import flatten
+from padforge.sense.twin.identified_pad import Identification
 
 COLUMNS = ("measured", "predicted", "left over")
 

@@ -6,17 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from design.common.files import check_replaceable, provenance, refuse_unwritable, staged, write_json
-from design.common.page.elements import PageSection, figures, paragraph, table
-from design.common.profiling import stage
-from sense.recordings.processing.limits import Array, Mask
+from padforge.design.common.files import check_replaceable, provenance, refuse_unwritable, staged, write_json
+from padforge.design.common.page.elements import PageSection, figures, paragraph, table
+from padforge.design.common.profiling import stage
+from padforge.sense.recordings.processing.limits import Array, Mask
 
 if TYPE_CHECKING:
-    from design.pad.morphology import Morphology
-    from design.pad.twin import Twin
-    from sense.recordings.recording import Recording
-    from sense.twin.identified_pad import Identification
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.pad.twin import Twin
+    from padforge.sense.recordings.recording import Recording
+    from padforge.sense.twin.identified_pad import Identification
 
 FORMAT = "padforge-identification/1"
 STRANGER = 0.02
@@ -44,7 +43,7 @@ def identify_into(
     Raises:
         InputError: as `identify`, `out` cannot be written, or others were made from the twin in it.
     """
-    from sense.twin.identification import identify  # here, so that a report that only tells of it does without
+    from padforge.sense.twin.identification import identify  # here, so that a report that only tells of it does without
 
     refuse_unwritable(out)
     origin = provenance(COMMAND, seed, inputs or [])  # minutes later they may differ from what was read

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common.figures import ALARM, FAINT, INK, canvas, explain, save_figure
-from sense.localizer.calibration.learning_curve import power_law
+from padforge.design.common.figures import ALARM, FAINT, INK, canvas, explain, save_figure
+from padforge.sense.localizer.calibration.learning_curve import power_law
 
 
 def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:

@@ -7,13 +7,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from design.common.errors import InputError
-from design.common.files import read_bytes
-from design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
-from sense.recordings.press_journal import read_journal
-from sense.recordings.processing.limits import MAX_FIBRES
-from sense.recordings.recorder import JOURNAL
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import read_bytes
+from padforge.design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
+from padforge.sense.recordings.press_journal import read_journal
+from padforge.sense.recordings.processing.limits import MAX_FIBRES
+from padforge.sense.recordings.recorder import JOURNAL
+from padforge.sense.recordings.recording import Recording
 
 from .loss_chart import Errors, loss_chart
 

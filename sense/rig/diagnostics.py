@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-
-from sense.recordings.processing.limits import Array
-from sense.settings import RigSettings
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.settings import RigSettings
 
 from .devices.protocols import Arm, Converter, RigFault
 from .safety import require_tool

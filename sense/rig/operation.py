@@ -8,20 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.common.files import provenance, scratch
-from design.common.profiling import stage
-from design.common.settings import Spec
-from design.pad.morphology import Morphology
-from design.pad.twin import Twin
-from design.settings import Contact, PadSettings
-from sense.localizer.localizer import Localizer
-from sense.recordings.press_plan import PressPlan, free_of, size_of
-from sense.recordings.recorder import refuse_begun, refuse_existing
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import RigSettings
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import provenance, scratch
+from padforge.design.common.profiling import stage
+from padforge.design.common.settings import Spec
+from padforge.design.pad.morphology import Morphology
+from padforge.design.pad.twin import Twin
+from padforge.design.settings import Contact, PadSettings
+from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.recordings.press_plan import PressPlan, free_of, size_of
+from padforge.sense.recordings.recorder import refuse_begun, refuse_existing
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import RigSettings
 
 from .devices.plugins import device
 from .devices.protocols import Arm, Converter, RigFault

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from sense.settings import RigSettings
+from padforge.sense.settings import RigSettings
 
 from .devices.protocols import Arm, ArmState, RigFault
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from design.common import command_line as common
-from design.common.errors import InputError
+from padforge.design.common import command_line as common
+from padforge.design.common.errors import InputError
 
 if TYPE_CHECKING:
-    from design.pad.morphology import Morphology
+    from padforge.design.pad.morphology import Morphology
 
     from .study import Study
 
@@ -51,8 +50,8 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             as_json: bool,
             **options: Any,
         ) -> None:
-            from design.common.computing import cluster
-            from design.common.files import refuse_unwritable
+            from padforge.design.common.computing import cluster
+            from padforge.design.common.files import refuse_unwritable
 
             from .study import run, study_lines
 
@@ -122,7 +121,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     For recordings of a built pad (figures 13 and 14) see `padforge sense fibre-loss`.
     """
-    from design.settings import Contact
+    from padforge.design.settings import Contact
 
     from .robustness import robustness_study
 
@@ -173,7 +172,7 @@ def force(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study force square random-5
     """
-    from sense.studies.indentation.force import force_study
+    from padforge.sense.studies.indentation.force import force_study
 
     return force_study(_pads(names, seed), seed=seed)
 
@@ -185,7 +184,7 @@ def shape(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study shape random-5
     """
-    from sense.studies.indentation.shape import shape_study
+    from padforge.sense.studies.indentation.shape import shape_study
 
     return shape_study(_pads(names, seed), seed=seed)
 
@@ -197,8 +196,8 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study drift out/pad/recording
     """
-    from sense.recordings.import_export import is_recording
-    from sense.studies.drift.study import drift_study
+    from padforge.sense.recordings.import_export import is_recording
+    from padforge.sense.studies.drift.study import drift_study
 
     from .pads import load_pads, load_recordings
 
@@ -215,6 +214,6 @@ def multicontact(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study multicontact square
     """
-    from sense.studies.multicontact.study import multicontact_study
+    from padforge.sense.studies.multicontact.study import multicontact_study
 
     return multicontact_study(_pads(names, seed), seed=seed)

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from design.common.errors import InputError
-from design.common.settings import validated
-from design.pad.morphology import Morphology
+from padforge.design.common.errors import InputError
+from padforge.design.common.settings import validated
+from padforge.design.pad.morphology import Morphology
 
 if TYPE_CHECKING:
-    from sense.recordings.recording import Recording
+    from padforge.sense.recordings.recording import Recording
 
 NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
 """Straight fibres, random ones of N knots, and what a search finds: by gradients, or as published; their grid after an
@@ -34,7 +34,7 @@ def load_pads(names: Sequence[str], seed: int) -> dict[str, Morphology]:
 
 def load_recordings(names: Sequence[str]) -> "dict[str, Recording]":
     """Recordings by label, as `open_recording` reads them; raises InputError as it does, and for a label met twice."""
-    from sense.recordings.import_export import open_recording
+    from padforge.sense.recordings.import_export import open_recording
 
     def label(path: Path) -> str:
         return path.resolve().parent.name if path.name == "recording" else path.stem
@@ -78,8 +78,8 @@ def _load(name: str, seed: int) -> tuple[str, Morphology]:
 def _found(grid: int, method: Literal["descent", "genetic"], knots: int | None, seed: int) -> Morphology:
     """What a search finds for the published contact: by gradients from a single start, under the default rules; or as
     published, where rules count for nothing. So many knots, or the default."""
-    from design.optimisers.search import search
-    from design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, SearchSettings
+    from padforge.design.optimisers.search import search
+    from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, SearchSettings
 
     pad = PUBLISHED_PAD.model_copy(update={"grid": grid})
     asked = {"starts": 1, "seed": seed, "method": method} | ({} if knots is None else {"knots": knots})

@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.checkpoints import State
-from design.common.errors import InputError
-from design.common.figures import CURVES, FAINT, INK, tidy
-from design.criteria.fibre_loss import lost_subsets
-from design.evaluation.localisation_error import Loss, PressSets, batches
-from design.pad.contact import lattice, signals, signals_quantized
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, Contact, between_fibres
-from sense.recordings.processing.limits import Array
+from padforge.design.common.checkpoints import State
+from padforge.design.common.errors import InputError
+from padforge.design.common.figures import CURVES, FAINT, INK, tidy
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.evaluation.localisation_error import Loss, PressSets, batches
+from padforge.design.pad.contact import lattice, signals, signals_quantized
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
+from padforge.sense.recordings.processing.limits import Array
 
 from .pads import described
 from .study import Findings, Study, Task

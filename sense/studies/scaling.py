@@ -15,16 +15,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.checkpoints import State
-from design.common.errors import InputError
-from design.common.figures import CURVES, FAINT, INK, tidy
-from design.evaluation.levenberg_marquardt import fit
-from design.evaluation.localisation_error import fresh_presses, training_presses
-from design.pad.contact import signals
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
-from sense.recordings.processing.limits import Array
+from padforge.design.common.checkpoints import State
+from padforge.design.common.errors import InputError
+from padforge.design.common.figures import CURVES, FAINT, INK, tidy
+from padforge.design.evaluation.levenberg_marquardt import fit
+from padforge.design.evaluation.localisation_error import fresh_presses, training_presses
+from padforge.design.pad.contact import signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
+from padforge.sense.recordings.processing.limits import Array
 
 from .pads import described
 from .study import Findings, Study, Task

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.checkpoints import State
-from design.common.figures import CURVES, FAINT, INK, tidy
-from design.evaluation.levenberg_marquardt import fit_many
-from design.evaluation.localisation_error import PressSets
-from design.pad.contact import signals
-from design.pad.morphology import Morphology
-from design.settings import Contact
+from padforge.design.common.checkpoints import State
+from padforge.design.common.figures import CURVES, FAINT, INK, tidy
+from padforge.design.evaluation.levenberg_marquardt import fit_many
+from padforge.design.evaluation.localisation_error import PressSets
+from padforge.design.pad.contact import signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact
 
 from .pads import described
 from .study import Findings, Study, Task

@@ -12,10 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from design.common.checkpoints import Checkpoints, State
-from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError
-from design.common.files import provenance, write_json, write_text
+from padforge.design.common.checkpoints import Checkpoints, State
+from padforge.design.common.computing import one_torch_thread, run_tasks
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import provenance, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,8 +95,8 @@ def run(
         InputError: tasks to go on from that belong to other settings, a folder that cannot be written, or in which the
             same study is at work.
     """
-    from design.common.figures import save_figure
-    from design.common.files import refuse_unwritable, staged
+    from padforge.design.common.figures import save_figure
+    from padforge.design.common.files import refuse_unwritable, staged
 
     refuse_unwritable(out)
     # What is kept goes by the number of a task, so the tasks and their order count as much as the settings.
@@ -117,7 +117,7 @@ def run(
 @contextmanager
 def _alone(out: Path, name: str) -> Iterator[None]:
     """Keep other runs of a study out of its folder; InputError where one is there."""
-    from design.common.files import lock
+    from padforge.design.common.files import lock
 
     out.mkdir(parents=True, exist_ok=True)
     path, busy = out / f".{name}.lock", f"{out}: a {name} study is at work there; wait for it or choose another --out"

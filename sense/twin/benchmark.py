@@ -8,17 +8,16 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 
 import numpy as np
-
-from design import Morphology
-from design.benchmarking.harness import Bench, BenchTrial
-from design.pad.contact import signals
-from design.pad.twin import Frame, Twin, TwinChannel
-from design.settings import Contact, sensed_rectangle
-from sense.localizer.response.response_model import RIDGE_PLACE, bumps
-from sense.recordings.processing.limits import Array
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import RigSettings
+from padforge.design import Morphology
+from padforge.design.benchmarking.harness import Bench, BenchTrial
+from padforge.design.pad.contact import signals
+from padforge.design.pad.twin import Frame, Twin, TwinChannel
+from padforge.design.settings import Contact, sensed_rectangle
+from padforge.sense.localizer.response.response_model import RIDGE_PLACE, bumps
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import RigSettings
 
 from .identification import identify
 from .identified_pad import Identification

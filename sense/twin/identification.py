@@ -4,15 +4,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from padforge.design import Morphology
+from padforge.design.common.errors import InputError, instance, whole
+from padforge.design.pad.twin import MOST_LOOKS, TwinReadings
+from padforge.design.settings import sensed_rectangle
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.strengths import strengths
 from threadpoolctl import threadpool_limits
-
-from design import Morphology
-from design.common.errors import InputError, instance, whole
-from design.pad.twin import MOST_LOOKS, TwinReadings
-from design.settings import sensed_rectangle
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.strengths import strengths
 
 from .fitting import Fit, Freedom, fit
 from .identified_pad import Identification

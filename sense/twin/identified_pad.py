@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from design import Morphology
-from design.pad.courses.curves import lengths
-from design.pad.twin import Twin, TwinChannel, TwinReadings, TwinScatter
-from sense.recordings.processing.limits import Array, Indices, Mask
+from padforge.design import Morphology
+from padforge.design.pad.courses.curves import lengths
+from padforge.design.pad.twin import Twin, TwinChannel, TwinReadings, TwinScatter
+from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
 from .fitting import Fit
 from .laid_pad import LaidPad

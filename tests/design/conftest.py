@@ -1,8 +1,7 @@
 """What tests of design share."""
 
 import pytest
-
-from design.benchmarking import harness
+from padforge.design.benchmarking import harness
 
 
 @pytest.fixture
@@ -21,7 +20,7 @@ def taken(monkeypatch):
 @pytest.fixture
 def one_thread():
     """Torch computes on one thread, as in a search: several that wait for a busy machine take many times as long."""
-    from design.common.computing import one_torch_thread
+    from padforge.design.common.computing import one_torch_thread
 
     with one_torch_thread():
         yield

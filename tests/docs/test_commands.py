@@ -11,7 +11,7 @@ from typing import Any
 import click
 import pytest
 
-from padforge import cli
+from padforge.cli import cli
 from tests.docs.pages import BLOCK, PAGES, relative
 
 

@@ -6,10 +6,10 @@ from importlib import invalidate_caches
 from pathlib import Path
 
 import pytest
+from padforge.design import Morphology
+from padforge.sense.recordings.recording import Recording
 
-import padforge
-from design import Morphology
-from sense.recordings.recording import Recording
+from padforge.cli import main
 from tests.docs.pages import BLOCK, ROOT
 
 PAGE = ROOT / "docs" / "devices.md"
@@ -52,7 +52,7 @@ def test_the_example_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
         Path("pad.toml").write_text(spec)
         monkeypatch.setattr(sys, "argv", command)
         with pytest.raises(SystemExit) as ended:
-            padforge.main()
+            main()
         return ended.value.code or 0, capsys.readouterr().err  # type: ignore[return-value]
 
     code, said = record(SPEC)

@@ -13,16 +13,16 @@ import pytest
 import shapely
 import trimesh
 from build123d import Solid, import_step
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import sha256
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate import export
+from padforge.fabricate.export import FORMATS, build
+from padforge.fabricate.mesh_files import COLOURS
+from padforge.fabricate.mould.cad import model
+from padforge.fabricate.mould.prisms import Body, Prism
+from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 
-from design.common.errors import InputError
-from design.common.files import sha256
-from design.pad.morphology import Morphology
-from fabricate import export
-from fabricate.export import FORMATS, build
-from fabricate.mesh_files import COLOURS
-from fabricate.mould.cad import model
-from fabricate.mould.prisms import Body, Prism
-from fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 PAD = Morphology.random(1, 2, seed=7)

@@ -4,11 +4,11 @@ import sys
 
 import pytest
 from click.testing import CliRunner
+from padforge.design.common.errors import InputError
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.cli import fabricate
 from PIL import Image
 
-from design.common.errors import InputError
-from design.pad.morphology import Morphology
-from fabricate.cli import fabricate
 from tests.fabricate.planted import level_pad
 
 FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg"}

@@ -11,11 +11,10 @@ import trimesh
 import trimesh.exchange.stl
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from design.common.errors import InputError
-from fabricate.checks.findings import Finding
-from fabricate.checks.mesh_checks import check_mesh, inspect_mesh, sound
-from fabricate.mesh_files import read_mesh, write_3mf, write_stl
+from padforge.design.common.errors import InputError
+from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.checks.mesh_checks import check_mesh, inspect_mesh, sound
+from padforge.fabricate.mesh_files import read_mesh, write_3mf, write_stl
 
 BOX = trimesh.creation.box((10, 20, 5))
 VERTICES, TRIANGLES = np.asarray(BOX.vertices), np.asarray(BOX.faces)

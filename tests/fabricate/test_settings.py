@@ -4,13 +4,21 @@ import math
 
 import numpy as np
 import pytest
+from padforge.design.common.errors import InputError
+from padforge.design.common.settings import Spec, commented_toml
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.materials import (
+    FIBRES,
+    SILICONES,
+    Fibre,
+    FibreSettings,
+    Silicone,
+    SiliconeSettings,
+    divider_ohm,
+)
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 
-from design.common.errors import InputError
-from design.common.settings import Spec, commented_toml
-from design.pad.morphology import Morphology
-from fabricate.materials import FIBRES, SILICONES, Fibre, FibreSettings, Silicone, SiliconeSettings, divider_ohm
-from fabricate.mould.plan import Plan
-from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import with_settings
 
 

@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import pytest
 
-import padforge
+from padforge.cli import main
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def call(*arguments: str) -> Ended:
         patch.object(sys, "stderr", streams[1]),
         pytest.raises(SystemExit) as end,
     ):
-        padforge.main()
+        main()
     for stream in streams:
         stream.flush()
     out, err = (stream.buffer.getvalue().decode() for stream in streams)  # pyright: ignore[reportAttributeAccessIssue]

@@ -35,7 +35,7 @@ def compile_all() -> None:
 
 def design_kernels() -> None:
     """Contacts, criteria, a search and a check of a mould."""
-    from design import (
+    from padforge.design import (
         Contact,
         Indenter,
         Morphology,
@@ -50,10 +50,10 @@ def design_kernels() -> None:
         signals_quantized,
         signals_sparse,
     )
-    from design.criteria.information import disorder, disorder_area
-    from design.evaluation.ambiguity_map import ambiguity_map
-    from design.settings import PUBLISHED_CONTACT
-    from fabricate import build, check_mesh
+    from padforge.design.criteria.information import disorder, disorder_area
+    from padforge.design.evaluation.ambiguity_map import ambiguity_map
+    from padforge.design.settings import PUBLISHED_CONTACT
+    from padforge.fabricate import build, check_mesh
 
     pad, presses = Morphology.random(2, 3, seed=1), np.array([[1.0, 1.0], [1.5, 2.0]])
     ways = product((None, 30), ("uniform", "inverse_square", "inverse"), ("manhattan", "euclidean"))
@@ -79,8 +79,8 @@ def design_kernels() -> None:
 
 def sense_kernels() -> None:
     """Filters, presses, a calibration, health, a twin and places as they come."""
-    from design import Morphology
-    from sense import (
+    from padforge.design import Morphology
+    from padforge.sense import (
         LocalizerSettings,
         RigSettings,
         calibrate,
@@ -90,8 +90,8 @@ def sense_kernels() -> None:
         simulate,
         total_variation,
     )
-    from sense.live.deployment.streaming import Detector
-    from sense.twin.identification import identify
+    from padforge.sense.live.deployment.streaming import Detector
+    from padforge.sense.twin.identification import identify
 
     recording = simulate(Morphology.straight(2), RigSettings(presses=60))
     total_variation(recording.readings, 2.0)

@@ -4,9 +4,8 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-
-from design import InputError, Spec
-from design.common.settings import Settings
+from padforge.design import InputError, Spec
+from padforge.design.common.settings import Settings
 
 
 def require_ends(model: type[Settings], key: str, kept: Iterable[Any], refused: Iterable[Any]) -> None:

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from padforge.design.common.files import unchanged, write_json
+from padforge.design.pad.morphology import Morphology
 
-from design.common.files import unchanged, write_json
-from design.pad.morphology import Morphology
 from tests.helpers.door import contents
 from tools.hostile_inputs.files import CHEAP, require_whole_file
 
@@ -35,8 +35,8 @@ import resource, sys
 limit = int(sys.argv.pop(1))
 if limit >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-import padforge
-padforge.main()
+from padforge.cli import main
+main()
 """
 """The command line under a limit of the size of files, bytes; -1 for none."""
 

@@ -8,14 +8,13 @@ from importlib.machinery import PathFinder
 
 import numpy as np
 import pytest
-
-from design import Morphology, signals, signals_sparse
-from design.common import profiling
-from design.optimisers.search import SearchRun, search
-from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
-from fabricate import build
-from sense import RigSettings, calibrate, simulate
-from sense.settings import LocalizerSettings
+from padforge.design import Morphology, signals, signals_sparse
+from padforge.design.common import profiling
+from padforge.design.optimisers.search import SearchRun, search
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
+from padforge.fabricate import build
+from padforge.sense import RigSettings, calibrate, simulate
+from padforge.sense.settings import LocalizerSettings
 
 
 @pytest.fixture
@@ -116,7 +115,7 @@ def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
 def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     settings = SearchSettings(knots=1, starts=2, steps=2, lost=0)
     asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
-    monkeypatch.setattr("design.common.checkpoints.Checkpoints.clear", lambda self: None)
+    monkeypatch.setattr("padforge.design.common.checkpoints.Checkpoints.clear", lambda self: None)
     with profiling.profiled() as profile:
         first = search(*asked, run=SearchRun(keep_in=tmp_path / "search"))
     assert profile.counts["starts"] == [2, 2]

@@ -9,14 +9,14 @@ import threading
 import time
 from pathlib import Path
 
+import padforge.sense.cli.calibration
 import pytest
 import trimesh
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.files import sha256
 from safetensors.numpy import load_file
 
-import padforge.running
-import sense.cli.calibration
-from design.common.checkpoints import Checkpoints
-from design.common.files import sha256
+import padforge.run
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
 
@@ -94,7 +94,7 @@ def test_of_a_finished_run_nothing_is_done_anew(folder: Path) -> None:
 
 def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing of an earlier run counts as finished once it has begun."""
-    monkeypatch.setattr(padforge.running, "_designed", breaks)
+    monkeypatch.setattr(padforge.run, "_designed", breaks)
     assert called("run", cwd=folder).code == 130
     assert not (folder / "out" / "pad" / "run.json").exists()
 
@@ -134,7 +134,7 @@ def test_a_broken_off_calibration_is_all_that_is_done_again(
     """And two runs give the same files."""
     (tmp_path / "pad.toml").write_text(SMALL)
     with monkeypatch.context() as patch:
-        patch.setattr(sense.cli.calibration, "run_calibration", breaks)
+        patch.setattr(padforge.sense.cli.calibration, "run_calibration", breaks)
         assert called("run", cwd=tmp_path).code == 130
     assert resumed(tmp_path) == "fibres, mould, recording, contacts"
     assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
@@ -222,13 +222,13 @@ def test_a_time_budget_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "pad.toml").write_text(
         SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
     )
-    run, given = sense.cli.calibration.run_calibration, []
+    run, given = padforge.sense.cli.calibration.run_calibration, []
 
     def noted(*arguments, **more):
         given.append(arguments[-1])
         return run(*arguments, **more)
 
-    monkeypatch.setattr(sense.cli.calibration, "run_calibration", noted)
+    monkeypatch.setattr(padforge.sense.cli.calibration, "run_calibration", noted)
     begin = time.monotonic()
     words = ("run", "--time-budget", "16", "--formats", "stl,svg")
     ended = called(*words, cwd=tmp_path)

@@ -24,7 +24,6 @@ from pathlib import Path
 
 import numpy as np
 
-import padforge
 from tools.threads import on_one_thread
 
 from . import calls, command_lines, spoilt_files
@@ -35,8 +34,20 @@ from .workplace import Workplace
 
 LIBRARIES = (
     *("torch", "matplotlib.figure", "matplotlib.font_manager", "shapely", "trimesh", "h5py", "pyarrow"),
-    *("rosbags.rosbag2", "scipy.io", "sense.live.deployment.onnx_file", "ezdxf", "lxml.etree", "pymoo.core.problem"),
-    *("fabricate.export", "sense.report.sections", "sense.live.pipeline", "sense.rig.operation"),
+    *(
+        "rosbags.rosbag2",
+        "scipy.io",
+        "padforge.sense.live.deployment.onnx_file",
+        "ezdxf",
+        "lxml.etree",
+        "pymoo.core.problem",
+    ),
+    *(
+        "padforge.fabricate.export",
+        "padforge.sense.report.sections",
+        "padforge.sense.live.pipeline",
+        "padforge.sense.rig.operation",
+    ),
 )
 """Imported before, not by each process again; not build123d, which few need and which makes each copy take longer."""
 SHARES = {"command line": 0.35, "file": 0.4, "call": 0.25}
@@ -81,7 +92,7 @@ class Tally:
 def command(*words: str) -> None:
     """The command line, in this process."""
     sys.argv = ["padforge", *words]
-    padforge.main()
+    main()
 
 
 def drawn(rng: Rng, workplace: Workplace) -> Hostile:

@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from padforge.design import InputError
+from padforge.design.common.errors import Fault, shown
+from padforge.sense.health.health_model import DETECTED
 
-import design
-import fabricate
 import padforge
-import sense
-from design import InputError
-from design.common.errors import Fault, shown
-from sense.health.health_model import DETECTED
+from padforge import design, fabricate, sense
 
 from .texts import Rng, pick
 from .values import ODD, spoiled
@@ -89,26 +87,26 @@ def sound() -> dict[str, Any]:
 def _elsewhere(found: dict[str, Any]) -> dict[tuple[str, str], Any]:
     """Arguments that suit where a name means something else than elsewhere."""
     return {
-        ("sense.locate", "lost"): (1,),
+        ("padforge.sense.locate", "lost"): (1,),
         ("sense.Live", "localizers"): found["localizers"],
-        ("design.search", "pad"): design.PadSettings(grid=1),
-        ("design.search", "search"): found["search"],
-        ("design.search", "contact"): found["contact"],
-        ("fabricate.check_mesh", "path"): "pad/mould.stl",
+        ("padforge.design.search", "pad"): design.PadSettings(grid=1),
+        ("padforge.design.search", "search"): found["search"],
+        ("padforge.design.search", "contact"): found["contact"],
+        ("padforge.fabricate.check_mesh", "path"): "pad/mould.stl",
         ("design.Morphology.load", "path"): "pad/morphology.json",
         ("design.Twin.load", "path"): "pad/twin.json",
-        ("sense.open_recording", "path"): "pad/recording",
+        ("padforge.sense.open_recording", "path"): "pad/recording",
         ("sense.Recording.open", "path"): Path("pad/recording"),
-        ("sense.import_csv", "path"): "presses.csv",
+        ("padforge.sense.import_csv", "path"): "presses.csv",
         ("sense.import_hdf5", "path"): "presses.h5",
-        ("sense.import_mat", "path"): "pad.mat",
-        ("sense.import_bag", "path"): Path("presses.mcap"),
-        ("sense.export_csv", "path"): "new.csv",
+        ("padforge.sense.import_mat", "path"): "pad.mat",
+        ("padforge.sense.import_bag", "path"): Path("presses.mcap"),
+        ("padforge.sense.export_csv", "path"): "new.csv",
         ("sense.export_hdf5", "path"): "new.h5",
-        ("sense.export_bag", "path"): Path("new.mcap"),
-        ("sense.export_lerobot", "path"): Path("new"),
-        ("sense.export_bag", "findings"): None,
-        ("sense.export_lerobot", "findings"): None,
+        ("padforge.sense.export_bag", "path"): Path("new.mcap"),
+        ("padforge.sense.export_lerobot", "path"): Path("new"),
+        ("padforge.sense.export_bag", "findings"): None,
+        ("padforge.sense.export_lerobot", "findings"): None,
         ("design.Spec.load", "path"): Path("pad.toml"),
         ("design.Spec.section", "model"): design.Contact,
         ("design.Spec.given", "model"): design.Contact,
@@ -125,7 +123,7 @@ _OF_CLASS |= {"Indenter": "indenter", "HealthModel": "health"}
 @cache
 def functions() -> dict[str, Callable[..., Any]]:
     """All that the packages hand out and that can be called, by name; records that check nothing are not among them."""
-    found: dict[str, Callable[..., Any]] = {"padforge.write_report": padforge.write_report}
+    found: dict[str, Callable[..., Any]] = {"padforge.report.write_report": write_report}
     made = {
         "Finder": lambda: sense.Finder(4),
         "RunningMedian": lambda: sense.RunningMedian(4, 5),

@@ -7,7 +7,7 @@ from itertools import chain
 
 import click
 
-from padforge.commands import cli
+from padforge.cli import cli
 
 from .texts import Rng, pick
 from .values import HOSTILE, PATHS

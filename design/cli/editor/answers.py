@@ -5,15 +5,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-
-from design.criteria.rules import check_rules
-from design.criteria.score import AMBIGUITY_NOISE, free_presses
-from design.evaluation.ambiguity_map import ambiguity_map
-from design.pad.courses.curves import beziers
-from design.pad.courses.spare_knots import with_spares
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.criteria.rules import check_rules
+from padforge.design.criteria.score import AMBIGUITY_NOISE, free_presses
+from padforge.design.evaluation.ambiguity_map import ambiguity_map
+from padforge.design.pad.courses.curves import beziers
+from padforge.design.pad.courses.spare_knots import with_spares
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 from .course_edits import Courses
 

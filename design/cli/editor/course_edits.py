@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Layout
+from padforge.design.common.errors import InputError
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Layout
 
 NEAREST = 1e-3
 """Least distance of two knots along a fibre, grid units."""

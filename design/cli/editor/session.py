@@ -9,11 +9,11 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from design.common.errors import InputError, real, shown, whole
-from design.common.files import check_replaceable, find_dependents, provenance
-from design.pad.courses.spare_knots import without_spares
-from design.pad.knots import FARTHEST
-from design.pad.morphology import Morphology
+from padforge.design.common.errors import InputError, real, shown, whole
+from padforge.design.common.files import check_replaceable, find_dependents, provenance
+from padforge.design.pad.courses.spare_knots import without_spares
+from padforge.design.pad.knots import FARTHEST
+from padforge.design.pad.morphology import Morphology
 
 from .answers import Answers
 from .course_edits import moved, straight_courses, with_knot, without_knot

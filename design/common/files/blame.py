@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 
 @contextmanager

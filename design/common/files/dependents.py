@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 from .reading import read_bytes, sha256
 

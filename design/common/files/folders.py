@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 from .blame import refuse_unwritable, writing
 from .litter import UNFINISHED, clear_litter, scratch

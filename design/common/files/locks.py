@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 from .blame import writing
 

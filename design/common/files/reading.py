@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError, shown
+from padforge.design.common.errors import InputError, shown
 
 from .folders import resolve_exchange
 

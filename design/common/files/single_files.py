@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 from .blame import writing
 from .folders import settle

@@ -16,13 +16,12 @@ from xml.etree import ElementTree
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markdown_it import MarkdownIt
 from markdown_it.tree import SyntaxTreeNode
-
-from design.common.errors import InputError
-from design.common.files import read_bytes
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import read_bytes
 
 from .shipped import resource
 
-_HERE = "design.common.page"
+_HERE = "padforge.design.common.page"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
 _MOST_PICTURE = 2**25

@@ -14,7 +14,7 @@ _IN_FACTORS = 300.0
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def ambiguity_by_place(signals: Any, presses: Any, lost: Any) -> Any:
-    """(Q, L) sum_b w_ab |p_a - p_b| of `design.criteria.ambiguity` for every press a and every loss.
+    """(Q, L) sum_b w_ab |p_a - p_b| of `padforge.design.criteria.ambiguity` for every press a and every loss.
 
     Args:
         signals: (Q, F) divided by twice their noise. presses: (Q, 2).

@@ -6,8 +6,7 @@ angle either side of 0 and it never meets itself.
 
 import numpy as np
 import shapely
-
-from design.pad.knots import Array
+from padforge.design.pad.knots import Array
 
 from .curves import cubic, quadratic
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.pad.kernels.near_intervals import near_intervals
-from design.pad.knots import Array
+from padforge.design.pad.kernels.near_intervals import near_intervals
+from padforge.design.pad.knots import Array
 
 _TOUCHING = 1e-6
 """Share of the width by which two intervals of one line may be apart and still be one stretch: rounding."""

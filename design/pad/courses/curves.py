@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError, instance, real
-from design.pad.kernels.pchip import pchip_slopes
-from design.pad.knots import Array, assemble
-from design.pad.morphology import Morphology
-from design.settings import Layout
+from padforge.design.common.errors import InputError, instance, real
+from padforge.design.pad.kernels.pchip import pchip_slopes
+from padforge.design.pad.knots import Array, assemble
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Layout
 
 MOST_POINTS = 10**7
 """Most points the curves of a pad are flattened to."""

@@ -5,9 +5,8 @@ least squares (K. Levenberg 1944, D. Marquardt 1963), and left out one by one wh
 """
 
 import numpy as np
-
-from design.pad.kernels.pchip import pchip_slopes
-from design.pad.knots import Array, Ints
+from padforge.design.pad.kernels.pchip import pchip_slopes
+from padforge.design.pad.knots import Array, Ints
 
 SAMPLES = 700
 """Points of a curve that are looked at."""

@@ -3,10 +3,9 @@
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from padforge.design.common.errors import InputError
+from padforge.design.settings import PadSettings, RulesSettings
 from shapely import Polygon
-
-from design.common.errors import InputError
-from design.settings import PadSettings, RulesSettings
 
 
 def keep_outs(pad: PadSettings) -> list[Polygon]:

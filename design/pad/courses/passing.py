@@ -1,10 +1,9 @@
 """Courses that pass keep-outs: every fibre goes by on one side, and a family's fibres stay in their order."""
 
 import numpy as np
-
-from design.pad.knots import MARGIN, Array, assemble
-from design.pad.morphology import Morphology
-from design.settings import PadSettings, RulesSettings
+from padforge.design.pad.knots import MARGIN, Array, assemble
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PadSettings, RulesSettings
 
 from .curves import refine
 from .keep_out import keep_outs

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-
-from design.pad.knots import Array
-from design.settings import Layout
+from padforge.design.pad.knots import Array
+from padforge.design.settings import Layout
 
 HAIR = 1e-4
 """Length of all spare knots of a fibre together, grid units: far below what can be printed."""

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-
-from design.settings.contact import profile_spline
+from padforge.design.settings.contact import profile_spline
 
 from .pchip import piece_of
 

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import MOST_VALUES, InputError
-from design.common.files import require_file
+from padforge.design.common.errors import MOST_VALUES, InputError
+from padforge.design.common.files import require_file
 
 MOST_FILE_BYTES = 2**33
 """Size of the largest file that is looked at."""

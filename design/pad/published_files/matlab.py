@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError
-from design.common.files import read_bytes, require_file
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import read_bytes, require_file
 
 from .hdf5_datasets import MOST_FILE_BYTES, plain_datasets
 from .matlab_elements import read_elements

@@ -4,12 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, reals, whole
-from design.pad.kernels.press import INVERSE_SQUARE, MANHATTAN, UNIFORM, Law, frames
-from design.pad.kernels.published.sampled_signals import quantized_signals
-from design.pad.knots import FARTHEST, Array, assemble, axes, of_parameters
-from design.settings import Contact
+from padforge.design.common.errors import InputError, reals, whole
+from padforge.design.pad.kernels.press import INVERSE_SQUARE, MANHATTAN, UNIFORM, Law, frames
+from padforge.design.pad.kernels.published.sampled_signals import quantized_signals
+from padforge.design.pad.knots import FARTHEST, Array, assemble, axes, of_parameters
+from padforge.design.settings import Contact
 
 from .matlab import load_mat
 

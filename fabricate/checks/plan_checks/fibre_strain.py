@@ -4,10 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-
-from design.pad.knots import Array
-from fabricate.checks.findings import Finding, Status, as_places
-from fabricate.mould.plan import Plan
+from padforge.design.pad.knots import Array
+from padforge.fabricate.checks.findings import Finding, Status, as_places
+from padforge.fabricate.mould.plan import Plan
 
 _EASY = 0.5
 """Share of what the fibre bears up to which bending may use it: pressing takes the rest."""

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.pad.morphology import Morphology
-from fabricate.checks.findings import Finding
-from fabricate.checks.mesh_checks import inspect_mesh
-from fabricate.mesh_files import read_mesh
-from fabricate.mould.assembly import plan_mesh
-from fabricate.mould.plan import Plan
-from fabricate.settings import DEFAULTS, FabricationSettings
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.checks.mesh_checks import inspect_mesh
+from padforge.fabricate.mesh_files import read_mesh
+from padforge.fabricate.mould.assembly import plan_mesh
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 from .fibre_strain import fibre_strain
 from .pillars import pillars
@@ -48,7 +47,7 @@ def inspect_file(source: Path, settings: FabricationSettings = DEFAULTS) -> Insp
 
 def meshed(plan: Plan) -> Inspected:
     """The mesh of a plan, and every check on both."""
-    from fabricate.mould.mesh import arrays
+    from padforge.fabricate.mould.mesh import arrays
 
     vertices, triangles = arrays(plan_mesh(plan.enlarged))
     return vertices, triangles, inspect(plan, vertices, triangles)

@@ -1,9 +1,8 @@
 """Whether the pillars that leave holes print, and keep off the fibres."""
 
 import shapely
-
-from fabricate.checks.findings import Finding, Place, Status, as_places, verdict
-from fabricate.mould.plan import Plan, overlap
+from padforge.fabricate.checks.findings import Finding, Place, Status, as_places, verdict
+from padforge.fabricate.mould.plan import Plan, overlap
 
 from .tracks import thinner
 

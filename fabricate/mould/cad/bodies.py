@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 from build123d import Face, Plane, Solid, Vector, Wire
+from padforge.fabricate.mould.plan import polygon_rings
+from padforge.fabricate.mould.prisms import Body, Prism
 from shapely import affinity
-
-from fabricate.mould.plan import polygon_rings
-from fabricate.mould.prisms import Body, Prism
 
 from .outlines.pieces import arc_through
 

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from padforge.fabricate.mould import parts
+from padforge.fabricate.mould.plan import Plan
 from shapely.geometry.base import BaseGeometry
-
-from fabricate.mould import parts
-from fabricate.mould.plan import Plan
 
 from .outlines.drawing import GRID_MM, Drawing
 from .outlines.joints import joints, with_joints

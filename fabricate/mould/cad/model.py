@@ -15,16 +15,15 @@ from build123d import Color, Compound, Location, Solid
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure
+from padforge.design.common.errors import InputError
+from padforge.design.common.figures import HORIZONTAL, VERTICAL
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.mould.assembly import conductive_plan, pins, well_outlines
+from padforge.fabricate.mould.parts import INTO_FLOOR_MM
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.mould.prisms import COLOURS, Body
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from shapely.geometry.base import BaseGeometry
-
-from design.common.errors import InputError
-from design.common.figures import HORIZONTAL, VERTICAL
-from design.pad.morphology import Morphology
-from fabricate.mould.assembly import conductive_plan, pins, well_outlines
-from fabricate.mould.parts import INTO_FLOOR_MM
-from fabricate.mould.plan import Plan
-from fabricate.mould.prisms import COLOURS, Body
-from fabricate.settings import DEFAULTS, FabricationSettings
 
 from . import layout
 from .bodies import body_solid, prism_solids

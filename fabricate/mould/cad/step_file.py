@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from design.common.files import scratch
+from padforge.design.common.files import scratch
 
 if TYPE_CHECKING:
     from build123d import Compound

@@ -12,11 +12,10 @@ from functools import cached_property
 
 import numpy as np
 import shapely
-
-from design.pad.courses.curves import cubic
-from design.pad.knots import Array
-from design.settings import Layout
-from fabricate.settings import LeadRoom
+from padforge.design.pad.courses.curves import cubic
+from padforge.design.pad.knots import Array
+from padforge.design.settings import Layout
+from padforge.fabricate.settings import LeadRoom
 
 _EIGHTH = 4 / 3 * np.tan(np.pi / 16)
 """Length of the handles of a cubic for an eighth of a circle of radius 1, which it is within 4.3e-6 of."""

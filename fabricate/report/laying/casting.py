@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from fabricate.mould.plan import Plan
+from padforge.fabricate.mould.plan import Plan
 
 from .tables import table
 

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from fabricate.materials import PLASTICS
-from fabricate.mould.plan import Plan, overlap
-from fabricate.report.fibre_layers import fibre_name, layers
-from fabricate.settings import MouldSettings, PrinterSettings
+from padforge.fabricate.materials import PLASTICS
+from padforge.fabricate.mould.plan import Plan, overlap
+from padforge.fabricate.report.fibre_layers import fibre_name, layers
+from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
 from . import casting, print_settings, wiring
 from .orientation import LINK, sentence

@@ -11,12 +11,11 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 import shapely
+from padforge.design.common.figures import FAINT, INK, PAPER
+from padforge.design.pad.knots import Array
+from padforge.fabricate.mould.plan import Plan, polygon_rings
+from padforge.fabricate.report.fibre_layers import COLOURS, FAMILIES, layers
 from shapely.geometry.base import BaseGeometry
-
-from design.common.figures import FAINT, INK, PAPER
-from design.pad.knots import Array
-from fabricate.mould.plan import Plan, polygon_rings
-from fabricate.report.fibre_layers import COLOURS, FAMILIES, layers
 
 FILE = "orientation.svg"
 _TURNED = (

@@ -6,7 +6,7 @@ The names are those of PrusaSlicer 2.9, OrcaSlicer 2.3, Bambu Studio 2 and Cura 
 import math
 from collections.abc import Iterator
 
-from fabricate.settings import MouldSettings, PrinterSettings
+from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
 HEAD = ("PrusaSlicer", "OrcaSlicer, Bambu Studio", "Cura", "because")
 _SOLID_MM = 0.8

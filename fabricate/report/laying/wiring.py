@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fabricate.materials import divider_ohm
-from fabricate.mould.plan import Plan
+from padforge.fabricate.materials import divider_ohm
+from padforge.fabricate.mould.plan import Plan
 
 from .tables import table
 

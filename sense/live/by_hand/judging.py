@@ -8,9 +8,8 @@ changes by more than `ALIKE` while it is held.
 """
 
 import numpy as np
-
-from sense.localizer.features import REST
-from sense.recordings.processing.limits import Array
+from padforge.sense.localizer.features import REST
+from padforge.sense.recordings.processing.limits import Array
 
 WEAK = 0.15
 """Share of the usual answer, all fibres together, below which a press tells too little."""

@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.common.files import provenance
-from sense.recordings.press_journal import read_journal
-from sense.recordings.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
-from sense.recordings.recorder import JOURNAL, START, Recorder
-from sense.rig.planning.setup import Setup, begun_source, require_same_devices, source_of
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import provenance
+from padforge.sense.recordings.press_journal import read_journal
+from padforge.sense.recordings.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
+from padforge.sense.recordings.recorder import JOURNAL, START, Recorder
+from padforge.sense.rig.planning.setup import Setup, begun_source, require_same_devices, source_of
 
 from .targets import still_to_make, targets_of
 

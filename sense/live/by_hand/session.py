@@ -8,16 +8,15 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-
-from sense.live.press_buffer import HISTORY, SLACK, Ring
-from sense.live.sources import connected
-from sense.localizer.features import REST, bridged
-from sense.recordings.processing.limits import Array
-from sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
-from sense.recordings.recorder import Recorder, refuse_begun
-from sense.recordings.recording import Recording
-from sense.rig.devices.protocols import Converter, RigFault
-from sense.rig.planning.setup import Setup
+from padforge.sense.live.press_buffer import HISTORY, SLACK, Ring
+from padforge.sense.live.sources import connected
+from padforge.sense.localizer.features import REST, bridged
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+from padforge.sense.recordings.recorder import Recorder, refuse_begun
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.rig.devices.protocols import Converter, RigFault
+from padforge.sense.rig.planning.setup import Setup
 
 from .judging import GONE_S, SOON_S, Judge, answers
 from .run_directory import opened

@@ -1,11 +1,10 @@
 """Where a person is asked to press, in an order that is kind to the hand and fair to what is learnt."""
 
 import numpy as np
-
-from design.common.errors import InputError
-from sense.recordings.press_plan import free_of, planned, size_of
-from sense.recordings.processing.limits import Array
-from sense.rig.planning.setup import Setup
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.press_plan import free_of, planned, size_of
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.rig.planning.setup import Setup
 
 ROUND = 25
 """Places of a uniform plan that are gone through by a short way, before the next ones. Whoever stops early has been

@@ -6,7 +6,7 @@ All times are those of readings, s.
 from collections import deque
 from typing import Literal
 
-from sense.recordings.processing.limits import Array
+from padforge.sense.recordings.processing.limits import Array
 
 Phase = Literal["settle", "wait", "press", "hold", "lift", "done"]
 """Hands off before the first press; wait until the pad has recovered; press; hold it; lift; all presses are made."""

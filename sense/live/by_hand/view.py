@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-from design import Morphology
-from design.pad.courses.curves import flatten
+from padforge.design import Morphology
+from padforge.design.pad.courses.curves import flatten
 
 from .session import WORDS
 

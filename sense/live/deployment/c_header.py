@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-
-from design.common.files import write_text
-from sense.localizer.localizer import UNKNOWN, Localizer
-from sense.localizer.locating import MEASURED
-from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
-from sense.localizer.normalization import MAX_INPUT
-from sense.recordings.processing.limits import Array, Floats
-from sense.recordings.recording import Recording
-from sense.settings import LocalizerSettings
+from padforge.design.common.files import write_text
+from padforge.sense.localizer.localizer import UNKNOWN, Localizer
+from padforge.sense.localizer.locating import MEASURED
+from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
+from padforge.sense.localizer.normalization import MAX_INPUT
+from padforge.sense.recordings.processing.limits import Array, Floats
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.settings import LocalizerSettings
 
 from .budget import CODE, LAYERS, Budget, state_bytes, table_bytes
 from .kernels import press_stream
@@ -112,7 +111,9 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
     scaling = localizer.normalization
     span, hidden = scaling.span_mm, student.hidden
     environment = Environment(
-        loader=PackageLoader("sense.live.deployment", "."), undefined=StrictUndefined, keep_trailing_newline=True
+        loader=PackageLoader("padforge.sense.live.deployment", "."),
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
     )
     environment.filters["rows"] = lambda values: fill(
         ", ".join(values), LINE, initial_indent="  ", subsequent_indent="  "

@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import onnxruntime
-
-from design.common.errors import Fault, InputError
-from design.common.files import atomic
-from sense.health.trained_model import refuse_other_pad
-from sense.localizer.features import DOWN, bridged, press_inputs
-from sense.localizer.localizer import Localizer
-from sense.recordings.processing.limits import Array, Indices, Mask
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import Fault, InputError
+from padforge.design.common.files import atomic
+from padforge.sense.health.trained_model import refuse_other_pad
+from padforge.sense.localizer.features import DOWN, bridged, press_inputs
+from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.recordings.processing.limits import Array, Indices, Mask
+from padforge.sense.recordings.recording import Recording
 
 from .onnx_graph.localizer_graph import INPUTS, MEASURES, OUTPUTS, onnx_model
 

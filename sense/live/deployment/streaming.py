@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from sense.localizer.features import Inputs, bridged
-from sense.recordings.processing.limits import Array, Floats, Indices, Mask
-from sense.recordings.recording import Recording
+from padforge.sense.localizer.features import Inputs, bridged
+from padforge.sense.recordings.processing.limits import Array, Floats, Indices, Mask
+from padforge.sense.recordings.recording import Recording
 
 from .kernels.press_stream import LAG, WINDOWS, follow
 

@@ -6,20 +6,19 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-
-from design.common.computing import one_torch_thread
-from design.common.errors import InputError
-from sense.health.trained_model import refuse_other_pad
-from sense.localizer.calibration.calibration import CHECKED, learn, radii, split_presses, split_unseen
-from sense.localizer.calibration.networks.training_presses import TrainingPresses
-from sense.localizer.evaluation import distances, errors_by_loss
-from sense.localizer.features import Inputs
-from sense.localizer.localizer import Found, Localizer
-from sense.localizer.network import Weights, refuse_unsound
-from sense.localizer.normalization import Normalization
-from sense.recordings.processing.limits import Array, Floats, Indices, Mask
-from sense.recordings.recording import Recording
-from sense.settings import LocalizerSettings
+from padforge.design.common.computing import one_torch_thread
+from padforge.design.common.errors import InputError
+from padforge.sense.health.trained_model import refuse_other_pad
+from padforge.sense.localizer.calibration.calibration import CHECKED, learn, radii, split_presses, split_unseen
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
+from padforge.sense.localizer.evaluation import distances, errors_by_loss
+from padforge.sense.localizer.features import Inputs
+from padforge.sense.localizer.localizer import Found, Localizer
+from padforge.sense.localizer.network import Weights, refuse_unsound
+from padforge.sense.localizer.normalization import Normalization
+from padforge.sense.recordings.processing.limits import Array, Floats, Indices, Mask
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.settings import LocalizerSettings
 
 from .budget import LAYERS, Budget, widest
 from .streaming import Detector, Seen, commanded, owners, seen
@@ -185,7 +184,9 @@ def _trained(
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
 ) -> Weights:
-    from sense.localizer.calibration.training import train_members  # torch, seconds to import, is needed here only
+    from padforge.sense.localizer.calibration.training import (
+        train_members,  # torch, seconds to import, is needed here only
+    )
 
     with one_torch_thread():
         weights = train_members(learn, table, options, rng, progress).weights

@@ -10,10 +10,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sense.health.monitor import FibreFault
-from sense.live.pipeline import Estimate, Event, Live
-from sense.recordings.formats.ros.topics import FRAME, HEALTH, KINDS, NOT_KNOWN, PRESSED, R90, READINGS, TOUCHES
-from sense.recordings.processing.limits import Array
+from padforge.sense.health.monitor import FibreFault
+from padforge.sense.live.pipeline import Estimate, Event, Live
+from padforge.sense.recordings.formats.ros.topics import (
+    FRAME,
+    HEALTH,
+    KINDS,
+    NOT_KNOWN,
+    PRESSED,
+    R90,
+    READINGS,
+    TOUCHES,
+)
+from padforge.sense.recordings.processing.limits import Array
 
 FORMAT = "padforge-live/1"
 _OK, _ERROR = 0, 2

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
-from design.common.errors import InputError, shown
-from design.common.page.local_page.listening import END_S, POLL_S, ConnectionServer, listening, refuse_open
-from sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
+from padforge.design.common.errors import InputError, shown
+from padforge.design.common.page.local_page.listening import END_S, POLL_S, ConnectionServer, listening, refuse_open
+from padforge.sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
 from .messages import Message
 

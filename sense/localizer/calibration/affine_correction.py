@@ -10,11 +10,10 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-
-from sense.localizer.features import Inputs
-from sense.localizer.localizer import Localizer
-from sense.localizer.network import Weights
-from sense.recordings.processing.limits import Array, Floats
+from padforge.sense.localizer.features import Inputs
+from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.network import Weights
+from padforge.sense.recordings.processing.limits import Array, Floats
 
 GAIN, TURN, SHIFT = 0.2, 0.05, 0.1
 """Spreads expected: of the logarithm of a gain, of the angle (radians) and the stretch, of the shift (spans)."""

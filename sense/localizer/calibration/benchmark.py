@@ -9,17 +9,16 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-
-from design import Morphology
-from design.benchmarking.harness import Bench, BenchTrial
-from design.common.computing import one_torch_thread
-from sense import settings
-from sense.localizer.features import press_inputs
-from sense.localizer.network import learnt, pooled
-from sense.localizer.normalization import Normalization
-from sense.recordings.processing.limits import Array, Floats, Mask
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.published_protocol import simulate
+from padforge.design import Morphology
+from padforge.design.benchmarking.harness import Bench, BenchTrial
+from padforge.design.common.computing import one_torch_thread
+from padforge.sense import settings
+from padforge.sense.localizer.features import press_inputs
+from padforge.sense.localizer.network import learnt, pooled
+from padforge.sense.localizer.normalization import Normalization
+from padforge.sense.recordings.processing.limits import Array, Floats, Mask
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.published_protocol import simulate
 
 from .networks.published_training import HIDDEN
 
@@ -80,7 +79,7 @@ def _held(presses: int) -> Mask:
 
 
 def _marquardt(x: Array, y: Array, epochs: int) -> Predict:
-    from design.evaluation.levenberg_marquardt import fit
+    from padforge.design.evaluation.levenberg_marquardt import fit
 
     held = _held(len(x))
     return fit(x[~held], y[~held], np.random.default_rng(0), HIDDEN, epochs, check=(x[held], y[held]))
@@ -91,8 +90,7 @@ class _Published:
 
     def __init__(self, x: Array, y: Array) -> None:
         import torch
-
-        from design.evaluation.levenberg_marquardt import first_weights
+        from padforge.design.evaluation.levenberg_marquardt import first_weights
 
         rng = np.random.default_rng(0)
         weights = first_weights(np.ptp(x, axis=0) > 0, HIDDEN, rng), rng.uniform(-0.5, 0.5, (y.shape[1], HIDDEN + 1))

@@ -8,21 +8,20 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, instance, real
-from design.common.files import provenance
-from design.common.profiling import stage
-from design.common.settings import or_default, validated
-from design.criteria.fibre_loss import lost_subsets
-from sense import settings
-from sense.localizer.evaluation import conformal, evaluate, held_back
-from sense.localizer.features import PHASES, press_inputs
-from sense.localizer.localizer import Localizer
-from sense.localizer.network import LEAST_LOG, MOST_LOG, Weights, learnt, refuse_unsound
-from sense.localizer.normalization import Normalization, Scaled
-from sense.localizer.response.observer import TOLD
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, instance, real
+from padforge.design.common.files import provenance
+from padforge.design.common.profiling import stage
+from padforge.design.common.settings import or_default, validated
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.sense import settings
+from padforge.sense.localizer.evaluation import conformal, evaluate, held_back
+from padforge.sense.localizer.features import PHASES, press_inputs
+from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.network import LEAST_LOG, MOST_LOG, Weights, learnt, refuse_unsound
+from padforge.sense.localizer.normalization import Normalization, Scaled
+from padforge.sense.localizer.response.observer import TOLD
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
 
 from .networks.training_presses import TrainingPresses
 
@@ -83,7 +82,7 @@ def calibrate(
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
-    from design.common.computing import one_torch_thread
+    from padforge.design.common.computing import one_torch_thread
 
     with stage("train"), one_torch_thread():
         localizer = learn(recording, training, options, rng, progress, time_budget)
@@ -118,7 +117,9 @@ def learn(
     measures = learnable(recording, training) if masked else {}
     shown_raw, rows = raw[taught], taught
     if masked:
-        from sense.recordings.processing.press_alignment import as_detected  # compiled, which takes a moment to load
+        from padforge.sense.recordings.processing.press_alignment import (
+            as_detected,  # compiled, which takes a moment to load
+        )
 
         again = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]

@@ -12,18 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common.checkpoints import Checkpoints, State
-from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError, instance, path, shown, whole
-from design.common.files import provenance
-from design.common.settings import or_default
-from design.criteria.fibre_loss import lost_subsets
-from sense import settings
-from sense.localizer.evaluation import by_place, errors_by_loss
-from sense.localizer.localizer import Found, Localizer
-from sense.recordings.processing.limits import MAX_FIBRES, Array, Indices
-from sense.recordings.recording import Recording
+from padforge.design.common.checkpoints import Checkpoints, State
+from padforge.design.common.computing import one_torch_thread, run_tasks
+from padforge.design.common.errors import InputError, instance, path, shown, whole
+from padforge.design.common.files import provenance
+from padforge.design.common.settings import or_default
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.sense import settings
+from padforge.sense.localizer.evaluation import by_place, errors_by_loss
+from padforge.sense.localizer.localizer import Found, Localizer
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array, Indices
+from padforge.sense.recordings.recording import Recording
 
 from .calibration import learn, split_unseen
 

@@ -10,15 +10,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-
-from design.common.computing import one_torch_thread, run_tasks
-from design.common.errors import InputError, instance
-from design.common.files import provenance
-from design.common.settings import or_default
-from sense import settings
-from sense.localizer.evaluation import distances
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
+from padforge.design.common.computing import one_torch_thread, run_tasks
+from padforge.design.common.errors import InputError, instance
+from padforge.design.common.files import provenance
+from padforge.design.common.settings import or_default
+from padforge.sense import settings
+from padforge.sense.localizer.evaluation import distances
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
 
 from .calibration import learn, split_presses
 

@@ -13,15 +13,14 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, instance, whole
-from design.common.files import provenance
-from design.criteria.fibre_loss import lost_subsets
-from sense.localizer.evaluation import conformal, distances, error_row
-from sense.localizer.features import Inputs
-from sense.localizer.localizer import Found, Localizer, joined
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, instance, whole
+from padforge.design.common.files import provenance
+from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.sense.localizer.evaluation import conformal, distances, error_row
+from padforge.sense.localizer.features import Inputs
+from padforge.sense.localizer.localizer import Found, Localizer, joined
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
 
 from .affine_correction import fit_correction
 

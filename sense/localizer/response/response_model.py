@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
+from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 BUMPS = 21
 """Bumps along a side of the pad."""

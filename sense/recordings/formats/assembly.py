@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError
-from sense.recordings.processing.limits import Array, Indices, Mask, as_numbers
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.processing.limits import Array, Indices, Mask, as_numbers
+from padforge.sense.recordings.recording import Recording
 
 from .csv_table import UNKNOWN
 from .mapping import Part
@@ -171,7 +170,7 @@ def _runs(values: Array, down: Mask) -> _Presses:
 
 def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _Presses:
     """Presses that the readings show."""
-    from sense.recordings.processing.press_detection import as_commanded, find_presses
+    from padforge.sense.recordings.processing.press_detection import as_commanded, find_presses
 
     first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
     Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)

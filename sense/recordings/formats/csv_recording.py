@@ -16,11 +16,10 @@ from pathlib import Path
 from reprlib import repr as shortened
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.common.files import atomic, writing
-from sense.recordings.processing.limits import MAX_FIBRES, Array
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import atomic, writing
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
+from padforge.sense.recordings.recording import Recording
 
 from .assembly import MEASURES, assembled
 from .csv_table import CsvTable

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-
-from design.common.errors import MOST_VALUES, InputError
-from design.common.files import require_file
-from sense.recordings.processing.limits import MAX_BYTES, Array
+from padforge.design.common.errors import MOST_VALUES, InputError
+from padforge.design.common.files import require_file
+from padforge.sense.recordings.processing.limits import MAX_BYTES, Array
 
 UNKNOWN = -1.7e308
 """Stands for `?` among numbers; far beyond any of them."""

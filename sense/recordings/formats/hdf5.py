@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.common.files import atomic, writing
-from design.pad.published_files.hdf5_datasets import plain_datasets
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import atomic, writing
+from padforge.design.pad.published_files.hdf5_datasets import plain_datasets
+from padforge.sense.recordings.recording import Recording
 
 from .assembly import MEASURES, assembled
 from .mapping import chosen, file_and_mapping, listed, parse_mapping

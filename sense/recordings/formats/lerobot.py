@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError
-from design.common.files import scratch, write_json, writing
-from sense.recordings.processing.limits import Indices
-from sense.recordings.recorder import refuse_existing
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import scratch, write_json, writing
+from padforge.sense.recordings.processing.limits import Indices
+from padforge.sense.recordings.recorder import refuse_existing
+from padforge.sense.recordings.recording import Recording
 
 from .model_findings import ModelFindings, export_path
 

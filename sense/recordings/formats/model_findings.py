@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from design.common.errors import instance
-from design.common.errors import path as as_path
-from sense.recordings.processing.limits import Array
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import instance
+from padforge.design.common.errors import path as as_path
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recording import Recording
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.pad.published_files.matlab import load_mat
-from sense.recordings.processing.limits import Array
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.pad.published_files.matlab import load_mat
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recording import Recording
 
 from .assembly import assembled
 from .mapping import chosen, file_and_mapping, parse_mapping

@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 
 import numpy as np
+from padforge.design.benchmarking.harness import Bench, BenchTrial
 from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import linprog
-
-from design.benchmarking.harness import Bench, BenchTrial
 
 from .filters import running_median, total_variation
 from .limits import Array

@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from design.common.errors import InputError, whole
+from padforge.design.common.errors import InputError, whole
 
 from .kernels.pad_state import unknown
 from .kernels.press_detection import find

@@ -14,12 +14,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from padforge.design import Contact, Morphology
+from padforge.design.pad.contact import relative_stretch
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.settings import RigSettings
 from scipy.signal import lfilter
-
-from design import Contact, Morphology
-from design.pad.contact import relative_stretch
-from sense.recordings.processing.limits import Array
-from sense.settings import RigSettings
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095

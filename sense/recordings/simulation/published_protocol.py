@@ -1,15 +1,14 @@
 """The simulated rig: the published protocol on the simulated pad."""
 
 import numpy as np
-
-from design import Contact, Morphology, Twin
-from design.common.errors import MOST_VALUES, InputError, instance, whole
-from design.common.settings import or_default
-from design.settings import PadSettings
-from sense.recordings.press_plan import free_of, planned_in, size_of, uniform
-from sense.recordings.processing.limits import MAX_FIBRES, Array
-from sense.recordings.recording import Recording
-from sense.settings import RigSettings
+from padforge.design import Contact, Morphology, Twin
+from padforge.design.common.errors import MOST_VALUES, InputError, instance, whole
+from padforge.design.common.settings import or_default
+from padforge.design.settings import PadSettings
+from padforge.sense.recordings.press_plan import free_of, planned_in, size_of, uniform
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.settings import RigSettings
 
 from .pad_model import Cycle, read_pad
 from .simulated_pad import SimulatedPad, measured, measured_alike, planned

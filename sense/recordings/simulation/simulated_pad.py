@@ -5,14 +5,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-
-from design import Contact, Morphology, Twin
-from design.common.errors import InputError
-from design.pad.contact import relative_stretch
-from design.pad.twin import TwinChannel
-from design.settings import PadSettings
-from sense.recordings.press_plan import Free, free_of, size_of, told_pad
-from sense.recordings.processing.limits import Array
+from padforge.design import Contact, Morphology, Twin
+from padforge.design.common.errors import InputError
+from padforge.design.pad.contact import relative_stretch
+from padforge.design.pad.twin import TwinChannel
+from padforge.design.settings import PadSettings
+from padforge.sense.recordings.press_plan import Free, free_of, size_of, told_pad
+from padforge.sense.recordings.processing.limits import Array
 
 LEAST_APART = 0.3
 """Of what a pad spans that lies askew by more than some 28 degrees, both sides are taken to be alike."""

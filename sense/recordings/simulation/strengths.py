@@ -6,10 +6,9 @@ drifts over minutes; how far a fibre comes back beyond its rest, set against its
 """
 
 import numpy as np
+from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices
+from padforge.sense.recordings.recording import Recording
 from scipy.optimize import nnls
-
-from sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices
-from sense.recordings.recording import Recording
 
 from .pad_model import DELAY_S, DRIFT_S, TRAVEL_S
 

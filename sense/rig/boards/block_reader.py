@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
 
-from sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.devices.protocols import RigFault
 
 from .byte_stream import POLL_S
 

@@ -3,8 +3,8 @@
 import time
 from contextlib import suppress
 
-from sense.rig.devices.protocols import RigFault
-from sense.rig.devices.serial_port import open_port
+from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.devices.serial_port import open_port
 
 POLL_S = 0.1
 """The longest time `ByteStream.receive` waits."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.devices.protocols import RigFault
 
 
 def chosen_inputs(inputs: Sequence[int], there: int, board: str) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 ROOT = Path(__file__).parents[3]
 

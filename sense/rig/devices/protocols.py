@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from design.common.errors import Fault
-from sense.recordings.processing.limits import Array, Indices
+from padforge.design.common.errors import Fault
+from padforge.sense.recordings.processing.limits import Array, Indices
 
 Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""

@@ -7,10 +7,18 @@ It samples by the host's clock at a rate that may be off by some ppm, and fails 
 import time
 
 import numpy as np
-
-from sense.recordings.processing.limits import Array
-from sense.rig.boards.due import framing
-from sense.rig.boards.due.framing import FULL_SCALE, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Status
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.rig.boards.due import framing
+from padforge.sense.rig.boards.due.framing import (
+    FULL_SCALE,
+    MAX_CHANNELS,
+    Ack,
+    Block,
+    BoardSettings,
+    Identity,
+    Kind,
+    Status,
+)
 
 from .serial_board import OUT_BYTES, SerialBoard, Source
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from design import Contact, Morphology, signals
-from sense.recordings.processing.limits import Array
-from sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
-from sense.rig.boards.due.driver import Arduino
-from sense.rig.devices.protocols import Converter
-from sense.settings import RigSettings
+from padforge.design import Contact, Morphology, signals
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.simulation.pad_model import TRAVEL_S, LivePad
+from padforge.sense.rig.boards.due.driver import Arduino
+from padforge.sense.rig.devices.protocols import Converter
+from padforge.sense.settings import RigSettings
 
 from .due_board import EmulatedBoard
 

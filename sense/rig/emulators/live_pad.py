@@ -6,15 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-
-from design import Contact, Morphology, signals
-from design.settings import PadSettings
-from sense.recordings.press_plan import planned
-from sense.recordings.processing.limits import Array
-from sense.recordings.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
-from sense.recordings.simulation.published_protocol import random_places
-from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.settings import RigSettings
+from padforge.design import Contact, Morphology, signals
+from padforge.design.settings import PadSettings
+from padforge.sense.recordings.press_plan import planned
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
+from padforge.sense.recordings.simulation.published_protocol import random_places
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.settings import RigSettings
 
 
 class SimulatedConverter:

@@ -5,18 +5,17 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 import numpy as np
-
-from design import Contact, Morphology, signals
-from design.common.errors import InputError
-from sense.recordings.processing.limits import Array
-from sense.recordings.simulation.pad_model import SUPPLY_V, LivePad
-from sense.rig.arms.printer.driver import Printer
-from sense.rig.arms.ur5.driver import UR5
-from sense.rig.boards.due.driver import Arduino
-from sense.rig.boards.line.driver import LineBoard
-from sense.rig.boards.line.framing import Header
-from sense.rig.session.pad_frame import Frame
-from sense.settings import RigSettings
+from padforge.design import Contact, Morphology, signals
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.simulation.pad_model import SUPPLY_V, LivePad
+from padforge.sense.rig.arms.printer.driver import Printer
+from padforge.sense.rig.arms.ur5.driver import UR5
+from padforge.sense.rig.boards.due.driver import Arduino
+from padforge.sense.rig.boards.line.driver import LineBoard
+from padforge.sense.rig.boards.line.framing import Header
+from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.settings import RigSettings
 
 from .due_board import EmulatedBoard
 from .line_board import EmulatedLineBoard

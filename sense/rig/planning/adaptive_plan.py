@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.locating import locate
+from padforge.sense.recordings.press_plan import Free, PressPlan, uniform
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recording import Recording
 from scipy.spatial import KDTree
-
-from sense.localizer.localizer import Localizer
-from sense.localizer.locating import locate
-from sense.recordings.press_plan import Free, PressPlan, uniform
-from sense.recordings.processing.limits import Array
-from sense.recordings.recording import Recording
 
 EVERY = 20
 """Presses between two looks at how well the localizer finds them."""

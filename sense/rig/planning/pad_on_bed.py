@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from design.common.errors import InputError, shown
-from design.common.files import read_json
-from sense.rig.devices.protocols import RigFault
-from sense.settings import RigSettings
+from padforge.design.common.errors import InputError, shown
+from padforge.design.common.files import read_json
+from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.settings import RigSettings
 
 FILE, FORMAT = "fabrication.json", "padforge-fabrication/1"
 _LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "surface_mm": 1, "walls_mm": 1}

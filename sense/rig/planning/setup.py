@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from design.common.errors import InputError
-from design.common.files import provenance, read_json
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import provenance, read_json
 
 if TYPE_CHECKING:
-    from design.pad.morphology import Morphology
-    from design.settings import Contact, PadSettings
-    from sense.recordings.press_plan import PressPlan
-    from sense.recordings.recorder import Recorder
-    from sense.settings import RigSettings
+    from padforge.design.pad.morphology import Morphology
+    from padforge.design.settings import Contact, PadSettings
+    from padforge.sense.recordings.press_plan import PressPlan
+    from padforge.sense.recordings.recorder import Recorder
+    from padforge.sense.settings import RigSettings
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,8 @@ class Setup:
 def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
     """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
-
-    from sense.recordings.press_plan import PressPlan, all_free, free_of, planned, size_of
-    from sense.recordings.recorder import START
+    from padforge.sense.recordings.press_plan import PressPlan, all_free, free_of, planned, size_of
+    from padforge.sense.recordings.recorder import START
 
     if resume and (setup.out / START).exists():
         plan = PressPlan.of(begun_source(setup, rig, KIND)["plan"]["presses"])
@@ -71,7 +70,7 @@ def begun_source(setup: Setup, rig: "RigSettings", kind: str) -> dict[str, Any]:
     Raises:
         InputError: it is of another kind, has no plan, or was begun with other settings or another pad.
     """
-    from sense.recordings.recorder import FORMAT, START
+    from padforge.sense.recordings.recorder import FORMAT, START
 
     source = read_json(setup.out / START, FORMAT).get("source")
     source = source if isinstance(source, dict) else {}
@@ -91,7 +90,7 @@ def begun_source(setup: Setup, rig: "RigSettings", kind: str) -> dict[str, Any]:
 
 def kept_plan(setup: Setup) -> str:
     """What to tell where other presses are asked for than the recording was begun with, whose plan is kept; else ""."""
-    from sense.recordings.recorder import FORMAT, START
+    from padforge.sense.recordings.recorder import FORMAT, START
 
     if not (setup.out / START).exists():
         return ""
@@ -125,7 +124,7 @@ def source_of(
 
 def _told(setup: Setup, rig: "RigSettings") -> dict[str, Any]:
     """Settings, with the inputs of the board as they are wired and the side of the pad as it counts, and the pad."""
-    from sense.recordings.press_plan import told_pad
+    from padforge.sense.recordings.press_plan import told_pad
 
     wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots)), "mirrored": bool(rig.mirrored)})
     return {"rig": wired.model_dump(mode="json"), "morphology": told_pad(setup.pad)}
@@ -152,8 +151,8 @@ def recorder_of(
     Raises:
         InputError: the recording cannot be gone on with, or was begun with other devices.
     """
-    from sense.recordings.press_plan import COLUMNS
-    from sense.recordings.recorder import FORMAT, START, Recorder
+    from padforge.sense.recordings.press_plan import COLUMNS
+    from padforge.sense.recordings.recorder import FORMAT, START, Recorder
 
     if resume and (folder / START).exists():
         require_same_devices(folder, read_json(folder / START, FORMAT).get("source", {}), devices)

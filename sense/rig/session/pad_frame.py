@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
-from sense.recordings.processing.limits import Array
-from sense.rig.devices.protocols import Pose, RigFault
-from sense.settings import RigSettings
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.rig.devices.protocols import Pose, RigFault
+from padforge.sense.settings import RigSettings
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 import numpy as np
-
-from sense.recordings.press_plan import PressPlan
-from sense.recordings.processing.limits import Array
-from sense.recordings.recorder import STATE_COLUMNS, Recorder
-from sense.rig.devices.protocols import Arm, Converter, Pose, RigFault
-from sense.rig.safety import POLL_S, Limits, require_ready, require_safe, wait_until_still, watch
-from sense.settings import RigSettings
+from padforge.sense.recordings.press_plan import PressPlan
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recorder import STATE_COLUMNS, Recorder
+from padforge.sense.rig.devices.protocols import Arm, Converter, Pose, RigFault
+from padforge.sense.rig.safety import POLL_S, Limits, require_ready, require_safe, wait_until_still, watch
+from padforge.sense.settings import RigSettings
 
 from .averaging import Averager
 from .disk_thread import DiskThread

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from sense.rig.devices.protocols import Arm, ArmState, Pose, RigFault
-from sense.rig.safety import Limits, require_safe, wait_until_still, watch
+from padforge.sense.rig.devices.protocols import Arm, ArmState, Pose, RigFault
+from padforge.sense.rig.safety import Limits, require_safe, wait_until_still, watch
 
 SPEED_MM_S = 10.0
 HEIGHT_MM = 10.0

@@ -12,25 +12,24 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-
-from design.common.checkpoints import State
-from design.common.errors import InputError
-from design.criteria.information import idle_share
-from design.evaluation.localisation_error import training_presses
-from design.pad.contact import signals
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, between_fibres
-from sense.localizer.calibration.calibration import split_presses
-from sense.localizer.evaluation import distances
-from sense.localizer.evaluation import idle_share as recorded_idle_share
-from sense.localizer.features import bridged, press_inputs
-from sense.recordings.processing.filters import running_median, total_variation
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import RigSettings
-from sense.studies.pads import described
-from sense.studies.study import Findings, Study, Task
+from padforge.design.common.checkpoints import State
+from padforge.design.common.errors import InputError
+from padforge.design.criteria.information import idle_share
+from padforge.design.evaluation.localisation_error import training_presses
+from padforge.design.pad.contact import signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
+from padforge.sense.localizer.calibration.calibration import split_presses
+from padforge.sense.localizer.evaluation import distances
+from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
+from padforge.sense.localizer.features import bridged, press_inputs
+from padforge.sense.recordings.processing.filters import running_median, total_variation
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import RigSettings
+from padforge.sense.studies.pads import described
+from padforge.sense.studies.study import Findings, Study, Task
 
 from .figure import draw
 from .text import told
@@ -200,7 +199,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
         (3, W) times s, readings and filtered readings V; "marks": (SHOWN, 3, 2) times s and values V; and "levels":
         (L, 3) times s, and values V before and in presses.
     """
-    from design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.evaluation.levenberg_marquardt import fit_many
 
     recording = source()
     begun, lifted, places_mm = recording.begun, recording.lifted, recording.presses_mm

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sense.localizer.evaluation import ACTIVE
+from padforge.sense.localizer.evaluation import ACTIVE
 
 Rows = Sequence[Mapping[str, Any]]
 

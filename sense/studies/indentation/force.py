@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.checkpoints import State
-from design.common.figures import CURVES, FAINT, INK, head, tidy
-from design.evaluation.localisation_error import fresh_presses
-from design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
-from design.pad.morphology import Morphology
-from design.settings import between_fibres
-from sense.recordings.processing.limits import Array
-from sense.studies.pads import described
-from sense.studies.study import Findings, Study, Task
+from padforge.design.common.checkpoints import State
+from padforge.design.common.figures import CURVES, FAINT, INK, head, tidy
+from padforge.design.evaluation.localisation_error import fresh_presses
+from padforge.design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import between_fibres
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.studies.pads import described
+from padforge.sense.studies.study import Findings, Study, Task
 
 COUNTS = 2**12 - 1
 """Full scale of the converter the signals are read with."""
@@ -120,7 +119,7 @@ def committee(
     inputs: Array, targets: Array, rng: np.random.Generator, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """The mean of networks that learnt from (Q, D) inputs and (Q, O) targets, each with its own split and weights."""
-    from design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.evaluation.levenberg_marquardt import fit_many
 
     members = fit_many(inputs, targets, rng.spawn(MEMBERS), hidden, epochs)
     return lambda given: np.mean([network(given) for network in members], axis=0)

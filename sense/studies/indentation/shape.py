@@ -7,17 +7,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.checkpoints import State
-from design.common.figures import INK, draw_confusions, head
-from design.evaluation.localisation_error import fresh_presses
-from design.pad.contact import signals
-from design.pad.indentation import Indenter, indented_signals
-from design.pad.morphology import Morphology
-from design.settings import Contact, between_fibres
-from sense.recordings.processing.limits import Array, Indices
-from sense.studies.pads import described
-from sense.studies.study import Findings, Study, Task
+from padforge.design.common.checkpoints import State
+from padforge.design.common.figures import INK, draw_confusions, head
+from padforge.design.evaluation.localisation_error import fresh_presses
+from padforge.design.pad.contact import signals
+from padforge.design.pad.indentation import Indenter, indented_signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Contact, between_fibres
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.studies.pads import described
+from padforge.sense.studies.study import Findings, Study, Task
 
 from .force import EPOCHS, MEMBERS, committee, magnitudes, readings
 

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from design.common.checkpoints import State
-from design.common.figures import CURVES, INK, draw_confusions, head, tidy
-from design.evaluation.localisation_error import fresh_presses
-from design.pad.contact import signals
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, between_fibres
-from sense.recordings.processing.limits import Array
-from sense.studies.indentation.force import COUNTS, readings
-from sense.studies.pads import described
-from sense.studies.study import Findings, Study, Task
+from padforge.design.common.checkpoints import State
+from padforge.design.common.figures import CURVES, INK, draw_confusions, head, tidy
+from padforge.design.evaluation.localisation_error import fresh_presses
+from padforge.design.pad.contact import signals
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.studies.indentation.force import COUNTS, readings
+from padforge.sense.studies.pads import described
+from padforge.sense.studies.study import Findings, Study, Task
 
 from .pairs import LABELLED, WAYS, Way, learnt, unordered_distances
 
@@ -87,7 +86,7 @@ def _located(
 
 def _counted(pad: Morphology, presses: int, test: int, members: int, hidden: int, epochs: int, seed: int) -> State:
     """Confusions (MOST+1, MOST+1) on the test presses: how often i contacts, by row, were taken for j."""
-    from design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.evaluation.levenberg_marquardt import fit_many
 
     rng = np.random.default_rng([6, seed])
     places = _drawn(pad, presses + test, MOST, rng)

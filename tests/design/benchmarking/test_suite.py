@@ -4,13 +4,12 @@ import csv
 import json
 
 import pytest
-
-from design.benchmarking import harness, suite, table
-from design.benchmarking.comparison import read_earlier, worsenings
-from design.benchmarking.harness import Bench, BenchRounds, BenchTrial, measure_round
-from design.benchmarking.suite import run_benches
-from design.benchmarking.table import bench_lines
-from design.common.errors import InputError
+from padforge.design.benchmarking import harness, suite, table
+from padforge.design.benchmarking.comparison import read_earlier, worsenings
+from padforge.design.benchmarking.harness import Bench, BenchRounds, BenchTrial, measure_round
+from padforge.design.benchmarking.suite import run_benches
+from padforge.design.benchmarking.table import bench_lines
+from padforge.design.common.errors import InputError
 
 
 def bench(error=0.1, work=lambda: None, name="x"):

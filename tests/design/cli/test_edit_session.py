@@ -5,13 +5,12 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-
-from design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
-from design.cli.editor.answers import Answers
-from design.cli.editor.session import Session
-from design.cli.main import design
-from design.common.files import sha256, write_json
-from design.criteria.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
+from padforge.design.cli.editor.answers import Answers
+from padforge.design.cli.editor.session import Session
+from padforge.design.cli.main import design
+from padforge.design.common.files import sha256, write_json
+from padforge.design.criteria.score import AMBIGUITY_NOISE, ambiguities
 
 
 def session(tmp_path, pad=None, **size):

@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from padforge.design import Morphology
+from padforge.design.cli.editing import edit
+from padforge.design.cli.main import design
 
-from design import Morphology
-from design.cli.editing import edit
-from design.cli.main import design
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Ctrl-C is a signal here")

@@ -10,9 +10,8 @@ from functools import partial
 
 import pytest
 import torch
-
-from design.common.computing import cluster, forget_outdated, one_torch_thread, run_tasks
-from design.common.errors import Fault
+from padforge.design.common.computing import cluster, forget_outdated, one_torch_thread, run_tasks
+from padforge.design.common.errors import Fault
 
 
 @pytest.fixture
@@ -139,8 +138,8 @@ def test_an_end_from_outside_is_told_and_crashes_nothing() -> None:
     code = """
 import os, signal, sys, threading
 import click, torch
-from design.common.command_line import run_to_end
-from design.common.computing import run_tasks
+from padforge.design.common.command_line import run_to_end
+from padforge.design.common.computing import run_tasks
 sys.argv = ["padforge"]
 at_work = threading.Barrier(5, lambda: threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start())
 def train():

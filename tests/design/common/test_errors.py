@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design.common import errors
-from design.common.errors import InputError, what_to_install
+from padforge.design.common import errors
+from padforge.design.common.errors import InputError, what_to_install
 
 LONGEST = "a" * errors.LONGEST_PATH
 

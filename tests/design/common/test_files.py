@@ -10,11 +10,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-from design.common import files
-from design.common.errors import InputError
-from design.common.files import locks
-from design.common.files.folders import EXCHANGE
+from padforge.design.common import files
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import locks
+from padforge.design.common.files.folders import EXCHANGE
 
 CLAIM = "import sys\nfrom pathlib import Path\nfrom design.common.files import claimed\n"
 ANOTHER = CLAIM + "try:\n  with claimed(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from padforge.design.common import files
+from padforge.design.common.errors import InputError
+from padforge.design.common.files.folders import EXCHANGE
 
-from design.common import files
-from design.common.errors import InputError
-from design.common.files.folders import EXCHANGE
 from tools.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")

@@ -10,13 +10,12 @@ from http.client import HTTPConnection, HTTPResponse
 from typing import Any
 
 import pytest
-
-from design.common.errors import InputError
-from design.common.page.elements import PageSection, html_pieces, table
-from design.common.page.elements import page as whole_page
-from design.common.page.local_page import listening
-from design.common.page.local_page.listening import HOST
-from design.common.page.local_page.local_page import LocalPage
+from padforge.design.common.errors import InputError
+from padforge.design.common.page.elements import PageSection, html_pieces, table
+from padforge.design.common.page.elements import page as whole_page
+from padforge.design.common.page.local_page import listening
+from padforge.design.common.page.local_page.listening import HOST
+from padforge.design.common.page.local_page.local_page import LocalPage
 
 PAGE = "<!doctype html><title>x</title><style>p { margin: 0 }</style><script>1</script>"
 

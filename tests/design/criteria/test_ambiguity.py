@@ -5,14 +5,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from design import Contact, Morphology
-from design.criteria.ambiguity import ambiguity, full_scale, sharpness
-from design.criteria.fibre_loss import draw_losses, loss_shares, lost_subsets
-from design.criteria.score import ambiguities, free_presses
-from design.evaluation.ambiguity_map import ambiguity_map
-from design.pad.contact import relative_stretch, signals
-from design.settings import PUBLISHED_CONTACT, PadSettings
+from padforge.design import Contact, Morphology
+from padforge.design.criteria.ambiguity import ambiguity, full_scale, sharpness
+from padforge.design.criteria.fibre_loss import draw_losses, loss_shares, lost_subsets
+from padforge.design.criteria.score import ambiguities, free_presses
+from padforge.design.evaluation.ambiguity_map import ambiguity_map
+from padforge.design.pad.contact import relative_stretch, signals
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAIR = torch.tensor([[0.0, 0.0], [1.0, 0.0]])

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from design import Contact, Morphology, published_objective, signals
-from design.criteria import benchmark as objective
-from design.criteria.information import (
+from padforge.design import Contact, Morphology, published_objective, signals
+from padforge.design.criteria import benchmark as objective
+from padforge.design.criteria.information import (
     disorder,
     disorder_area,
     idle_share,
@@ -16,9 +15,9 @@ from design.criteria.information import (
     published_sharpness,
     quantize,
 )
-from design.criteria.published_objective import published_presses, published_terms
-from design.pad.contact import boustrophedon
-from design.settings import PUBLISHED_CONTACT, Layout, between_fibres
+from padforge.design.criteria.published_objective import published_presses, published_terms
+from padforge.design.pad.contact import boustrophedon
+from padforge.design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 
 def test_levels_round_up_within_each_columns_own_range():

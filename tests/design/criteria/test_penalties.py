@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from padforge.design import Morphology
+from padforge.design.criteria.differentiable import span_samples
+from padforge.design.criteria.penalties import COMMON, penalties
+from padforge.design.criteria.rules import check_rules
+from padforge.design.pad.contact import fibre_axes
+from padforge.design.pad.courses.curves import crossings, lengths, refine
+from padforge.design.settings import PadSettings, RulesSettings
 from scipy.interpolate import PchipInterpolator
-
-from design import Morphology
-from design.criteria.differentiable import span_samples
-from design.criteria.penalties import COMMON, penalties
-from design.criteria.rules import check_rules
-from design.pad.contact import fibre_axes
-from design.pad.courses.curves import crossings, lengths, refine
-from design.settings import PadSettings, RulesSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NONE = RulesSettings(

@@ -3,11 +3,10 @@
 import math
 
 import pytest
-
-from design import Contact, InputError, Morphology
-from design.criteria.published_objective import published_terms
-from design.criteria.score import score
-from design.settings import PUBLISHED_CONTACT, PadSettings
+from padforge.design import Contact, InputError, Morphology
+from padforge.design.criteria.published_objective import published_terms
+from padforge.design.criteria.score import score
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

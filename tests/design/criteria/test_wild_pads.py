@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 import torch
-
-from design import Contact, Morphology
-from design.criteria.information import disorder, disorder_area
-from design.criteria.penalties import penalties
-from design.criteria.rules import check_rules
-from design.criteria.score import score
-from design.optimisers.parametrization import Fibres
-from design.pad.knots import assemble
-from design.report.plan_drawing import draw_plan
-from design.settings import PadSettings, RulesSettings
+from padforge.design import Contact, Morphology
+from padforge.design.criteria.information import disorder, disorder_area
+from padforge.design.criteria.penalties import penalties
+from padforge.design.criteria.rules import check_rules
+from padforge.design.criteria.score import score
+from padforge.design.optimisers.parametrization import Fibres
+from padforge.design.pad.knots import assemble
+from padforge.design.report.plan_drawing import draw_plan
+from padforge.design.settings import PadSettings, RulesSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 KINDS = ["random", "steps", "lattice", "border", "alike", "edge", "needles", "level", "no knots"]

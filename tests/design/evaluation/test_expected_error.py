@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import torch
-
-from design.evaluation import expected_error as module
-from design.evaluation.expected_error import (
+from padforge.design.evaluation import expected_error as module
+from padforge.design.evaluation.expected_error import (
     BY_LEARNING,
     BY_NOISE,
     RIDGE,
@@ -20,10 +19,10 @@ from design.evaluation.expected_error import (
     straight_full_scale,
     window_presses,
 )
-from design.pad.contact import lattice, relative_stretch, signals
-from design.pad.courses.curves import lengths
-from design.pad.morphology import Morphology
-from design.settings import (
+from padforge.design.pad.contact import lattice, relative_stretch, signals
+from padforge.design.pad.courses.curves import lengths
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import (
     Contact,
     PadSettings,
     Scatter,

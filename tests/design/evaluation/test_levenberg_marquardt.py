@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import torch
-
-from design.common.errors import InputError
-from design.evaluation import benchmark
-from design.evaluation.levenberg_marquardt import ColumnScale, Network, first_weights, fit, fit_many
-from design.evaluation.variable_projection import (
+from padforge.design.common.errors import InputError
+from padforge.design.evaluation import benchmark
+from padforge.design.evaluation.levenberg_marquardt import ColumnScale, Network, first_weights, fit, fit_many
+from padforge.design.evaluation.variable_projection import (
     RIDGE,
     Fit,
     curvature,

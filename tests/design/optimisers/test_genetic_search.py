@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-
-from design.criteria.published_objective import published_objective, published_presses, published_terms
-from design.optimisers.genetic_search import GeneticSearch
-from design.optimisers.problem import SearchProblem
-from design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
+from padforge.design.criteria.published_objective import published_objective, published_presses, published_terms
+from padforge.design.optimisers.genetic_search import GeneticSearch
+from padforge.design.optimisers.problem import SearchProblem
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)

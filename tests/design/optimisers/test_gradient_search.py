@@ -5,20 +5,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import PchipInterpolator
-
-from design import Contact, Morphology
-from design.criteria.differentiable import arc_lengths, pchip_slopes
-from design.criteria.rules import check_rules
-from design.criteria.score import score
-from design.evaluation.expected_error import expected_errors
-from design.optimisers.gradient_search import GradientSearch
-from design.optimisers.parametrization import OTHER_START, Fibres, border_of, first_course
-from design.optimisers.problem import SearchProblem
-from design.optimisers.search import search
-from design.pad.contact import fibre_axes
-from design.pad.courses.curves import lengths, refine
-from design.settings import (
+from padforge.design import Contact, Morphology
+from padforge.design.criteria.differentiable import arc_lengths, pchip_slopes
+from padforge.design.criteria.rules import check_rules
+from padforge.design.criteria.score import score
+from padforge.design.evaluation.expected_error import expected_errors
+from padforge.design.optimisers.gradient_search import GradientSearch
+from padforge.design.optimisers.parametrization import OTHER_START, Fibres, border_of, first_course
+from padforge.design.optimisers.problem import SearchProblem
+from padforge.design.optimisers.search import search
+from padforge.design.pad.contact import fibre_axes
+from padforge.design.pad.courses.curves import lengths, refine
+from padforge.design.settings import (
     PUBLISHED_CONTACT,
     PUBLISHED_PAD,
     PUBLISHED_SEARCH,
@@ -26,6 +24,7 @@ from design.settings import (
     RulesSettings,
     SearchSettings,
 )
+from scipy.interpolate import PchipInterpolator
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False)

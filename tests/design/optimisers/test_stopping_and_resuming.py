@@ -13,13 +13,13 @@ from typing import cast
 import click
 import numpy as np
 import pytest
+from padforge.design import InputError, PadSettings, RulesSettings, SearchRun, SearchSettings, search
+from padforge.design.common import computing
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.command_line import run_to_end
+from padforge.design.optimisers import stopping
 
-from design import InputError, PadSettings, RulesSettings, SearchRun, SearchSettings, search
-from design.common import computing
-from design.common.checkpoints import Checkpoints
-from design.common.command_line import run_to_end
-from design.optimisers import stopping
-from padforge import cli
+from padforge.cli import cli
 
 PAD = PadSettings(grid=1)
 SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, lost=1)

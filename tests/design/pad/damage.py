@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from hypothesis import strategies as st
-
-from design import InputError
+from padforge.design import InputError
 
 T = TypeVar("T")
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import shapely
-
-from design.pad.courses.common_length import common_stretches
-from design.pad.courses.curves import flatten
-from design.pad.morphology import Morphology
+from padforge.design.pad.courses.common_length import common_stretches
+from padforge.design.pad.courses.curves import flatten
+from padforge.design.pad.morphology import Morphology
 
 LEVEL = np.array([[-9.0, 0.0], [9.0, 0.0]])
 

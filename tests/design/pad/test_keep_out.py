@@ -5,16 +5,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from design import InputError, Morphology
-from design.criteria.penalties import penalties
-from design.criteria.rules import check_rules
-from design.criteria.score import free_presses
-from design.pad.contact import fibre_axes
-from design.pad.courses.bending import bend_radius, rolled_turns
-from design.pad.courses.keep_out import keep_outs, outside, require_free_ends
-from design.pad.courses.passing import passing, straight_course
-from design.settings import Layout, PadSettings, RulesSettings
+from padforge.design import InputError, Morphology
+from padforge.design.criteria.penalties import penalties
+from padforge.design.criteria.rules import check_rules
+from padforge.design.criteria.score import free_presses
+from padforge.design.pad.contact import fibre_axes
+from padforge.design.pad.courses.bending import bend_radius, rolled_turns
+from padforge.design.pad.courses.keep_out import keep_outs, outside, require_free_ends
+from padforge.design.pad.courses.passing import passing, straight_course
+from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
 

@@ -15,10 +15,10 @@ import pytest
 import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.design import InputError, Morphology
+from padforge.design.pad.published_files.matlab import load_mat
+from padforge.sense import import_mat
 
-from design import InputError, Morphology
-from design.pad.published_files.matlab import load_mat
-from sense import import_mat
 from tests.design.pad.damage import damages, read_damaged
 
 

@@ -6,11 +6,10 @@ from functools import reduce
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology, Twin
-from design.pad.contact import relative_stretch
-from design.pad.courses.curves import flatten
-from design.pad.twin import Frame, TwinChannel, TwinReadings, TwinScatter
+from padforge.design import InputError, Morphology, Twin
+from padforge.design.pad.contact import relative_stretch
+from padforge.design.pad.courses.curves import flatten
+from padforge.design.pad.twin import Frame, TwinChannel, TwinReadings, TwinScatter
 
 PAD = Morphology.random(2, knots=3, seed=5)
 DISTANCE = np.linspace(0, 1.6, 9)

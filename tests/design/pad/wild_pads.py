@@ -5,9 +5,8 @@ from typing import Literal
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-
-from design import Contact, Morphology
-from design.pad.knots import assemble
+from padforge.design import Contact, Morphology
+from padforge.design.pad.knots import assemble
 
 Array = NDArray[np.float64]
 KINDS = ("random", "steps", "lattice", "border", "alike", "edge", "needles", "level")

@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from padforge.design.pad.courses.curves import beziers, cubic
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import RulesSettings
+from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.checks.mesh_checks import SOUND
+from padforge.fabricate.checks.plan_checks import check, check_plan
+from padforge.fabricate.checks.plan_checks.fibre_strain import strains
+from padforge.fabricate.checks.plan_checks.tracks import thinner
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
-from design.pad.courses.curves import beziers, cubic
-from design.pad.morphology import Morphology
-from design.settings import RulesSettings
-from fabricate.checks.findings import Finding
-from fabricate.checks.mesh_checks import SOUND
-from fabricate.checks.plan_checks import check, check_plan
-from fabricate.checks.plan_checks.fibre_strain import strains
-from fabricate.checks.plan_checks.tracks import thinner
-from fabricate.mould.plan import Plan
-from fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 

@@ -3,9 +3,8 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.fabricate.checks.self_intersections import penetrating, places
 from scipy.optimize import linprog
-
-from fabricate.checks.self_intersections import penetrating, places
 
 CUBE = np.asarray(trimesh.creation.box((10, 10, 10)).triangles)
 

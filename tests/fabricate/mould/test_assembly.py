@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-from shapely import affinity
-
-from design.common.errors import InputError
-from design.pad.morphology import Morphology
-from fabricate.checks.plan_checks import check_plan
-from fabricate.mould.assembly import (
+from padforge.design.common.errors import InputError
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.checks.plan_checks import check_plan
+from padforge.fabricate.mould.assembly import (
     bed_frame,
     conductive_body,
     conductive_plan,
@@ -18,11 +16,13 @@ from fabricate.mould.assembly import (
     mould_body,
     sizes,
 )
-from fabricate.mould.cad.bodies import body_solid
-from fabricate.mould.mesh import arrays, mesh
-from fabricate.mould.plan import Plan
-from fabricate.mould.prisms import Body, Prism
-from fabricate.settings import WELL_MM
+from padforge.fabricate.mould.cad.bodies import body_solid
+from padforge.fabricate.mould.mesh import arrays, mesh
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.mould.prisms import Body, Prism
+from padforge.fabricate.settings import WELL_MM
+from shapely import affinity
+
 from tests.fabricate.planted import with_settings
 
 EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}

@@ -2,13 +2,12 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-
-from design.pad.morphology import Morphology
-from fabricate.mould import benchmark as bench
-from fabricate.mould.cad.model import FITS_MM, mould_model
-from fabricate.mould.cad.outlines.pieces import FINE_MM
-from fabricate.mould.plan import Plan
-from fabricate.settings import DEFAULTS, MouldSettings
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.mould import benchmark as bench
+from padforge.fabricate.mould.cad.model import FITS_MM, mould_model
+from padforge.fabricate.mould.cad.outlines.pieces import FINE_MM
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
 
 @pytest.mark.slow

@@ -5,15 +5,15 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+from padforge.design.common.errors import InputError
+from padforge.design.pad.knots import assemble
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.checks.mesh_checks import sound
+from padforge.fabricate.checks.plan_checks import check
+from padforge.fabricate.mould.assembly import mould_body
+from padforge.fabricate.mould.mesh import arrays, mesh
+from padforge.fabricate.mould.plan import Plan
 
-from design.common.errors import InputError
-from design.pad.knots import assemble
-from design.pad.morphology import Morphology
-from fabricate.checks.mesh_checks import sound
-from fabricate.checks.plan_checks import check
-from fabricate.mould.assembly import mould_body
-from fabricate.mould.mesh import arrays, mesh
-from fabricate.mould.plan import Plan
 from tests.fabricate.planted import with_settings
 
 ENDS = {

@@ -7,16 +7,16 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.design.common.errors import InputError
+from padforge.design.pad.courses.curves import Crossing
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.mould.assembly import mould_body
+from padforge.fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan
+from padforge.fabricate.mould.planning.depth_levels import fibre_levels
+from padforge.fabricate.mould.planning.numerals import number_strokes
+from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.settings import RigSettings
 
-from design.common.errors import InputError
-from design.pad.courses.curves import Crossing
-from design.pad.morphology import Morphology
-from fabricate.mould.assembly import mould_body
-from fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan
-from fabricate.mould.planning.depth_levels import fibre_levels
-from fabricate.mould.planning.numerals import number_strokes
-from sense.rig.session.pad_frame import Frame
-from sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 

@@ -9,19 +9,18 @@ import shapely
 from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
-
-from design.pad.morphology import Morphology
-from design.settings import PadSettings
-from fabricate.checks.plan_checks import check_plan, meshed
-from fabricate.dispensing.course import laying_steps, turned_over
-from fabricate.export import build
-from fabricate.mould.assembly import bed_frame, holder_body, lid_body, plan_mesh, sizes
-from fabricate.mould.mesh import mesh
-from fabricate.mould.plan import Plan
-from fabricate.report.laying.orientation import orientation_svg, sentence
-from fabricate.report.relief import WALL, mould_relief
-from fabricate.report.track_drawings import tracks_svg
-from fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, FibreSettings, MouldSettings
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PadSettings
+from padforge.fabricate.checks.plan_checks import check_plan, meshed
+from padforge.fabricate.dispensing.course import laying_steps, turned_over
+from padforge.fabricate.export import build
+from padforge.fabricate.mould.assembly import bed_frame, holder_body, lid_body, plan_mesh, sizes
+from padforge.fabricate.mould.mesh import mesh
+from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.report.laying.orientation import orientation_svg, sentence
+from padforge.fabricate.report.relief import WALL, mould_relief
+from padforge.fabricate.report.track_drawings import tracks_svg
+from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, FibreSettings, MouldSettings
 
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
 

@@ -4,13 +4,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from padforge.design.common.figures import save_figure
+from padforge.design.common.files import provenance
+from padforge.design.report.plan_drawing import draw_plan
+from padforge.design.settings import Contact
+from padforge.fabricate import build
 
-from design.common.figures import save_figure
-from design.common.files import provenance
-from design.report.plan_drawing import draw_plan
-from design.settings import Contact
-from fabricate import build
-from padforge import write_report
+from padforge.report import write_report
 from tests.padforge.report.documents import (
     PAD,
     calibration_document,

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from padforge.fabricate.report.mould_view import Packed, packed
 
-from fabricate.report.mould_view import Packed, packed
-from padforge import write_report
+from padforge.report import write_report
 from tests.helpers.chromium import SOFTWARE_GL, Chromium
 
 
@@ -53,7 +53,7 @@ def test_a_mesh_that_is_too_large_is_made_coarser_or_left_out(made: Path, pad: P
     assert coarse.nbytes <= whole.nbytes * 4 // 5
     assert volume(coarse) == pytest.approx(volume(whole), rel=0.01)
     assert packed(made / "mould.stl", most_bytes=1000) is None
-    monkeypatch.setattr("fabricate.report.sections.packed", lambda path: None)
+    monkeypatch.setattr("padforge.fabricate.report.sections.packed", lambda path: None)
     text = write_report(pad).read_text()
     assert "mould.stl is too large to be turned" in text
     assert "<canvas" not in text

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from markupsafe import escape
+from padforge.design.common.errors import Fault, InputError
+from padforge.design.common.files import provenance
+from padforge.design.pad.morphology import Morphology
+from padforge.design.report.contact_section import contact_line
+from padforge.fabricate import build
+from padforge.sense.recordings.recorder import Recorder
+from padforge.sense.recordings.recording import Recording
 
-from design.common.errors import Fault, InputError
-from design.common.files import provenance
-from design.pad.morphology import Morphology
-from design.report.contact_section import contact_line
-from fabricate import build
-from padforge import write_report
-from sense.recordings.recorder import Recorder
-from sense.recordings.recording import Recording
+from padforge.report import write_report
 from tests.padforge.report.documents import (
     HOSTILE,
     PAD,

@@ -7,13 +7,13 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from padforge.design import Morphology
+from padforge.design.common.settings import Spec
+from padforge.sense.cli.calibration import run_calibration
+from padforge.sense.health import fibre_prediction
+from padforge.sense.rig.operation import record_simulated
 
-import padforge
-from design import Morphology
-from design.common.settings import Spec
-from sense.cli.calibration import run_calibration
-from sense.health import fibre_prediction
-from sense.rig.operation import record_simulated
+from padforge.cli import main
 from tests.helpers.once import Once
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
@@ -30,7 +30,7 @@ def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["padforge", "sense", *arguments])
         with pytest.raises(SystemExit) as caught:
-            padforge.main()
+            main()
         out, err = capsys.readouterr()
         return caught.value.code or 0, out, err  # type: ignore[return-value]
 

@@ -3,11 +3,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import padforge.sense.cli.calibration
+import padforge.sense.report.calibration_figures
 import pytest
-
-import sense.cli.calibration
-import sense.report.calibration_figures
-from sense.localizer.calibration import fine_tuning
+from padforge.sense.localizer.calibration import fine_tuning
 
 
 def files_in(folder: str) -> dict[str, bytes]:
@@ -50,7 +49,7 @@ def test_interrupted_training_leaves_no_file(few, monkeypatch: pytest.MonkeyPatc
 
         yield report
 
-    monkeypatch.setattr(sense.cli.calibration, "reported", reported)
+    monkeypatch.setattr(padforge.sense.cli.calibration, "reported", reported)
     code, _, err = few("calibrate", "rec", "--out", "new")
     assert code == 130
     assert "interrupted" in err
@@ -63,7 +62,7 @@ def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkey
     def full(document: object, path: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(sense.report.calibration_figures, "draw_error_by_loss", full)
+    monkeypatch.setattr(padforge.sense.report.calibration_figures, "draw_error_by_loss", full)
     code, _, err = few("calibrate", "rec", "--seed", "5", "--out", "model")
     assert code == 2
     assert "model: cannot be written (No space left on device)" in err.splitlines()[-1]

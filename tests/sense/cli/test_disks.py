@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import sense
+from padforge import sense
 
 COMMANDS = {
     "record": "record --out out/rec",

@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from design import Morphology
-from sense.cli.options import typed_keys
+from padforge.design import Morphology
+from padforge.sense.cli.options import typed_keys
 
 
 def test_importing_takes_no_torch() -> None:
@@ -51,7 +50,7 @@ class Bare(MetaPathFinder):
 
 assert {"torch", "scipy", "matplotlib", "build123d", "shapely"} <= GONE and "numpy" not in GONE
 sys.meta_path.insert(0, Bare())
-from padforge import main
+from padforge.cli import main
 ends = []
 for line in sys.argv[1:]:
     sys.argv, out, err = ["padforge", *line.split()], io.StringIO(), io.StringIO()

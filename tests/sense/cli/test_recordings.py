@@ -5,8 +5,7 @@ from pathlib import Path
 
 import scipy.io
 from mcap.reader import make_reader
-
-from sense import Recording, export_csv
+from padforge.sense import Recording, export_csv
 
 
 def test_csv_comes_in(padforge_sense, brief: Recording) -> None:

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design import Morphology
-from design.common.files import sha256
-from design.pad.twin import TwinChannel
-from sense import Recording
-from sense.live.page_server import LivePage
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import RigSettings
-from sense.twin.benchmark import printed_pad
+from padforge.design import Morphology
+from padforge.design.common.files import sha256
+from padforge.design.pad.twin import TwinChannel
+from padforge.sense import Recording
+from padforge.sense.live.page_server import LivePage
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import RigSettings
+from padforge.sense.twin.benchmark import printed_pad
 
 ROWS = """
 import noise.mat --out r                        | noise.mat
@@ -162,8 +161,8 @@ def files_of(folder: Path) -> dict[Path, int]:
 def test_what_cannot_be_done_is_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
-    monkeypatch.setattr("sense.localizer.calibration.fine_tuning.STEPS", 15)
-    monkeypatch.setattr("sense.rig.boards.due.serial_link.find_ports", list)
+    monkeypatch.setattr("padforge.sense.localizer.calibration.fine_tuning.STEPS", 15)
+    monkeypatch.setattr("padforge.sense.rig.boards.due.serial_link.find_ports", list)
     monkeypatch.chdir(workshop)
     before = files_of(workshop)
     with LivePage(0) as page:

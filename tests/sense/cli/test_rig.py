@@ -8,15 +8,15 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from padforge.design import Morphology
+from padforge.design.common.files import sha256
+from padforge.design.common.settings import commented_toml
+from padforge.design.settings import PadSettings
+from padforge.sense import Recording
+from padforge.sense.rig import operation
+from padforge.sense.settings import RigSettings
+from padforge.sense.twin.benchmark import printed_pad
 
-from design import Morphology
-from design.common.files import sha256
-from design.common.settings import commented_toml
-from design.settings import PadSettings
-from sense import Recording
-from sense.rig import operation
-from sense.settings import RigSettings
-from sense.twin.benchmark import printed_pad
 from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 

@@ -5,12 +5,11 @@ from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
-
-from sense import Recording
-from sense.health import fibre_prediction, learning
-from sense.health.health_model import HealthModel
-from sense.health.learning import fit_health_model
-from sense.health.monitor import FibreFault, examine
+from padforge.sense import Recording
+from padforge.sense.health import fibre_prediction, learning
+from padforge.sense.health.health_model import HealthModel
+from padforge.sense.health.learning import fit_health_model
+from padforge.sense.health.monitor import FibreFault, examine
 
 Array = NDArray[np.float64]
 LEARNT, PRESSES, BAD_FROM = 600, 760, 660

@@ -6,9 +6,18 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-
-from sense.health import fibre_prediction
-from sense.health.fibre_prediction import COMPONENTS, INPUTS, MEMBERS, RELEASED, REST, TARGETS, TRACE, History, Shapes
+from padforge.sense.health import fibre_prediction
+from padforge.sense.health.fibre_prediction import (
+    COMPONENTS,
+    INPUTS,
+    MEMBERS,
+    RELEASED,
+    REST,
+    TARGETS,
+    TRACE,
+    History,
+    Shapes,
+)
 
 FIBRES = 2
 

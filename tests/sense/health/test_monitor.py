@@ -6,20 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from padforge.design import Morphology
+from padforge.design.common.errors import InputError
+from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.sense import Localizer, Recording, open_recording
+from padforge.sense import settings as sense_settings
+from padforge.sense.health import learning
+from padforge.sense.health.fault_likelihoods import HYPOTHESES
+from padforge.sense.health.health_model import COMMANDED, DETECTED, HealthModel, checked_presses
+from padforge.sense.health.learning import dead_fibres, fit_health_model
+from padforge.sense.health.monitor import TEXTS, FibreFault, Monitor, examine, fault_lines
+from padforge.sense.health.schema import LEAST_PRESSES
+from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V
+from padforge.sense.recordings.simulation.published_protocol import simulate
 
-from design import Morphology
-from design.common.errors import InputError
-from design.settings import PUBLISHED_CONTACT
-from sense import Localizer, Recording, open_recording
-from sense import settings as sense_settings
-from sense.health import learning
-from sense.health.fault_likelihoods import HYPOTHESES
-from sense.health.health_model import COMMANDED, DETECTED, HealthModel, checked_presses
-from sense.health.learning import dead_fibres, fit_health_model
-from sense.health.monitor import TEXTS, FibreFault, Monitor, examine, fault_lines
-from sense.health.schema import LEAST_PRESSES
-from sense.recordings.processing.limits import LEAST_SPREAD_V
-from sense.recordings.simulation.published_protocol import simulate
 from tests.sense.health.pads import BAD_FROM, LEARNT, PRESSES, faulty, later, learn, spoilt
 
 FEW = 320

@@ -1,6 +1,6 @@
 """What tests of live work share."""
 
-from sense import Recording
+from padforge.sense import Recording
 
 
 def first_presses(recording: Recording, presses: int) -> Recording:

@@ -10,10 +10,10 @@ from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 
 import pytest
+from padforge.design.common.page.local_page import local_page
+from padforge.design.common.page.local_page.listening import HOST
+from padforge.sense.live.page_server import LivePage
 
-from design.common.page.local_page import local_page
-from design.common.page.local_page.listening import HOST
-from sense.live.page_server import LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'

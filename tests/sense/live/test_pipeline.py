@@ -6,17 +6,17 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import padforge.sense.live.pipeline
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.design.common.errors import InputError
+from padforge.sense import Localizer, Recording, calibrate, locate
+from padforge.sense.health.monitor import FibreFault
+from padforge.sense.live.pipeline import Estimate, Live
+from padforge.sense.live.press_buffer import HISTORY, SLACK, Press
+from padforge.sense.recordings.processing.press_detection import Event
 
-import sense.live.pipeline
-from design.common.errors import InputError
-from sense import Localizer, Recording, calibrate, locate
-from sense.health.monitor import FibreFault
-from sense.live.pipeline import Estimate, Live
-from sense.live.press_buffer import HISTORY, SLACK, Press
-from sense.recordings.processing.press_detection import Event
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
 
@@ -25,8 +25,8 @@ from tests.sense.live.conftest import first_presses
 def prompt() -> Iterator[None]:
     """Presses as scripted begin as they are sent."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(sense.live.pipeline, "SENT_DOWN_S", 0.0)
-        monkeypatch.setattr(sense.live.pipeline, "SENT_UP_S", 0.0)
+        monkeypatch.setattr(padforge.sense.live.pipeline, "SENT_DOWN_S", 0.0)
+        monkeypatch.setattr(padforge.sense.live.pipeline, "SENT_UP_S", 0.0)
         yield
 
 
@@ -80,7 +80,7 @@ def follow(
     recording: Recording, localizers: Sequence[Localizer], lags: tuple[int, int] = (2, 1), cuts: Sequence[int] = ()
 ) -> tuple[Live, list[Any]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(recording, lags))
+        monkeypatch.setattr(padforge.sense.live.pipeline, "Finder", Scripted(recording, lags))
         live = Live(localizers, None, recording.fibres, recording.rate_hz)
     events = []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
@@ -153,8 +153,8 @@ def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt,
     begun, lifted = part.begun.copy(), part.lifted.copy()
     begun[8], lifted[8] = lifted[7] + 4, lifted[7] + 20  # soon after the one before
     part = replace(part, begun=begun, lifted=lifted)
-    monkeypatch.setattr(sense.live.pipeline, "Monitor", lambda model: watching)
-    monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
+    monkeypatch.setattr(padforge.sense.live.pipeline, "Monitor", lambda model: watching)
+    monkeypatch.setattr(padforge.sense.live.pipeline, "Finder", Scripted(part))
     live = Live([localizer], localizer, part.fibres, part.rate_hz)  # as alike as it looks at
     events = live.feed(part.times_s, part.readings)
     found = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
@@ -191,7 +191,7 @@ def test_without_any_fibre_a_press_may_be_anywhere(recording, learnt) -> None:
 
 def test_the_view_follows_the_pad(recording, learnt, monkeypatch) -> None:
     part = first_presses(recording, 3)
-    monkeypatch.setattr(sense.live.pipeline, "Finder", Scripted(part))
+    monkeypatch.setattr(padforge.sense.live.pipeline, "Finder", Scripted(part))
     live = Live([learnt("full")], None, part.fibres, part.rate_hz)
     missing = [{"swing": None, "state": "missing"}] * 4
     assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "findings": []}

@@ -4,19 +4,19 @@ import json
 from pathlib import Path
 
 import numpy as np
+import padforge.sense.live.sources
 import pytest
+from padforge.design import Morphology
+from padforge.design.common.errors import InputError
+from padforge.design.settings import PUBLISHED_CONTACT, Contact
+from padforge.sense import Recording
+from padforge.sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
+from padforge.sense.recordings.recorder import FORMAT, START
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.rig.emulators.live_pad import SimulatedConverter
+from padforge.sense.settings import RigSettings
 
-import sense.live.sources
-from design import Morphology
-from design.common.errors import InputError
-from design.settings import PUBLISHED_CONTACT, Contact
-from sense import Recording
-from sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
-from sense.recordings.recorder import FORMAT, START
-from sense.recordings.simulation.published_protocol import simulate
-from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.rig.emulators.live_pad import SimulatedConverter
-from sense.settings import RigSettings
 from tests.sense.rig.devices.fakes import Time
 
 
@@ -24,8 +24,8 @@ from tests.sense.rig.devices.fakes import Time
 def still(monkeypatch: pytest.MonkeyPatch) -> Time:
     """A clock that stands still but where somebody waits."""
     time = Time(least_s=0)
-    monkeypatch.setattr(sense.live.sources.time, "monotonic", time)
-    monkeypatch.setattr(sense.live.sources.time, "sleep", time.sleep)
+    monkeypatch.setattr(padforge.sense.live.sources.time, "monotonic", time)
+    monkeypatch.setattr(padforge.sense.live.sources.time, "sleep", time.sleep)
     return time
 
 

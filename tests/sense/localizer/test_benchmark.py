@@ -1,9 +1,8 @@
 """The localizer bench: it holds every way, and its networks are those they stand for. No times are asserted."""
 
 import pytest
-
-from design.benchmarking import harness
-from sense.localizer.calibration import benchmark as bench
+from padforge.design.benchmarking import harness
+from padforge.sense.localizer.calibration import benchmark as bench
 
 
 @pytest.mark.slow

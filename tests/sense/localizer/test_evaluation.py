@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Recording
-from sense.localizer.evaluation import by_place, conformal, error_row, errors_by_loss, idle_share
-from sense.localizer.localizer import Found, Measured
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording
+from padforge.sense.localizer.evaluation import by_place, conformal, error_row, errors_by_loss, idle_share
+from padforge.sense.localizer.localizer import Found, Measured
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
 

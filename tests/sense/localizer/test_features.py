@@ -6,9 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from sense.localizer.features import FEATURES, PAST, PASTS, REST, SIZES, SLOW, Inputs, bridged, history, press_inputs
-from sense.localizer.normalization import MAX_INPUT, Normalization
+from padforge.sense.localizer.features import (
+    FEATURES,
+    PAST,
+    PASTS,
+    REST,
+    SIZES,
+    SLOW,
+    Inputs,
+    bridged,
+    history,
+    press_inputs,
+)
+from padforge.sense.localizer.normalization import MAX_INPUT, Normalization
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
 BEGUN = 40 * np.arange(PRESSES) + 20

@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from padforge.design.common.errors import InputError
+from padforge.sense import Localizer, Recording, evaluate
+from padforge.sense.localizer.calibration import fibre_loss_study as loss_study
+from padforge.sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
+from padforge.sense.report import fibre_loss_figure
+from padforge.sense.settings import LocalizerSettings as Options
 
-from design.common.errors import InputError
-from sense import Localizer, Recording, evaluate
-from sense.localizer.calibration import fibre_loss_study as loss_study
-from sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
-from sense.report import fibre_loss_figure
-from sense.settings import LocalizerSettings as Options
 from tests.helpers.door import Ended, call
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published network of three neurons, and a coarse map of the answers, which is not what is tested."""
-    monkeypatch.setattr("sense.localizer.calibration.networks.published_training.HIDDEN", 3)
-    monkeypatch.setattr("sense.localizer.response.response_model.BUMPS", 7)
+    monkeypatch.setattr("padforge.sense.localizer.calibration.networks.published_training.HIDDEN", 3)
+    monkeypatch.setattr("padforge.sense.localizer.response.response_model.BUMPS", 7)
 
 
 def mean_of(part: dict) -> float:
@@ -162,7 +162,7 @@ def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatc
 
     command = ("--retrain", "--lost", "1", "--out", "out")
     with monkeypatch.context() as broken:
-        broken.setattr("sense.report.fibre_loss_figure.draw_fibre_loss", full)
+        broken.setattr("padforge.sense.report.fibre_loss_figure.draw_fibre_loss", full)
         ended = loss(*command)
     assert (ended.code, len(trained)) == (2, 5), ended
     assert len(list(Path("out", "unfinished").glob("start_*.npz"))) == 5

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording
+from padforge.sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
+from padforge.sense.settings import LocalizerSettings as Options
 
-from design.common.errors import InputError
-from sense import Recording
-from sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
-from sense.settings import LocalizerSettings as Options
 from tests.helpers.door import called
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
@@ -44,8 +44,8 @@ def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
 def quick() -> Iterator[None]:
     """Few resamplings, and a coarse map of the answers."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("sense.localizer.calibration.learning_curve.DRAWS", 40)
-        patched.setattr("sense.localizer.response.response_model.BUMPS", 7)
+        patched.setattr("padforge.sense.localizer.calibration.learning_curve.DRAWS", 40)
+        patched.setattr("padforge.sense.localizer.response.response_model.BUMPS", 7)
         yield
 
 

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Localizer, Recording
-from sense.localizer.localizer import UNKNOWN, Found, Measured, joined
-from sense.localizer.locating import write_places
-from sense.localizer.normalization import Scaled
+from padforge.design.common.errors import InputError
+from padforge.sense import Localizer, Recording
+from padforge.sense.localizer.localizer import UNKNOWN, Found, Measured, joined
+from padforge.sense.localizer.locating import write_places
+from padforge.sense.localizer.normalization import Scaled
 
 
 def test_a_fibre_masked_or_without_readings_does_nothing(localizer: Localizer, recording: Recording) -> None:

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from padforge.design.common.errors import InputError
+from padforge.sense import Localizer, Recording, evaluate
+from padforge.sense.localizer.calibration import fine_tuning
+from padforge.sense.localizer.calibration.affine_correction import fit_correction
+from padforge.sense.localizer.calibration.fine_tuning import adapt
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
+from padforge.sense.localizer.calibration.recalibration import CrossValidation, recalibrate
+from padforge.sense.localizer.evaluation import distances
+from padforge.sense.localizer.localizer import Found
+from padforge.sense.localizer.response.response_model import looked_up
 
-from design.common.errors import InputError
-from sense import Localizer, Recording, evaluate
-from sense.localizer.calibration import fine_tuning
-from sense.localizer.calibration.affine_correction import fit_correction
-from sense.localizer.calibration.fine_tuning import adapt
-from sense.localizer.calibration.networks.training_presses import TrainingPresses
-from sense.localizer.calibration.recalibration import CrossValidation, recalibrate
-from sense.localizer.evaluation import distances
-from sense.localizer.localizer import Found
-from sense.localizer.response.response_model import looked_up
 from tests.helpers.door import called
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])

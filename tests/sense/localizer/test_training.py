@@ -8,15 +8,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from sense.localizer import network
-from sense.localizer.calibration import training
-from sense.localizer.calibration.networks import masked_network
-from sense.localizer.calibration.networks.masked_network import draw_alive
-from sense.localizer.calibration.networks.training_presses import TrainingPresses
-from sense.localizer.response.response_model import looked_up
-from sense.settings import Features
-from sense.settings import LocalizerSettings as Options
+from padforge.sense.localizer import network
+from padforge.sense.localizer.calibration import training
+from padforge.sense.localizer.calibration.networks import masked_network
+from padforge.sense.localizer.calibration.networks.masked_network import draw_alive
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
+from padforge.sense.localizer.response.response_model import looked_up
+from padforge.sense.settings import Features
+from padforge.sense.settings import LocalizerSettings as Options
 
 
 @settings(max_examples=5)

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design import Morphology
-from sense import Recording, RigSettings, simulate
-from sense.recordings.formats.ros.exporting import export_bag
+from padforge.design import Morphology
+from padforge.sense import Recording, RigSettings, simulate
+from padforge.sense.recordings.formats.ros.exporting import export_bag
 
 
 @pytest.fixture(scope="session")

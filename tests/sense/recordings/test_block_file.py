@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-
-from design.common.errors import InputError
-from sense.recordings.block_file import BlockWriter, block_dtype, read_blocks
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.block_file import BlockWriter, block_dtype, read_blocks
 
 
 def write(path: Path, rows: np.ndarray, cuts: Sequence[int] = (), flush: bool = False) -> None:

@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from PIL import Image
-
-from design.common.errors import InputError
-from sense import (
+from padforge.design.common.errors import InputError
+from padforge.sense import (
     Recorder,
     Recording,
     export_bag,
@@ -22,8 +20,9 @@ from sense import (
     import_mat,
     open_recording,
 )
-from sense.cli.main import sense
-from sense.recordings.import_export import arm_states, export_file
+from padforge.sense.cli.main import sense
+from padforge.sense.recordings.import_export import arm_states, export_file
+from PIL import Image
 
 
 @pytest.mark.parametrize("name", ["run", "run.csv", "run.h5", "run.mcap"])

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Recording
-from sense.recordings.recorder import Recorder
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording
+from padforge.sense.recordings.recorder import Recorder
 
 
 def test_a_torn_journal_line_and_one_that_begins_again_lose_their_press_only(
@@ -104,6 +103,6 @@ def test_presses_that_another_program_has_just_made_count(folder: Path, monkeypa
             another.append([another.last_s + 1], np.zeros((1, another.fibres)))
             another.finish(another.readings)
 
-    monkeypatch.setattr("sense.recordings.recorder.lock", last_made)
+    monkeypatch.setattr("padforge.sense.recordings.recorder.lock", last_made)
     with Recorder.resume(folder) as recorder:
         assert 9999 in recorder.done

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology
-from design.common.settings import validated
-from design.settings import PadSettings
-from sense.recordings.press_plan import PressPlan, planned, read_plan
-from sense.settings import RigSettings
+from padforge.design import InputError, Morphology
+from padforge.design.common.settings import validated
+from padforge.design.settings import PadSettings
+from padforge.sense.recordings.press_plan import PressPlan, planned, read_plan
+from padforge.sense.settings import RigSettings
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 KINDS = ("uniform", "grid", "boustrophedon", "adaptive")

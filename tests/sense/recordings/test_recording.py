@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Recorder, Recording
+from padforge.design.common.errors import InputError
+from padforge.sense import Recorder, Recording
 
 
 def test_a_run_directory_gives_back_the_recording_and_a_torn_stream_loses_the_presses_it_had(

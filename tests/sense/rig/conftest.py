@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
-
-from sense.rig.arms.ur5.driver import UR5
-from sense.rig.devices.protocols import RigFault
-from sense.rig.emulators import whole_rig
-from sense.rig.emulators.ur.controller import Series
-from sense.rig.emulators.ur.emulator import UrEmulator
+from padforge.sense.rig.arms.ur5.driver import UR5
+from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.emulators import whole_rig
+from padforge.sense.rig.emulators.ur.controller import Series
+from padforge.sense.rig.emulators.ur.emulator import UrEmulator
 
 WAIT_S = 180.0
 ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]

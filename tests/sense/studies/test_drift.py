@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology
-from sense import Recording, open_recording
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import RigSettings
-from sense.studies.drift import study as drift
-from sense.studies.drift.study import FILTERS, SCHEMES, SLOW_PRESSES, drift_study, scheme_inputs, values
-from sense.studies.study import Study, run
+from padforge.design import InputError, Morphology
+from padforge.sense import Recording, open_recording
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import RigSettings
+from padforge.sense.studies.drift import study as drift
+from padforge.sense.studies.drift.study import FILTERS, SCHEMES, SLOW_PRESSES, drift_study, scheme_inputs, values
+from padforge.sense.studies.study import Study, run
 
 PAD = Morphology.random(2, knots=3, seed=5)
 STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0)

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology
-from design.pad.indentation import Indenter
-from sense.studies.indentation.force import COUNTS, Learning, force_study, readings
-from sense.studies.indentation.shape import FOOTPRINTS, SETS, circumradius, shape_study
-from sense.studies.study import run
+from padforge.design import InputError, Morphology
+from padforge.design.pad.indentation import Indenter
+from padforge.sense.studies.indentation.force import COUNTS, Learning, force_study, readings
+from padforge.sense.studies.indentation.shape import FOOTPRINTS, SETS, circumradius, shape_study
+from padforge.sense.studies.study import run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 

@@ -2,12 +2,18 @@
 
 import numpy as np
 import pytest
-
-from design import Morphology, signals
-from design.common.computing import one_torch_thread
-from sense.studies.multicontact.pairs import LABELLED, WAYS, learnt, moments, pairs_of_moments, unordered_distances
-from sense.studies.multicontact.study import COUNTED, multicontact_study
-from sense.studies.study import run
+from padforge.design import Morphology, signals
+from padforge.design.common.computing import one_torch_thread
+from padforge.sense.studies.multicontact.pairs import (
+    LABELLED,
+    WAYS,
+    learnt,
+    moments,
+    pairs_of_moments,
+    unordered_distances,
+)
+from padforge.sense.studies.multicontact.study import COUNTED, multicontact_study
+from padforge.sense.studies.study import run
 
 PAD = Morphology.random(4, 3, 0)
 PADS = {"square": Morphology.straight(4), "random": PAD}

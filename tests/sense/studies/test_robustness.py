@@ -11,12 +11,11 @@ from typing import cast
 
 import numpy as np
 import pytest
-
-from design import Contact, Morphology
-from sense.studies import robustness
-from sense.studies.pads import load_pads
-from sense.studies.robustness import robustness_study
-from sense.studies.study import Study, run
+from padforge.design import Contact, Morphology
+from padforge.sense.studies import robustness
+from padforge.sense.studies.pads import load_pads
+from padforge.sense.studies.robustness import robustness_study
+from padforge.sense.studies.study import Study, run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 

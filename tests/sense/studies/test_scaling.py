@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology, signals
-from sense.studies import scaling, sensitivity
-from sense.studies.scaling import around, scaling_study, shares, spread_presses
-from sense.studies.sensitivity import sensitivity_study
-from sense.studies.study import run
+from padforge.design import InputError, Morphology, signals
+from padforge.sense.studies import scaling, sensitivity
+from padforge.sense.studies.scaling import around, scaling_study, shares, spread_presses
+from padforge.sense.studies.sensitivity import sensitivity_study
+from padforge.sense.studies.study import run
 
 
 def rows_of(document: dict, **wanted) -> list[dict]:

@@ -13,19 +13,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings
+from padforge.design.optimisers.search import SearchResult
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import RigSettings
+from padforge.sense.studies import scaling, sensitivity
+from padforge.sense.studies.drift import study as drift
+from padforge.sense.studies.indentation.force import Learning, force_study
+from padforge.sense.studies.indentation.shape import shape_study
+from padforge.sense.studies.multicontact.study import multicontact_study
+from padforge.sense.studies.pads import described, load_pads
+from padforge.sense.studies.robustness import robustness_study
+from padforge.sense.studies.study import Findings, Study, Task, run, study_lines
 
-from design import Contact, InputError, Morphology, PadSettings, SearchSettings
-from design.optimisers.search import SearchResult
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import RigSettings
-from sense.studies import scaling, sensitivity
-from sense.studies.drift import study as drift
-from sense.studies.indentation.force import Learning, force_study
-from sense.studies.indentation.shape import shape_study
-from sense.studies.multicontact.study import multicontact_study
-from sense.studies.pads import described, load_pads
-from sense.studies.robustness import robustness_study
-from sense.studies.study import Findings, Study, Task, run, study_lines
 from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
@@ -107,7 +107,7 @@ def test_a_folder_in_which_a_study_is_at_work_or_one_of_other_settings_was_broke
 
 def test_a_lock_that_goes_while_it_is_taken_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who had it may come to the end between the opening of its file and the lock on that."""
-    monkeypatch.setattr("design.common.files.lock", lambda file, busy: (tmp_path / ".x.lock").unlink())
+    monkeypatch.setattr("padforge.design.common.files.lock", lambda file, busy: (tmp_path / ".x.lock").unlink())
     with pytest.raises(InputError, match="a x study is at work there"):
         run(one(), tmp_path)
 
@@ -217,7 +217,7 @@ def test_pads_are_searched_for_with_so_many_knots_by_either_method(monkeypatch: 
         asked.append((pad.grid, settings.method, settings.knots, settings.seed))
         return SearchResult(Morphology.straight(pad.grid), {}, [], "start 1", {})
 
-    monkeypatch.setattr("design.optimisers.search.search", remembered)
+    monkeypatch.setattr("padforge.design.optimisers.search.search", remembered)
     names = ("optimised", "optimised-5", "genetic-1@2", "optimised-30@3")
     assert tuple(load_pads(names, seed=4)) == names
     assert asked == [(4, "descent", 21, 4), (4, "descent", 5, 4), (2, "genetic", 1, 4), (3, "descent", 30, 4)]

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-
-from design import Morphology
-from design.pad.twin import Twin
-from sense.twin.benchmark import printed_pad
-from sense.twin.responses import Responses
+from padforge.design import Morphology
+from padforge.design.pad.twin import Twin
+from padforge.sense.twin.benchmark import printed_pad
+from padforge.sense.twin.responses import Responses
 
 PLAN = Morphology.random(2, knots=3, seed=5)
 

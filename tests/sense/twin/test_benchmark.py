@@ -1,9 +1,8 @@
 """The twin bench: it holds every way, and judges what it was told to. No times are asserted."""
 
 import pytest
-
-from design.benchmarking import harness
-from sense.twin import benchmark as bench
+from padforge.design.benchmarking import harness
+from padforge.sense.twin import benchmark as bench
 
 
 @pytest.mark.slow

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from sense.twin.fitting import Freedom, fit
-from sense.twin.laid_pad import AWAY, COUNTS, LaidPad, Plan
-from sense.twin.responses import Responses
-from sense.twin.scatter import response_scatter
-from sense.twin.smooth import smooth_function
-from sense.twin.wiring import assigned, wirings
+from padforge.sense.twin.fitting import Freedom, fit
+from padforge.sense.twin.laid_pad import AWAY, COUNTS, LaidPad, Plan
+from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.scatter import response_scatter
+from padforge.sense.twin.smooth import smooth_function
+from padforge.sense.twin.wiring import assigned, wirings
 
 from .conftest import PLAN, responses_of
 

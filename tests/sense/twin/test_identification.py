@@ -8,18 +8,17 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology
-from design.pad.twin import Twin
-from design.settings import PadSettings
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.published_protocol import simulate
-from sense.report.identification_results import identification_lines
-from sense.settings import RigSettings
-from sense.twin import identification, wiring
-from sense.twin.benchmark import printed_pad
-from sense.twin.identification import identify
-from sense.twin.identified_pad import Identification
+from padforge.design import InputError, Morphology
+from padforge.design.pad.twin import Twin
+from padforge.design.settings import PadSettings
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.report.identification_results import identification_lines
+from padforge.sense.settings import RigSettings
+from padforge.sense.twin import identification, wiring
+from padforge.sense.twin.benchmark import printed_pad
+from padforge.sense.twin.identification import identify
+from padforge.sense.twin.identified_pad import Identification
 
 from .conftest import PLAN
 

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from design import Morphology, Twin
-from design.pad.twin import TwinReadings
-from sense import Recording, RigSettings, simulate
-from sense.twin.responses import information, of_one_depth, responses
+from padforge.design import Morphology, Twin
+from padforge.design.pad.twin import TwinReadings
+from padforge.sense import Recording, RigSettings, simulate
+from padforge.sense.twin.responses import information, of_one_depth, responses
 
 QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
 

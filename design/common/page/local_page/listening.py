@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 HOST = "127.0.0.1"
 """Only this machine is served, unless another address is asked for: then whoever asks must know a token."""

@@ -17,7 +17,7 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any, Self
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 from ..shipped import resource
 from .listening import END_S, HOST, POLL_S, ConnectionServer, listening, refuse_open

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, shown
-from design.common.files import require_file
+from padforge.design.common.errors import InputError, shown
+from padforge.design.common.files import require_file
 
 from .strokes import FARTHEST, MOST_BYTES, MOST_POINTS, Drawing, Pen, reason
 

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-
-from design.common.errors import InputError, real
-from design.pad.courses.curves import flatten
-from design.pad.courses.fitting import fitted_knots
-from design.pad.courses.spare_knots import with_spares
-from design.pad.knots import Array
-from design.pad.morphology import Morphology
-from design.settings import Layout
+from padforge.design.common.errors import InputError, real
+from padforge.design.pad.courses.curves import flatten
+from padforge.design.pad.courses.fitting import fitted_knots
+from padforge.design.pad.courses.spare_knots import with_spares
+from padforge.design.pad.knots import Array
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import Layout
 
 from .dxf import read_dxf
 from .strokes import Drawing, Stroke

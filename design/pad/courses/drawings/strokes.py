@@ -5,10 +5,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-
-from design.common.errors import InputError
-from design.pad.courses.curves import cubic
-from design.pad.knots import Array
+from padforge.design.common.errors import InputError
+from padforge.design.pad.courses.curves import cubic
+from padforge.design.pad.knots import Array
 
 MOST_BYTES = 2**22
 """Of a drawing: one of more is none of fibres."""

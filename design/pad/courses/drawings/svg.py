@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]  it is compiled
-
-from design.common.errors import InputError, shown
-from design.common.files import read_bytes
-from design.pad.knots import Array
+from padforge.design.common.errors import InputError, shown
+from padforge.design.common.files import read_bytes
+from padforge.design.pad.knots import Array
 
 from .strokes import MOST_BYTES, Drawing, Pen, reason
 

@@ -5,12 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 import onnx
 from onnx import TensorProto, helper
-
-from sense.localizer.features import SIZES
-from sense.localizer.localizer import UNKNOWN, Localizer
-from sense.localizer.locating import MEASURED
-from sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
-from sense.localizer.normalization import MAX_INPUT
+from padforge.sense.localizer.features import SIZES
+from padforge.sense.localizer.localizer import UNKNOWN, Localizer
+from padforge.sense.localizer.locating import MEASURED
+from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
+from padforge.sense.localizer.normalization import MAX_INPUT
 
 from .features_graph import END, GraphNodes, PressFeatures, volts
 from .observer_graph import observed

@@ -1,10 +1,9 @@
-"""What `sense.localizer.response.observer` computes, as nodes of an ONNX graph: from inputs to a place."""
+"""What `padforge.sense.localizer.response.observer` computes, as nodes of an ONNX graph: from inputs to a place."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 from onnx import TensorProto
-
-from sense.localizer.response.observer import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, Observer
+from padforge.sense.localizer.response.observer import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, Observer
 
 from .features_graph import END, GraphNodes
 

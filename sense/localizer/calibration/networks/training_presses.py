@@ -3,9 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from sense.localizer.response.response_model import leverages, looked_up
-from sense.recordings.processing.limits import Floats, Mask
+from padforge.sense.localizer.response.response_model import leverages, looked_up
+from padforge.sense.recordings.processing.limits import Floats, Mask
 
 
 @dataclass(frozen=True)

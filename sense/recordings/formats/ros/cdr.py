@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError
+from padforge.design.common.errors import InputError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -4,9 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from sense.recordings.formats.model_findings import ModelFindings
-from sense.recordings.recording import Recording
+from padforge.sense.recordings.formats.model_findings import ModelFindings
+from padforge.sense.recordings.recording import Recording
 
 from . import topics
 from .cdr import blank

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError, real
-from sense.recordings.processing.limits import MAX_S, Array
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, real
+from padforge.sense.recordings.processing.limits import MAX_S, Array
+from padforge.sense.recordings.recording import Recording
 
 from .topics import UNITS
 

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError
-from design.common.files import UNFINISHED, staged, writing
-from sense.recordings.formats.model_findings import ModelFindings, export_path
-from sense.recordings.processing.limits import Array, as_numbers
-from sense.recordings.recorder import STATE_COLUMNS
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.design.common.files import UNFINISHED, staged, writing
+from padforge.sense.recordings.formats.model_findings import ModelFindings, export_path
+from padforge.sense.recordings.processing.limits import Array, as_numbers
+from padforge.sense.recordings.recorder import STATE_COLUMNS
+from padforge.sense.recordings.recording import Recording
 
 from . import exact, topics
 from .bags.bag import MOST_BYTES, MOST_MESSAGES, MOST_RECORDS

@@ -8,13 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError, shown
-from sense.recordings.formats.assembly import assembled
-from sense.recordings.formats.mapping import MILLIMETRES, UNITS, Part, chosen, file_and_mapping, listed, parse_mapping
-from sense.recordings.formats.published_mat import NOTE
-from sense.recordings.processing.limits import Array, Indices
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError, shown
+from padforge.sense.recordings.formats.assembly import assembled
+from padforge.sense.recordings.formats.mapping import (
+    MILLIMETRES,
+    UNITS,
+    Part,
+    chosen,
+    file_and_mapping,
+    listed,
+    parse_mapping,
+)
+from padforge.sense.recordings.formats.published_mat import NOTE
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.recording import Recording
 
 from . import exact, topics
 from .bags.bag import Topic

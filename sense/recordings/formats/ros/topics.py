@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from design.common.errors import InputError
-from sense.recordings.processing.limits import Array
-from sense.recordings.recording import Recording
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.recordings.recording import Recording
 
 READINGS, PRESSED, PLACE = "/pad/readings", "/pad/pressed", "/pad/place"
 REACHED, FORCE, RECORDING = "/pad/reached", "/pad/force", "/pad/recording"

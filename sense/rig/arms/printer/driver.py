@@ -11,11 +11,10 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-
-from sense.recordings.recorder import STATE_COLUMNS
-from sense.rig.devices.protocols import ArmState, Array, Pose, RigFault
-from sense.rig.safety import require_numbers
-from sense.settings import RigSettings
+from padforge.sense.recordings.recorder import STATE_COLUMNS
+from padforge.sense.rig.devices.protocols import ArmState, Array, Pose, RigFault
+from padforge.sense.rig.safety import require_numbers
+from padforge.sense.settings import RigSettings
 
 from . import marlin
 from .link import HOME, MarlinLink

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-from sense.rig.devices.protocols import Cause, RigFault
-from sense.rig.devices.serial_port import open_port
+from padforge.sense.rig.devices.protocols import Cause, RigFault
+from padforge.sense.rig.devices.serial_port import open_port
 
 from . import marlin
 

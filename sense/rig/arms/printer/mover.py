@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import NoReturn
 
-from sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.devices.protocols import RigFault
 
 from . import marlin
 from .link import HOME, MarlinLink

@@ -7,11 +7,10 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-
-from sense.recordings.recorder import STATE_COLUMNS
-from sense.rig.devices.protocols import ArmState, Array, RigFault
-from sense.rig.safety import require_numbers
-from sense.settings import RigSettings
+from padforge.sense.recordings.recorder import STATE_COLUMNS
+from padforge.sense.rig.devices.protocols import ArmState, Array, RigFault
+from padforge.sense.rig.safety import require_numbers
+from padforge.sense.settings import RigSettings
 
 from .link import ArmLink
 from .rtde_frames import stop_program

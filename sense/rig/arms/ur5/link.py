@@ -10,8 +10,8 @@ from collections import deque
 from contextlib import suppress
 from typing import Any
 
-from sense.rig.devices.processes import start
-from sense.rig.devices.protocols import Cause, RigFault
+from padforge.sense.rig.devices.processes import start
+from padforge.sense.rig.devices.protocols import Cause, RigFault
 
 from . import messages as wire
 from .rtde_frames import stop_program
@@ -45,7 +45,7 @@ class ArmLink:
         self._news = threading.Condition()
         self._looked = time.monotonic()
         self._ending = threading.Event()
-        self._process = start("sense.rig.arms.ur5.child_process", host, stderr=subprocess.DEVNULL)
+        self._process = start("padforge.sense.rig.arms.ur5.child_process", host, stderr=subprocess.DEVNULL)
         assert self._process.stdin is not None
         os.set_blocking(self._process.stdin.fileno(), False)
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._beat)]

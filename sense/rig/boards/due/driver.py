@@ -5,13 +5,12 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-
-from design.common.errors import InputError
-from sense.rig.boards.block_reader import BlockReader
-from sense.rig.boards.inputs import chosen_inputs
-from sense.rig.boards.sample_clock import SampleClock
-from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.settings import RigSettings
+from padforge.design.common.errors import InputError
+from padforge.sense.rig.boards.block_reader import BlockReader
+from padforge.sense.rig.boards.inputs import chosen_inputs
+from padforge.sense.rig.boards.sample_clock import SampleClock
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.settings import RigSettings
 
 from .framing import FULL_SCALE, MAX_AVERAGING, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Request, Status
 from .serial_link import SerialLink, port_of

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from sense.rig.boards.byte_stream import ByteStream
-from sense.rig.devices.protocols import RigFault
-from sense.rig.devices.serial_port import host_ports
-from sense.settings import RigSettings
+from padforge.sense.rig.boards.byte_stream import ByteStream
+from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.devices.serial_port import host_ports
+from padforge.sense.settings import RigSettings
 
 from .framing import BoardSettings, Decoder, Frame, Request, encode
 

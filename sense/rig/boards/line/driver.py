@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from sense.rig.boards.block_reader import BlockReader
-from sense.rig.boards.byte_stream import ByteStream
-from sense.rig.boards.inputs import chosen_inputs
-from sense.rig.boards.sample_clock import SampleClock
-from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.rig.devices.serial_port import host_ports
-from sense.settings import RigSettings
+from padforge.sense.rig.boards.block_reader import BlockReader
+from padforge.sense.rig.boards.byte_stream import ByteStream
+from padforge.sense.rig.boards.inputs import chosen_inputs
+from padforge.sense.rig.boards.sample_clock import SampleClock
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.rig.devices.serial_port import host_ports
+from padforge.sense.settings import RigSettings
 
 from .framing import ASK, Decoder, Header, Sample
 

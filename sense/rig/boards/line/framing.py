@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sense.recordings.processing.limits import MAX_FIBRES
+from padforge.sense.recordings.processing.limits import MAX_FIBRES
 
 ASK = b"?"
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0

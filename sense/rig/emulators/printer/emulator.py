@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from sense.recordings.processing.limits import Array
-from sense.rig.arms.printer.motion import Place
-from sense.rig.emulators.serial_device import SerialDevice
+from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.rig.arms.printer.motion import Place
+from padforge.sense.rig.emulators.serial_device import SerialDevice
 
 from .firmware import Firmware
 

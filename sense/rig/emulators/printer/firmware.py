@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from operator import xor
 
-from sense.rig.arms.printer.motion import Place, StraightMove
+from padforge.sense.rig.arms.printer.motion import Place, StraightMove
 
 PLANNED = 16
 """Moves that wait for their turn; a further one waits at the door."""

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from numpy.typing import ArrayLike
-
-from design.common.files import unfinished_file
-from sense.rig.devices.processes import start
-from sense.rig.devices.protocols import Array, Pose, RigFault
+from padforge.design.common.files import unfinished_file
+from padforge.sense.rig.devices.processes import start
+from padforge.sense.rig.devices.protocols import Array, Pose, RigFault
 
 from .controller import Series
 from .truth import Truth, create
@@ -59,7 +58,9 @@ class UrEmulator:
         with ExitStack() as begun:
             path = begun.enter_context(unfinished_file(Path(tempfile.gettempdir()), prefix=_TRUTH))
             create(path)
-            self._process = start("sense.rig.emulators.ur.server", json.dumps(self._settings | {"truth": str(path)}))
+            self._process = start(
+                "padforge.sense.rig.emulators.ur.server", json.dumps(self._settings | {"truth": str(path)})
+            )
             self.truth = Truth(path)
             self._end = begun.pop_all()
         if problem := self._hear():

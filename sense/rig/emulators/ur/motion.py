@@ -3,8 +3,7 @@
 from typing import Protocol
 
 import numpy as np
-
-from sense.recordings.processing.limits import Array
+from padforge.sense.recordings.processing.limits import Array
 
 
 class Path(Protocol):

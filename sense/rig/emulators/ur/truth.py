@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-from sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.processing.limits import Array, Indices
 
 COLUMNS = 8
 """Time on the host's monotonic clock in s, pose in mm and rad, force on the tool in N."""

@@ -10,20 +10,20 @@ import shapely
 from build123d import GeomType, Solid
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.design.pad.morphology import Morphology
+from padforge.fabricate.mould.assembly import holder_body, lid_body, pins, sizes
+from padforge.fabricate.mould.cad.bodies import body_solid, prism_solids
+from padforge.fabricate.mould.cad.layout import Span, Surface
+from padforge.fabricate.mould.cad.outlines.drawing import Drawing
+from padforge.fabricate.mould.cad.outlines.pieces import ring_pieces, straight_pieces
+from padforge.fabricate.mould.cad.shells import solids
+from padforge.fabricate.mould.cad.walls import FLOOR, RIM, Walls
+from padforge.fabricate.mould.mesh import mesh as body_mesh
+from padforge.fabricate.mould.plan import Plan, polygon_rings
+from padforge.fabricate.mould.prisms import Body, Prism, cylinder
 from scipy.special import ellipe
 from shapely.geometry.base import BaseGeometry
 
-from design.pad.morphology import Morphology
-from fabricate.mould.assembly import holder_body, lid_body, pins, sizes
-from fabricate.mould.cad.bodies import body_solid, prism_solids
-from fabricate.mould.cad.layout import Span, Surface
-from fabricate.mould.cad.outlines.drawing import Drawing
-from fabricate.mould.cad.outlines.pieces import ring_pieces, straight_pieces
-from fabricate.mould.cad.shells import solids
-from fabricate.mould.cad.walls import FLOOR, RIM, Walls
-from fabricate.mould.mesh import mesh as body_mesh
-from fabricate.mould.plan import Plan, polygon_rings
-from fabricate.mould.prisms import Body, Prism, cylinder
 from tests.fabricate.planted import with_settings
 
 

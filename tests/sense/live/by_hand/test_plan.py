@@ -7,17 +7,16 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-
-from design import Contact, Morphology
-from design.common.errors import InputError
-from design.settings import PadSettings
-from sense.live.by_hand.run_directory import opened
-from sense.live.by_hand.session import record_by_hand
-from sense.live.by_hand.targets import ROUND, in_rounds, still_to_make, targets_of
-from sense.live.by_hand.view import COLUMNS, ROWS, pad_view, view_lines
-from sense.rig.devices.protocols import RigFault
-from sense.rig.planning.setup import Setup
-from sense.settings import RigSettings
+from padforge.design import Contact, Morphology
+from padforge.design.common.errors import InputError
+from padforge.design.settings import PadSettings
+from padforge.sense.live.by_hand.run_directory import opened
+from padforge.sense.live.by_hand.session import record_by_hand
+from padforge.sense.live.by_hand.targets import ROUND, in_rounds, still_to_make, targets_of
+from padforge.sense.live.by_hand.view import COLUMNS, ROWS, pad_view, view_lines
+from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.planning.setup import Setup
+from padforge.sense.settings import RigSettings
 
 BOARD = {"name": "board", "channels": 4, "rate_hz": 1000.0}
 VIEW = {

@@ -8,23 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import padforge.sense.live.sources
 import pytest
 from numpy.typing import ArrayLike
+from padforge.design import Contact, Morphology
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording
+from padforge.sense.live.by_hand import session
+from padforge.sense.live.by_hand.session import record_by_hand
+from padforge.sense.live.by_hand.targets import targets_of
+from padforge.sense.localizer.calibration.calibration import calibrate
+from padforge.sense.recordings.press_journal import read_journal
+from padforge.sense.recordings.processing.press_detection import Event, Finder
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.rig.emulators.finger import SCATTER_MM, Finger
+from padforge.sense.rig.planning.setup import Setup
+from padforge.sense.settings import RigSettings
 
-import sense.live.sources
-from design import Contact, Morphology
-from design.common.errors import InputError
-from sense import Recording
-from sense.live.by_hand import session
-from sense.live.by_hand.session import record_by_hand
-from sense.live.by_hand.targets import targets_of
-from sense.localizer.calibration.calibration import calibrate
-from sense.recordings.press_journal import read_journal
-from sense.recordings.processing.press_detection import Event, Finder
-from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.rig.emulators.finger import SCATTER_MM, Finger
-from sense.rig.planning.setup import Setup
-from sense.settings import RigSettings
 from tests.sense.conftest import QUICK
 from tests.sense.rig.devices.fakes import Time
 
@@ -83,7 +83,7 @@ class Hands:
             watch(view)
 
         with pytest.MonkeyPatch.context() as patch:  # nobody else sleeps meanwhile
-            patch.setattr(sense.live.sources.time, "sleep", self.clock.sleep)
+            patch.setattr(padforge.sense.live.sources.time, "sleep", self.clock.sleep)
             board = Board(self.finger, self.clock)
             return record_by_hand(self.setup, board, show, lambda: [*said(), *self.finger.said()], resume)
 

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-
-from sense.live.by_hand.judging import BACK, LEARNT, Judge, answers
-from sense.live.by_hand.turns import SEEN_S, SETTLE_S, Turns
+from padforge.sense.live.by_hand.judging import BACK, LEARNT, Judge, answers
+from padforge.sense.live.by_hand.turns import SEEN_S, SETTLE_S, Turns
 
 PLACES = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
 REST = np.array([2.0, 1.8, 1.9])

@@ -12,13 +12,13 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from padforge.design.common.errors import Fault, InputError
+from padforge.sense import Localizer, Recording, calibrate, export_csv
+from padforge.sense.live.deployment import onnx_file
+from padforge.sense.live.deployment.onnx_file import MOST_OFF_MM, Exported, export_onnx, onnx_line
+from padforge.sense.localizer.features import bridged
+from padforge.sense.localizer.localizer import Found
 
-from design.common.errors import Fault, InputError
-from sense import Localizer, Recording, calibrate, export_csv
-from sense.live.deployment import onnx_file
-from sense.live.deployment.onnx_file import MOST_OFF_MM, Exported, export_onnx, onnx_line
-from sense.localizer.features import bridged
-from sense.localizer.localizer import Found
 from tests.sense.conftest import QUICK
 from tests.sense.live.deployment.conftest import ROOT, tutorial
 

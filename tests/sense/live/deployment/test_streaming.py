@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-
-from sense import Recording
-from sense.live.deployment.kernels import press_stream
-from sense.live.deployment.streaming import POLES, Detector, commanded, held, owners, seen
-from sense.localizer import features
-from sense.recordings.processing import limits
+from padforge.sense import Recording
+from padforge.sense.live.deployment.kernels import press_stream
+from padforge.sense.live.deployment.streaming import POLES, Detector, commanded, held, owners, seen
+from padforge.sense.localizer import features
+from padforge.sense.recordings.processing import limits
 
 
 @pytest.fixture

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Recording
-from sense.recordings.formats.assembly import FOUND, assembled
-from sense.recordings.formats.mapping import Part
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording
+from padforge.sense.recordings.formats.assembly import FOUND, assembled
+from padforge.sense.recordings.formats.mapping import Part
 
 TIMES = np.arange(12) / 10
 VOLTS = np.arange(24.0).reshape(12, 2)

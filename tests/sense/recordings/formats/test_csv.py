@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Recording, export_csv, import_csv
-from sense.recordings.formats import csv_table
-from sense.recordings.press_plan import read_plan
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording, export_csv, import_csv
+from padforge.sense.recordings.formats import csv_table
+from padforge.sense.recordings.press_plan import read_plan
 
 
 def lines(rows: list[str], header: str = "time_s,a,b,x_mm,y_mm") -> str:

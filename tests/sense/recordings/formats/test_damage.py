@@ -8,10 +8,9 @@ import pytest
 import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from design.common.errors import InputError
-from sense import Recorder, Recording, export_bag, export_csv, export_hdf5, open_recording
-from sense.recordings.import_export import import_file
+from padforge.design.common.errors import InputError
+from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, open_recording
+from padforge.sense.recordings.import_export import import_file
 
 from .ros.foreign import array, make, write_bag
 

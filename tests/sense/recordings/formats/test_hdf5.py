@@ -8,9 +8,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from sense import Recording, export_hdf5, import_hdf5, open_recording
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording, export_hdf5, import_hdf5, open_recording
 
 MAPPING = "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"
 

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-
-from design.common.errors import InputError
-from sense import Recording
-from sense.recordings.formats import lerobot
-from sense.recordings.formats.lerobot import export_lerobot
-from sense.recordings.formats.model_findings import ModelFindings
-from sense.recordings.import_export import export_file
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording
+from padforge.sense.recordings.formats import lerobot
+from padforge.sense.recordings.formats.lerobot import export_lerobot
+from padforge.sense.recordings.formats.model_findings import ModelFindings
+from padforge.sense.recordings.import_export import export_file
 
 COUNTED = {"timestamp": "float32"} | dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}

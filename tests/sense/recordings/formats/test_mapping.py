@@ -1,9 +1,8 @@
 """Mappings: what they name, and what they leave to guess."""
 
 import pytest
-
-from design.common.errors import InputError
-from sense.recordings.formats.mapping import Part, chosen, parse_mapping
+from padforge.design.common.errors import InputError
+from padforge.sense.recordings.formats.mapping import Part, chosen, parse_mapping
 
 NAMES = ["t_ms", "Time [s]", "ch1", "ch2", "a,b", "a:b", "px", "py", "contact"]
 

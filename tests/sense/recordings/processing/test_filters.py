@@ -5,11 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-
-from design.common.errors import InputError
-from sense import TotalVariation, open_recording, running_median, total_variation
-from sense.recordings.processing.benchmark import fibre, iterated, linear_program
-from sense.recordings.processing.filters import stretches
+from padforge.design.common.errors import InputError
+from padforge.sense import TotalVariation, open_recording, running_median, total_variation
+from padforge.sense.recordings.processing.benchmark import fibre, iterated, linear_program
+from padforge.sense.recordings.processing.filters import stretches
 
 STEP_V = 3.3 / 1023
 LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])

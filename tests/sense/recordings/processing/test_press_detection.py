@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from design import Morphology
-from design.common.errors import InputError
-from design.settings import Counts
-from sense import Recording, RigSettings, import_mat, simulate
-from sense.recordings.processing.press_alignment import as_detected
-from sense.recordings.processing.press_detection import Finder, Presses, as_commanded, find_presses
-from sense.recordings.simulation.pad_model import Divider
+from padforge.design import Morphology
+from padforge.design.common.errors import InputError
+from padforge.design.settings import Counts
+from padforge.sense import Recording, RigSettings, import_mat, simulate
+from padforge.sense.recordings.processing.press_alignment import as_detected
+from padforge.sense.recordings.processing.press_detection import Finder, Presses, as_commanded, find_presses
+from padforge.sense.recordings.simulation.pad_model import Divider
 
 RATE_HZ = 14.0
 SENT_DOWN_S, SENT_UP_S = 0.16, 0.08

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-
-from design.common.errors import InputError
-from sense import RunningMedian, TotalVariation, running_median, total_variation
+from padforge.design.common.errors import InputError
+from padforge.sense import RunningMedian, TotalVariation, running_median, total_variation
 
 VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))
 RECORDINGS = hnp.arrays(np.float64, st.tuples(st.integers(0, 40), st.integers(1, 2)), elements=VALUES)

@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology, signals, signals_quantized
-from design.pad.contact import relative_stretch
-from design.settings import PUBLISHED_CONTACT, PadSettings
-from sense import RigSettings, simulate
-from sense.recordings.simulation.pad_model import (
+from padforge.design import InputError, Morphology, signals, signals_quantized
+from padforge.design.pad.contact import relative_stretch
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
+from padforge.sense import RigSettings, simulate
+from padforge.sense.recordings.simulation.pad_model import (
     ADC_STEPS,
     SUPPLY_V,
     Answer,

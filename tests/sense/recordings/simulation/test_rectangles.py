@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from design import Morphology
-from design.settings import PadSettings
-from sense import Localizer, Recording, calibrate, evaluate, locate
-from sense.live.sources import simulated
-from sense.recordings.press_plan import told_pad
-from sense.recordings.simulation.published_protocol import simulate
-from sense.settings import LocalizerSettings, RigSettings
+from padforge.design import Morphology
+from padforge.design.settings import PadSettings
+from padforge.sense import Localizer, Recording, calibrate, evaluate, locate
+from padforge.sense.live.sources import simulated
+from padforge.sense.recordings.press_plan import told_pad
+from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.settings import LocalizerSettings, RigSettings
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))

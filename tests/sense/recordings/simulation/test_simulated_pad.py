@@ -5,13 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from design import InputError, Morphology, Twin
-from design.pad.contact import relative_stretch
-from design.pad.twin import Frame, TwinChannel, TwinReadings
-from sense import Recording, RigSettings, simulate
-from sense.recordings.simulation.simulated_pad import measured
-from sense.recordings.simulation.strengths import strengths
+from padforge.design import InputError, Morphology, Twin
+from padforge.design.pad.contact import relative_stretch
+from padforge.design.pad.twin import Frame, TwinChannel, TwinReadings
+from padforge.sense import Recording, RigSettings, simulate
+from padforge.sense.recordings.simulation.simulated_pad import measured
+from padforge.sense.recordings.simulation.strengths import strengths
 
 PAD = Morphology.straight(2)
 GAINS = (-0.06, -0.04, -0.05)

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from padforge.design.common.errors import InputError
+from padforge.sense.rig.boards import block_reader
+from padforge.sense.rig.boards.due import driver as due_driver
+from padforge.sense.rig.boards.due.driver import Arduino
+from padforge.sense.rig.boards.line import driver as line_driver
+from padforge.sense.rig.boards.line.driver import LineBoard
+from padforge.sense.rig.boards.line.framing import Header
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.rig.emulators.due_board import EmulatedBoard
+from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
 
-from design.common.errors import InputError
-from sense.rig.boards import block_reader
-from sense.rig.boards.due import driver as due_driver
-from sense.rig.boards.due.driver import Arduino
-from sense.rig.boards.line import driver as line_driver
-from sense.rig.boards.line.driver import LineBoard
-from sense.rig.boards.line.framing import Header
-from sense.rig.devices.protocols import ConverterSamples, RigFault
-from sense.rig.emulators.due_board import EmulatedBoard
-from sense.rig.emulators.line_board import EmulatedLineBoard
 from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from padforge.sense.rig.boards.sample_clock import SampleClock
 from scipy.optimize import linprog
-
-from sense.rig.boards.sample_clock import SampleClock
 
 SETTLE_S = 0.5
 

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-from design import Morphology
-from design.settings import PUBLISHED_CONTACT
-from sense.recordings.recorder import STATE_COLUMNS
-from sense.recordings.simulation.pad_model import LivePad
-from sense.rig.devices.protocols import ArmState, ConverterSamples, Pose, RigFault
-from sense.rig.session.pad_frame import Frame
-from sense.settings import RigSettings
+from padforge.design import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.sense.recordings.recorder import STATE_COLUMNS
+from padforge.sense.recordings.simulation.pad_model import LivePad
+from padforge.sense.rig.devices.protocols import ArmState, ConverterSamples, Pose, RigFault
+from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
 FIBRES = 4

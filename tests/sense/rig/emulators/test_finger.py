@@ -4,10 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from design import Contact, Morphology
-from sense.rig.emulators.finger import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, Stroke
-from sense.settings import RigSettings
+from padforge.design import Contact, Morphology
+from padforge.sense.rig.emulators.finger import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, Stroke
+from padforge.sense.settings import RigSettings
 
 RATE_HZ = 50.0
 

@@ -14,26 +14,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from padforge.design import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.sense.recordings.press_journal import read_journal
+from padforge.sense.recordings.press_plan import PressPlan, planned
+from padforge.sense.recordings.recorder import Recorder
+from padforge.sense.recordings.recording import Recording
+from padforge.sense.recordings.simulation.pad_model import LivePad
+from padforge.sense.rig.arms.ur5.rtde_frames import RTDE_PORT
+from padforge.sense.rig.boards import block_reader
+from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.emulators import whole_rig
+from padforge.sense.rig.emulators.printer.emulator import EmulatedPrinter
+from padforge.sense.rig.operation import look_over
+from padforge.sense.rig.planning.setup import Setup
+from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.rig.session.press_loop import Report, Session
+from padforge.sense.rig.session.retreat import HEIGHT_MM
+from padforge.sense.settings import RigSettings
 
-import padforge
-from design import Morphology
-from design.settings import PUBLISHED_CONTACT
-from sense.recordings.press_journal import read_journal
-from sense.recordings.press_plan import PressPlan, planned
-from sense.recordings.recorder import Recorder
-from sense.recordings.recording import Recording
-from sense.recordings.simulation.pad_model import LivePad
-from sense.rig.arms.ur5.rtde_frames import RTDE_PORT
-from sense.rig.boards import block_reader
-from sense.rig.devices.protocols import RigFault
-from sense.rig.emulators import whole_rig
-from sense.rig.emulators.printer.emulator import EmulatedPrinter
-from sense.rig.operation import look_over
-from sense.rig.planning.setup import Setup
-from sense.rig.session.pad_frame import Frame
-from sense.rig.session.press_loop import Report, Session
-from sense.rig.session.retreat import HEIGHT_MM
-from sense.settings import RigSettings
+from padforge.cli import main
 
 pytest.importorskip("rtde_control")
 pytest.importorskip("serial")
@@ -248,7 +248,7 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
 
 
 def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sense.rig.diagnostics.LOOK_S", 0.3)
+    monkeypatch.setattr("padforge.sense.rig.diagnostics.LOOK_S", 0.3)
     setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
     found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
     assert found["channel 1"].found.startswith("input 14 rests at")
@@ -259,10 +259,10 @@ def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkey
 
 PROGRAM = """
 import sys
-from sense.rig.emulators import whole_rig
+from padforge.sense.rig.emulators import whole_rig
 whole_rig.HOST = sys.argv.pop(1)
-import padforge
-padforge.main()
+from padforge.cli import main
+main()
 """
 
 
@@ -302,7 +302,7 @@ def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
     await_the_end_of_its_arm(address)
     monkeypatch.setattr(sys, "argv", ["padforge", *words])
     with pytest.raises(SystemExit) as done:
-        padforge.main()
+        main()
     assert not done.value.code
     assert len(Recording.open(Path("run")).presses_mm) == 5
     assert set(read_journal(journal)) >= kept >= {0, 1}

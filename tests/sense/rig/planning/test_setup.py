@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from design.common.errors import InputError
-from design.pad.morphology import Morphology
-from design.settings import PUBLISHED_CONTACT, PadSettings
-from sense.recordings.press_plan import planned
-from sense.recordings.recorder import START
-from sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
-from sense.settings import RigSettings
+from padforge.design.common.errors import InputError
+from padforge.design.pad.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
+from padforge.sense.recordings.press_plan import planned
+from padforge.sense.recordings.recorder import START
+from padforge.sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
+from padforge.sense.settings import RigSettings
 
 PAD = Morphology.straight(2)
 RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))

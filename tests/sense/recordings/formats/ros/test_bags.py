@@ -12,10 +12,9 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
-
-from design.common.errors import InputError
-from sense import Recording, import_bag
-from sense.recordings.formats.ros.bags import bag as limits
+from padforge.design.common.errors import InputError
+from padforge.sense import Recording, import_bag
+from padforge.sense.recordings.formats.ros.bags import bag as limits
 
 from .foreign import STORE, array, channel, chunk, make, mcap_file, message, record, text, write_bag
 

@@ -3,9 +3,8 @@
 import math
 
 import pytest
-
-from sense.rig.arms.printer import marlin
-from sense.rig.arms.printer.motion import StraightMove
+from padforge.sense.rig.arms.printer import marlin
+from padforge.sense.rig.arms.printer.motion import StraightMove
 
 M115 = [
     "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from padforge.sense.rig.arms.printer import marlin
+from padforge.sense.rig.arms.printer.driver import Printer
+from padforge.sense.rig.arms.printer.link import MarlinLink
+from padforge.sense.rig.boards.line.framing import Header
+from padforge.sense.rig.devices.protocols import ArmState, RigFault
+from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
+from padforge.sense.rig.emulators.printer import firmware
+from padforge.sense.rig.emulators.printer.emulator import EmulatedPrinter
+from padforge.sense.settings import RigSettings
 
-from sense.rig.arms.printer import marlin
-from sense.rig.arms.printer.driver import Printer
-from sense.rig.arms.printer.link import MarlinLink
-from sense.rig.boards.line.framing import Header
-from sense.rig.devices.protocols import ArmState, RigFault
-from sense.rig.emulators.line_board import EmulatedLineBoard
-from sense.rig.emulators.printer import firmware
-from sense.rig.emulators.printer.emulator import EmulatedPrinter
-from sense.settings import RigSettings
 from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")

@@ -14,16 +14,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-
-from sense.recordings.recorder import STATE_COLUMNS
-from sense.rig.arms.ur5 import driver as ur5
-from sense.rig.arms.ur5 import link as ur5_link
-from sense.rig.arms.ur5.driver import UR5
-from sense.rig.devices.protocols import ArmState, Pose, RigFault
-from sense.rig.diagnostics import examine_arm
-from sense.rig.emulators.ur.emulator import HOME, UrEmulator
-from sense.rig.safety import Limits, wait_until_still
-from sense.settings import RigSettings
+from padforge.sense.recordings.recorder import STATE_COLUMNS
+from padforge.sense.rig.arms.ur5 import driver as ur5
+from padforge.sense.rig.arms.ur5 import link as ur5_link
+from padforge.sense.rig.arms.ur5.driver import UR5
+from padforge.sense.rig.devices.protocols import ArmState, Pose, RigFault
+from padforge.sense.rig.diagnostics import examine_arm
+from padforge.sense.rig.emulators.ur.emulator import HOME, UrEmulator
+from padforge.sense.rig.safety import Limits, wait_until_still
+from padforge.sense.settings import RigSettings
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
@@ -295,8 +294,8 @@ def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> No
 
 PARENT = f"""
 import sys, time
-from sense.rig.arms.ur5.driver import UR5
-from sense.rig.emulators.ur.controller import Series
+from padforge.sense.rig.arms.ur5.driver import UR5
+from padforge.sense.rig.emulators.ur.controller import Series
 arm = UR5(sys.argv[1])
 arm.connect()
 arm.move({LOW}, 50, 500)

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from sense.rig.boards.due import framing
-from sense.rig.boards.due.framing import (
+from padforge.sense.rig.boards.due import framing
+from padforge.sense.rig.boards.due.framing import (
     Ack,
     Block,
     BoardSettings,
@@ -18,7 +17,8 @@ from sense.rig.boards.due.framing import (
     Status,
     encode,
 )
-from sense.rig.emulators.due_board import judge_settings
+from padforge.sense.rig.emulators.due_board import judge_settings
+
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"

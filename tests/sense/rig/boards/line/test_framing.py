@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from sense.rig.boards.line import framing
-from sense.rig.boards.line.driver import Assembler, Lines
-from sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line
-from sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.rig.boards.line import framing
+from padforge.sense.rig.boards.line.driver import Assembler, Lines
+from padforge.sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line
+from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 
 HEADER = Header(500, 12, 3.3, 4, said=(("name", "my-board"),))
 SAMPLES = [Sample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]

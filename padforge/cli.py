@@ -6,10 +6,10 @@ from pkgutil import resolve_name
 
 import click
 
-from design.benchmarking.cli import bench_command
-from design.cli.main import compare_command
-from design.cli.main import design as design_group
-from design.common.command_line import (
+from padforge.design.benchmarking.cli import bench_command
+from padforge.design.cli.main import compare_command
+from padforge.design.cli.main import design as design_group
+from padforge.design.common.command_line import (
     INTERRUPTED,
     force_option,
     load_spec,
@@ -19,11 +19,11 @@ from design.common.command_line import (
     seed_option,
     spec_option,
 )
-from design.common.errors import InputError
-from fabricate.cli import fabricate as fabricate_group
-from fabricate.cli import formats_option, mould_costs, split_formats
-from sense.cli.main import sense as sense_group
-from sense.studies.cli import study as study_group
+from padforge.design.common.errors import InputError
+from padforge.fabricate.cli import fabricate as fabricate_group
+from padforge.fabricate.cli import formats_option, mould_costs, split_formats
+from padforge.sense.cli.main import sense as sense_group
+from padforge.sense.studies.cli import study as study_group
 
 from .report import write_report
 from .tables import BENCHES, EXTRAS, PRESETS, SECTIONS, sections
@@ -60,8 +60,8 @@ def _init(path: Path, preset: str | None) -> None:
     padforge init
     padforge init soft.toml --preset published
     """
-    from design.common.files import write_text
-    from design.common.settings import commented_toml
+    from padforge.design.common.files import write_text
+    from padforge.design.common.settings import commented_toml
 
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or move it away")
@@ -103,10 +103,10 @@ def _run(
 
     Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
     """
-    from design.common.files import claimed
-    from design.common.profiling import stage
+    from padforge.design.common.files import claimed
+    from padforge.design.common.profiling import stage
 
-    from .running import Run, check_ahead, run_stages
+    from .run import Run, check_ahead, run_stages
 
     run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
     check_ahead(run)

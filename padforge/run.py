@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from design.common.command_line import INTERRUPTED
-from design.common.errors import InputError
+from padforge.design.common.command_line import INTERRUPTED
+from padforge.design.common.errors import InputError
 
 from .progress import RunProgress
 from .tables import sections
 
 if TYPE_CHECKING:
-    from design.common.settings import Spec
-    from design.optimisers.search import SearchResult
-    from design.pad.morphology import Morphology
-    from sense.recordings.recording import Recording
+    from padforge.design.common.settings import Spec
+    from padforge.design.optimisers.search import SearchResult
+    from padforge.design.pad.morphology import Morphology
+    from padforge.sense.recordings.recording import Recording
 
 SEARCH_SHARE = 0.5
 """Of a time budget, what the search may take of it at most."""
@@ -43,7 +43,7 @@ class Run:
     Attributes:
         spec: its settings. out: the folder of the pad.
         seed: of every random choice; that of each section if None.
-        formats: files of the mould, see `fabricate.export.FORMATS`.
+        formats: files of the mould, see `padforge.fabricate.export.FORMATS`.
         resume: whether to go on from what an earlier run has done.
         time_budget: seconds for all of it; None for no end.
         force: whether to replace what others in `out` were made from, and what no run has made.
@@ -66,7 +66,7 @@ class Run:
 
     def made_of(self, stage: str, inputs: Mapping[str, str] | None = None) -> dict[str, Any]:
         """What a stage depends on, as JSON has it: settings, seed, and the digests of its inputs."""
-        from design.settings import Contact
+        from padforge.design.settings import Contact
 
         used = {name: self.spec.section(sections()[name]).model_dump(mode="json") for name in _SETTINGS[stage]}
         stated = {"contact": self.spec.given(Contact)} if "contact" in used else {}
@@ -87,13 +87,13 @@ def check_ahead(run: Run) -> None:
     """
     import numpy as np
 
-    from design.report.files import check_search
-    from design.settings import PadSettings
-    from fabricate import FabricationSettings
-    from fabricate.export import require_formats
-    from sense.localizer.calibration.calibration import split_presses
-    from sense.recordings.recording import refuse_replacing
-    from sense.settings import LocalizerSettings, RigSettings
+    from padforge.design.report.files import check_search
+    from padforge.design.settings import PadSettings
+    from padforge.fabricate import FabricationSettings
+    from padforge.fabricate.export import require_formats
+    from padforge.sense.localizer.calibration.calibration import split_presses
+    from padforge.sense.recordings.recording import refuse_replacing
+    from padforge.sense.settings import LocalizerSettings, RigSettings
 
     for model in sections().values():
         run.spec.section(model)
@@ -114,16 +114,16 @@ def check_ahead(run: Run) -> None:
 
 def _remade() -> set[str]:
     """Names of what a run makes of a pad, beside its files of other kinds."""
-    from design.report.contact_section import NAME
-    from sense.report.calibration_results import FILES
+    from padforge.design.report.contact_section import NAME
+    from padforge.sense.report.calibration_results import FILES
 
     return {"fabrication.json", "recording", NAME, *FILES}
 
 
 def _check_calibration(run: Run) -> None:
     """Refuse to replace a localizer that has learnt from other presses than simulated ones: no run makes it again."""
-    from design.common.files import as_written, read_json
-    from sense.localizer.localizer import FORMAT
+    from padforge.design.common.files import as_written, read_json
+    from padforge.sense.localizer.localizer import FORMAT
 
     path = run.out / "localizer.json"
     if run.force or not path.exists():
@@ -142,11 +142,11 @@ def run_stages(run: Run) -> int:
 
     What an earlier run has finished of the same is kept if `run.resume`.
     """
-    from design.common.files import sha256
-    from design.report.contact_section import contact_line
-    from design.report.files import search_lines
-    from fabricate.cli import mould_lines
-    from sense.report.calibration_results import calibration_lines
+    from padforge.design.common.files import sha256
+    from padforge.design.report.contact_section import contact_line
+    from padforge.design.report.files import search_lines
+    from padforge.fabricate.cli import mould_lines
+    from padforge.sense.report.calibration_results import calibration_lines
 
     progress = RunProgress(run.out, run.resume)
     progress.begin()
@@ -170,9 +170,9 @@ def run_stages(run: Run) -> int:
 
 
 def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult":
-    from design.common.checkpoints import Checkpoints
-    from design.optimisers.search import SearchRun
-    from design.report.files import found_before, run_search
+    from padforge.design.common.checkpoints import Checkpoints
+    from padforge.design.optimisers.search import SearchRun
+    from padforge.design.report.files import found_before, run_search
 
     made_of = run.made_of("design")
     if progress.has("design", made_of) and (found := found_before(run.out)):
@@ -192,7 +192,7 @@ def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult
 def _moulded(
     run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    from fabricate import FabricationSettings, build
+    from padforge.fabricate import FabricationSettings, build
 
     made_of = run.made_of("mould", inputs) | {"formats": sorted(run.formats)}
     if progress.has("mould", made_of):
@@ -207,10 +207,10 @@ def _moulded(
 def _recorded(
     run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
 ) -> "Recording":
-    from design.common.files import sha256
-    from sense.recordings.recording import Recording
-    from sense.rig.operation import record_simulated
-    from sense.settings import RigSettings
+    from padforge.design.common.files import sha256
+    from padforge.sense.recordings.recording import Recording
+    from padforge.sense.rig.operation import record_simulated
+    from padforge.sense.settings import RigSettings
 
     plan = run.spec.section(RigSettings).plan_file
     made_of = run.made_of("recording", {**inputs, **({plan.name: sha256(plan)} if plan else {})})
@@ -226,7 +226,7 @@ def _recorded(
 def _compared(
     run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    from design.report.contact_section import NAME, compare_contacts
+    from padforge.design.report.contact_section import NAME, compare_contacts
 
     made_of = run.made_of("contacts", inputs)
     if progress.has("contacts", made_of):
@@ -238,8 +238,8 @@ def _compared(
 
 
 def _calibrated(run: Run, progress: RunProgress, kept: list[str], recording: "Recording") -> dict[str, Any]:
-    from sense.cli.calibration import run_calibration
-    from sense.report.calibration_results import FILES
+    from padforge.sense.cli.calibration import run_calibration
+    from padforge.sense.report.calibration_results import FILES
 
     made_of = run.made_of("calibration", {"recording": recording.digest})
     if progress.has("calibration", made_of):

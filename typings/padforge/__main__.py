@@ -1,0 +1,1 @@
+../../padforge/__main__.py
