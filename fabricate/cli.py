@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from padforge.design.common.command_line import (
     json_option,
     load_spec,
@@ -17,7 +18,7 @@ from padforge.design.common.command_line import (
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.morphology import Morphology
 
 MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
@@ -75,7 +76,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
     """
     from padforge.design.common.files import claimed
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.morphology import Morphology
 
     from .export import build as build_files
     from .settings import FabricationSettings

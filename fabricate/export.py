@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from padforge.design.common import profiling
-from padforge.design.common.errors import InputError, instance, path, shown
 from padforge.design.common.files import (
     provenance,
     read_json,
@@ -24,7 +24,8 @@ from padforge.design.common.files import (
     write_json,
     writing,
 )
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError, instance, path, shown
+from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.findings import Finding, verdict
 from padforge.fabricate.checks.mesh_checks import SOUND, sound
 from padforge.fabricate.checks.plan_checks import inspect

@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Annotated, Any, ClassVar, TypeVar
 
-from padforge.design.common.settings import Settings, as_tuple, none_as
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
+
+from padforge.design.common.settings import Settings, as_tuple, none_as
 
 PUBLISHED = "published"
 

@@ -11,10 +11,11 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError
-from padforge.design.common.errors import path as as_path
+
 from padforge.design.common.files import require_file
-from padforge.design.pad.knots import Array
+from padforge.design.common.validation import InputError
+from padforge.design.common.validation import path as as_path
+from padforge.design.morphology import Array
 from padforge.fabricate.mould.prisms import COLOURS
 
 Numbers = NDArray[np.int64]

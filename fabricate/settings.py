@@ -4,10 +4,11 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from padforge.design.common.errors import InputError, instance
-from padforge.design.common.settings import Settings, Spec, as_tuple, none_as
-from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 from pydantic import BeforeValidator, Field, field_validator
+
+from padforge.design.common.settings import Settings, Spec, as_tuple, none_as
+from padforge.design.common.validation import InputError, instance
+from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 from .materials import FibreSettings, SiliconeSettings
 

@@ -1,7 +1,7 @@
 """From an idea to a calibrated soft strain-sensor pad.
 
-`padforge.design`, `padforge.fabricate` and `padforge.sense` are the three stages. What they export is here as well
-(`padforge.search`, `padforge.build`, `padforge.calibrate`, with the settings that these take) and is loaded on first use.
+`padforge.design`, `padforge.fabricate` and `padforge.sense` are the three stages. What they export is here too, and is
+loaded on first use: `padforge.search`, `padforge.build`, `padforge.calibrate`, and their settings.
 """
 
 from importlib import import_module
@@ -17,7 +17,7 @@ STAGES = ("design", "fabricate", "sense")
 
 # a checkout has the stages beside this package, a wheel has them inside it
 if not (Path(__file__).parent / "design").is_dir():
-    __path__.append(str(Path(__file__).parents[1]))
+    __path__.append(str(Path(__file__).parents[1]))  # noqa: F405
 
 
 def __getattr__(name: str) -> Any:

@@ -6,9 +6,9 @@ from pkgutil import resolve_name
 
 import click
 
-from padforge.design.benchmarking.cli import bench_command
-from padforge.design.cli.main import compare_command
-from padforge.design.cli.main import design as design_group
+from padforge.benchmarks.cli import bench
+from padforge.design.cli import compare_command
+from padforge.design.cli import design as design_group
 from padforge.design.common.command_line import (
     INTERRUPTED,
     force_option,
@@ -19,14 +19,20 @@ from padforge.design.common.command_line import (
     seed_option,
     spec_option,
 )
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs, split_formats
 from padforge.sense.cli.main import sense as sense_group
 from padforge.sense.studies.cli import study as study_group
 
 from .report import write_report
-from .tables import BENCHES, EXTRAS, PRESETS, SECTIONS, sections
+from .run import SECTIONS, Run, check_ahead, run_stages, sections
+
+PRESETS = {"published": "padforge.design.settings:PUBLISHED"}
+"""Settings other than the defaults, by section, that `padforge init` can write."""
+
+EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
+"""What of `pyproject.toml` each stage needs to be installed; what chains stages needs all of it."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -45,7 +51,7 @@ def cli(context: click.Context) -> None:
     context.obj = list(SECTIONS)
 
 
-for group in (design_group, fabricate_group, sense_group, study_group, bench_command(BENCHES)):
+for group in (design_group, fabricate_group, sense_group, study_group, bench):
     cli.add_command(group)
 design_group.add_command(compare_command(mould_costs))
 
@@ -105,8 +111,6 @@ def _run(
     """
     from padforge.design.common.files import claimed
     from padforge.design.common.profiling import stage
-
-    from .run import Run, check_ahead, run_stages
 
     run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
     check_ahead(run)

@@ -3,8 +3,8 @@
 from functools import cache
 from pathlib import Path
 
-from padforge.design.common.errors import Fault, InputError
-from padforge.design.common.errors import path as as_path
+from padforge.design.common.validation import Fault, InputError
+from padforge.design.common.validation import path as as_path
 
 
 def write_report(folder: Path) -> Path:
@@ -15,9 +15,9 @@ def write_report(folder: Path) -> Path:
         Fault: there are files of another pad or recording among them, which the page tells first.
     """
     from padforge.design.common.files import as_written, settle, write_text
-    from padforge.design.common.page.elements import PageSection, page
-    from padforge.design.report.contact_section import contact_sections
-    from padforge.design.report.sections import design_sections, provenance_row, provenance_section, stage_pages
+    from padforge.design.common.page import PageSection, page
+    from padforge.design.contact_comparison import contact_sections
+    from padforge.design.report import design_sections, provenance_row, provenance_section, stage_pages
     from padforge.fabricate.report.sections import fabrication_sections
     from padforge.sense.report import sections as sensed
     from padforge.sense.report.identification_results import identification_sections

@@ -1,26 +1,41 @@
-"""`padforge run`: the stages of a pad one after another, in a time that is shared among them, and gone on with."""
+"""`padforge run`: the stages of a pad one after another, within a time budget, resumed where a run ended."""
 
+import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from padforge.design.common.command_line import INTERRUPTED
-from padforge.design.common.errors import InputError
-
-from .progress import RunProgress
-from .tables import sections
+from padforge.design.common.files import as_written, read_json, sha256, write_json
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
-    from padforge.design.optimisers.search import SearchResult
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.common.settings import Settings, Spec
+    from padforge.design.morphology import Morphology
+    from padforge.design.optimize.search import SearchResult
     from padforge.sense.recordings.recording import Recording
+
+SECTIONS = {
+    "pad": "padforge.design.settings:PadSettings",
+    "contact": "padforge.design.settings:Contact",
+    "search": "padforge.design.settings:SearchSettings",
+    "rules": "padforge.design.settings:RulesSettings",
+    "mould": "padforge.fabricate.settings:MouldSettings",
+    "printer": "padforge.fabricate.settings:PrinterSettings",
+    "silicone": "padforge.fabricate.materials:SiliconeSettings",
+    "fibre": "padforge.fabricate.materials:FibreSettings",
+    "dispenser": "padforge.fabricate.settings:DispenserSettings",
+    "rig": "padforge.sense.settings:RigSettings",
+    "localizer": "padforge.sense.settings:LocalizerSettings",
+}
+"""The sections of a `pad.toml`, and where the settings of each are."""
 
 SEARCH_SHARE = 0.5
 """Of a time budget, what the search may take of it at most."""
@@ -34,6 +49,61 @@ _SETTINGS = {
     "calibration": ("localizer",),
 }
 """The sections that each stage depends on."""
+
+
+def sections() -> "dict[str, type[Settings]]":
+    """The models of all sections, by name."""
+    return {name: resolve_name(where) for name, where in SECTIONS.items()}
+
+
+FORMAT, NAME = "padforge-run/1", "run.json"
+
+
+class RunProgress:
+    """The stages that a run into a folder has finished.
+
+    Args:
+        out: the folder. resume: whether to go on from what an earlier run has noted; else that is forgotten.
+
+    Raises:
+        InputError: the note cannot be read, or is none of padforge.
+    """
+
+    def __init__(self, out: Path, resume: bool) -> None:
+        self._out, self._note = out, out / NAME
+        self._stages: dict[str, dict[str, Any]] = {}
+        if resume and self._note.exists():
+            with as_written(self._note):
+                self._stages = dict(read_json(self._note, FORMAT)["stages"])
+
+    def begin(self) -> None:
+        """Forget what is not to be gone on from: from now on another run's results are replaced."""
+        if not self._stages:
+            self._note.unlink(missing_ok=True)
+
+    def has(self, stage: str, made_of: Mapping[str, Any]) -> bool:
+        """Whether a stage was made of the same, and its files are as it has left them.
+
+        Args:
+            made_of: settings and digests of inputs, as JSON has them.
+        """
+        with as_written(self._note):
+            before = self._stages.get(stage, {})
+            same = before.get("made_of") == _digest(made_of)
+            return same and dict(before["files"]) == self._digests(before["files"])
+
+    def note(self, stage: str, made_of: Mapping[str, Any], files: Iterable[str] = ()) -> None:
+        """Keep that a stage is done, with the names of its files and folders."""
+        self._stages[stage] = {"made_of": _digest(made_of), "files": self._digests(files)}
+        write_json(self._note, {"format": FORMAT, "stages": self._stages})
+
+    def _digests(self, names: Iterable[str]) -> dict[str, str]:
+        paths = {name: self._out / Path(name).name for name in names}
+        return {name: sha256(path) for name, path in paths.items() if path.exists()}
+
+
+def _digest(made_of: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -87,7 +157,7 @@ def check_ahead(run: Run) -> None:
     """
     import numpy as np
 
-    from padforge.design.report.files import check_search
+    from padforge.design.run import check_search
     from padforge.design.settings import PadSettings
     from padforge.fabricate import FabricationSettings
     from padforge.fabricate.export import require_formats
@@ -114,7 +184,7 @@ def check_ahead(run: Run) -> None:
 
 def _remade() -> set[str]:
     """Names of what a run makes of a pad, beside its files of other kinds."""
-    from padforge.design.report.contact_section import NAME
+    from padforge.design.contact_comparison import NAME
     from padforge.sense.report.calibration_results import FILES
 
     return {"fabrication.json", "recording", NAME, *FILES}
@@ -143,8 +213,8 @@ def run_stages(run: Run) -> int:
     What an earlier run has finished of the same is kept if `run.resume`.
     """
     from padforge.design.common.files import sha256
-    from padforge.design.report.contact_section import contact_line
-    from padforge.design.report.files import search_lines
+    from padforge.design.contact_comparison import contact_line
+    from padforge.design.run import search_lines
     from padforge.fabricate.cli import mould_lines
     from padforge.sense.report.calibration_results import calibration_lines
 
@@ -171,8 +241,8 @@ def run_stages(run: Run) -> int:
 
 def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult":
     from padforge.design.common.checkpoints import Checkpoints
-    from padforge.design.optimisers.search import SearchRun
-    from padforge.design.report.files import found_before, run_search
+    from padforge.design.optimize.search import SearchRun
+    from padforge.design.run import found_before, run_search
 
     made_of = run.made_of("design")
     if progress.has("design", made_of) and (found := found_before(run.out)):
@@ -226,7 +296,7 @@ def _recorded(
 def _compared(
     run: Run, progress: RunProgress, kept: list[str], pad: "Morphology", inputs: Mapping[str, str]
 ) -> dict[str, Any]:
-    from padforge.design.report.contact_section import NAME, compare_contacts
+    from padforge.design.contact_comparison import NAME, compare_contacts
 
     made_of = run.made_of("contacts", inputs)
     if progress.has("contacts", made_of):

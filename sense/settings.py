@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from padforge.design.common.errors import InputError
-from padforge.design.common.settings import Settings, as_tuple, none_as
-from padforge.design.settings import Scatter
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
+
+from padforge.design.common.settings import Settings, as_tuple, none_as
+from padforge.design.common.validation import InputError
+from padforge.design.settings import Scatter
 
 Features = Literal["full", "causal", "early", "published"]
 Method = Literal["masked", "published"]

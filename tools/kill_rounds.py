@@ -20,10 +20,9 @@ from importlib import import_module
 from itertools import count
 from pathlib import Path
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import read_json, settle, sha256
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.recording import Recording
-
 from tools.kills import KILLED, forked, kill_at
 
 SETTINGS = """
@@ -66,7 +65,7 @@ _TOGETHER = (
     {"out.mcap"},
     {"dataset"},
 )
-_OF_DESIGN = ("torch", "matplotlib.figure", "padforge.design.report.files")
+_OF_DESIGN = ("torch", "matplotlib.figure", "padforge.design.run")
 _OF_OTHERS = (
     *("build123d", "shapely", "trimesh", "h5py", "rosbags.rosbag2", "pyarrow", "numba"),
     *("padforge.fabricate.export", "padforge.sense.localizer.calibration.training", "padforge.sense.report.sections"),

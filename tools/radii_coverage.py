@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
 from padforge.design import Morphology
 from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
-
 from tools.threads import on_one_thread
 
 PRESSES = (300, 3000)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError, shown
-from .files import MOST_BYTES, atomic, clear_litter, read_bytes, read_json, write_json
+from padforge.design.common.files import MOST_BYTES, atomic, clear_litter, read_bytes, read_json, write_json
+from padforge.design.common.validation import InputError, shown
 
 FORMAT = "padforge-search/1"
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .errors import Fault, InputError, what_to_install
+from padforge.design.common.validation import Fault, InputError, what_to_install
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -130,7 +130,7 @@ def _leave_tasks(code: int) -> None:
 
     Where the interpreter ends under them, those in torch crash it.
     """
-    computing = sys.modules.get(f"{__package__}.computing")
+    computing = sys.modules.get(f"{__package__}.parallel")
     if computing is not None and computing.DaemonThreads.at_work:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):

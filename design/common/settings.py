@@ -9,9 +9,9 @@ from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
-from .errors import InputError, instance, mapping, shown
-from .errors import path as as_path
-from .files import read_bytes
+from padforge.design.common.files import read_bytes
+from padforge.design.common.validation import InputError, instance, mapping, shown
+from padforge.design.common.validation import path as as_path
 
 MOST_BYTES = 2**18
 """Longer settings are none that anybody wrote, and would take long to be refused."""

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from padforge.fabricate.mould.plan import areas, overlap, without
 from shapely.geometry.base import BaseGeometry
+
+from padforge.fabricate.mould.plan import areas, overlap, without
 
 from .findings import Finding, verdict
 from .slices import Slab

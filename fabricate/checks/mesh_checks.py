@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import instance, real, whole
+
+from padforge.design.common.validation import instance, real, whole
 from padforge.fabricate.mesh_files import read_mesh
 from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+
 from padforge.fabricate.settings import PrinterSettings
 
 from .findings import Finding, verdict

@@ -16,7 +16,8 @@ import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import NDArray
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
 from padforge.fabricate.mould.plan import SNAP_MM
 
 PENETRATION_MM = 1e-3

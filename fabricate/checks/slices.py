@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from padforge.fabricate.mould.plan import areas, overlap, without
 from shapely.geometry.base import BaseGeometry
+
+from padforge.fabricate.mould.plan import areas, overlap, without
 
 from .surface import Surface
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from padforge.design.common.errors import InputError, reals
+
+from padforge.design.common.validation import InputError, reals
 from padforge.fabricate.mesh_files import LARGEST_MM, Array, Numbers
 
 from .findings import Place, as_places

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
 from padforge.fabricate.mould.plan import without
 from padforge.fabricate.settings import PrinterSettings
-from shapely.geometry.base import BaseGeometry
 
 from .findings import Finding, Place, Status, verdict
 from .slices import Slab, least_width, section, spare_width, tested_width, too_narrow

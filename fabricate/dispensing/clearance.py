@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
 from padforge.fabricate.checks.findings import Finding, verdict
 from padforge.fabricate.mould.plan import Plan, without
 

@@ -16,7 +16,8 @@ from functools import cached_property
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.fibre_layers import Layer, layers
 from padforge.fabricate.settings import DispenserSettings

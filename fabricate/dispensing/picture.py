@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from padforge.design.common.figures import ALARM, FAINT, INK
-from padforge.design.pad.knots import Array
+
+from padforge.design.common.plotting import ALARM, FAINT, INK
+from padforge.design.morphology import Array
 from padforge.fabricate.mould.plan import Plan, polygon_rings
 from padforge.fabricate.report.fibre_layers import FAMILIES
 

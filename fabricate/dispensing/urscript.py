@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
 from padforge.fabricate.settings import DispenserSettings
 
 from .course import TOLERANCE_MM, Stroke

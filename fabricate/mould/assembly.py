@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
-from padforge.design.common.errors import InputError
-from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 from shapely.geometry.base import BaseGeometry
+
+from padforge.design.common.validation import InputError
+from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 
 from . import parts
 from .plan import Plan, box_around

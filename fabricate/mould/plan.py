@@ -14,16 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from padforge.design.common.errors import InputError, instance
-from padforge.design.pad.courses.bending import traced_curve
-from padforge.design.pad.courses.common_length import common_stretches
-from padforge.design.pad.courses.curves import Crossing, beziers, crossings, flatten, lengths, slope_beziers
-from padforge.design.pad.courses.keep_out import keep_outs
-from padforge.design.pad.knots import Array
-from padforge.design.pad.morphology import Morphology
+from shapely.geometry.base import BaseGeometry
+
+from padforge.design.common.validation import InputError, instance
+from padforge.design.morphology import Array, Morphology
+from padforge.design.paths.bends import traced_curve
+from padforge.design.paths.curves import Crossing, beziers, common_stretches, crossings, flatten, lengths, slope_beziers
+from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import Layout
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
-from shapely.geometry.base import BaseGeometry
 
 from .planning.depth_levels import fibre_levels
 from .planning.leads import Lead, Leads, straight_on, to_one_side

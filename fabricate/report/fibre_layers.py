@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from padforge.design.common.figures import HORIZONTAL, VERTICAL
+from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.fabricate.mould.plan import Plan
 
 FAMILIES = ("horizontal", "vertical")

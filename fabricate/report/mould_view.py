@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.page.shipped import resource
+
+from padforge.design.common.page import resource
 from padforge.fabricate.mesh_files import read_mesh
 
 from .fibre_layers import COLOURS, FAMILIES

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.figures import ALARM, FAINT, INK, PAPER
+
+from padforge.design.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.fabricate.checks.findings import Finding
 from padforge.fabricate.mould.plan import INTO_WALL_MM, Plan, overlap, polygon_rings
 
@@ -222,7 +223,7 @@ class _Sheet:
 
     def save(self, path: Path, handles: list[Any]) -> None:
         """Write the picture with its legend as PNG."""
-        from padforge.design.common.figures import save_figure
+        from padforge.design.common.plotting import save_figure
 
         width, height = self.figure.get_size_inches() * _DPI
         below = _LINE * len(self.note)

@@ -7,10 +7,11 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.pad.knots import Array
+from shapely.geometry.base import BaseGeometry
+
+from padforge.design.morphology import Array
 from padforge.fabricate.mould.assembly import mould_body
 from padforge.fabricate.mould.plan import Plan, polygon_rings
-from shapely.geometry.base import BaseGeometry
 
 Ints = NDArray[np.intp]
 

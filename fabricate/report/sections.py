@@ -4,9 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import unchanged
-from padforge.design.common.page.elements import PageSection, figures, folded, heading, html_pieces, paragraph, table
+from padforge.design.common.page import PageSection, figures, folded, heading, html_pieces, paragraph, table
+from padforge.design.common.validation import InputError
 
 from .laying import orientation
 from .laying.guide import laying_page

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from padforge.design.pad.courses.curves import beziers
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
+from padforge.design.paths.curves import beziers
 from padforge.fabricate.mould.plan import Plan
 
 from .fibre_layers import COLOURS

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import click
+
 from padforge.design.common import command_line as common
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 from .options import FOLDER, FibreNumbers, fibre_indices, lost_option, model_option, recording_argument, reported
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from padforge.design.common import command_line as common
 
 from .options import FEATURES, METHODS, lost_option, model_option, read_recording, recording_argument, reported

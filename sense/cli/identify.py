@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import click
+
 from padforge.design.common import command_line as common
 
 from .options import FILE, read_recording, recording_argument
@@ -26,7 +27,7 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     twin_plan.png and twin_responses.png.
     """
     from padforge.design.common.files import claimed
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.morphology import Morphology
     from padforge.sense.report.identification_results import identification_lines, identify_into
 
     folder = out or common.pad_folder(recording)

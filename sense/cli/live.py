@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from padforge.design.common.command_line import json_option, load_spec, spec_option
-from padforge.design.common.page.local_page.listening import HOST
+from padforge.design.common.server import HOST
 
 from .options import drawn_anew
 from .rig import rig_option

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+
 from padforge.design.common.command_line import (
     json_option,
     load_spec,
@@ -14,7 +15,7 @@ from padforge.design.common.command_line import (
     show_result,
     spec_option,
 )
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 from .options import FibreNumbers, fibre_indices, model_option, read_recording, recording_argument, reported
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from padforge.design.common.command_line import progress
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
     from padforge.sense.recordings.recording import Recording

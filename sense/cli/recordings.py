@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
 from padforge.design.common.command_line import out_option, pad_folder
 
 from .options import FOLDER, read_recording, recording_argument, recording_line, say_note
@@ -110,6 +111,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
 def _findings(model: Path, recording: "Recording") -> "ModelFindings":
     """What a model says of a recording; a fibre at fault is left out from the press on since which it is."""
     import numpy as np
+
     from padforge.sense.health.model_folder import examined, has_health
     from padforge.sense.localizer.localizer import Localizer
     from padforge.sense.localizer.locating import locate

@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from padforge.design.common import command_line as common
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 from .options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
 
 if TYPE_CHECKING:
-    from padforge.design.pad.morphology import Morphology
-    from padforge.design.pad.twin import Twin
+    from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
+    from padforge.design.twin import Twin
     from padforge.sense.recordings.recording import Recording
     from padforge.sense.rig.planning.setup import Setup
 
@@ -114,7 +115,7 @@ def record(
 
 
 def _twin(path: Path | None, at_once: bool) -> "Twin | None":
-    from padforge.design.pad.twin import Twin
+    from padforge.design.twin import Twin
 
     if path and not at_once:
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --through-drivers")
@@ -192,7 +193,7 @@ def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording"
 
 
 def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.morphology import Morphology
 
     return Morphology.load(morphology) if morphology else Morphology.straight(of_pad.layout)
 

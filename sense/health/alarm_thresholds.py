@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 
 from .fault_likelihoods import HYPOTHESES

@@ -10,6 +10,7 @@ measured on presses that the prediction was not fitted on: the heights of health
 from dataclasses import dataclass
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 from .fibre_prediction import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE

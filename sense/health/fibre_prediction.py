@@ -14,7 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from padforge.design.common.computing import one_torch_thread
+
+from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
 from .trained_model import average_in, one_cycle

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import read_json
 from padforge.design.common.settings import validated
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array, Indices, as_numbers, stream_of
 from padforge.sense.recordings.recording import rate_of
 

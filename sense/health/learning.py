@@ -6,8 +6,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from padforge.design.common.computing import one_torch_thread, run_tasks
-from padforge.design.common.errors import InputError, instance, mapping, real, shown, whole
+
+from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.validation import InputError, instance, mapping, real, shown, whole
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask, as_numbers
 from padforge.sense.recordings.recording import Recording, rate_of
 

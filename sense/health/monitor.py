@@ -7,7 +7,8 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from padforge.design.common.errors import InputError, instance, whole
+
+from padforge.design.common.validation import InputError, instance, whole
 from padforge.sense.recordings.processing.limits import (
     MAX_VOLTS,
     Array,

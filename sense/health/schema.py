@@ -5,9 +5,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, JsonValue
+
 from padforge.design.common.settings import Settings
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
-from pydantic import Field, JsonValue
 
 from .fault_likelihoods import HYPOTHESES, LIBRARY, STEPS
 from .fibre_prediction import COMPONENTS, HIDDEN, INPUTS, MEMBERS, TARGETS, TRACE

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError, instance, shown
-from padforge.design.common.errors import path as as_path
-from padforge.design.common.files import read_bytes, staged
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
+
+from padforge.design.common.files import read_bytes, staged
+from padforge.design.common.validation import InputError, instance, shown
+from padforge.design.common.validation import path as as_path
 
 if TYPE_CHECKING:
     from torch import Tensor

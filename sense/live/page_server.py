@@ -4,9 +4,8 @@ import contextlib
 import queue
 from collections.abc import Collection
 
-from padforge.design.common.errors import InputError
-from padforge.design.common.page.local_page.listening import HOST
-from padforge.design.common.page.local_page.local_page import LocalPage, page_text
+from padforge.design.common.server import HOST, LocalPage, page_text
+from padforge.design.common.validation import InputError
 
 _MOST_WORDS = 16
 """That wait to be taken: a button may be hit again and again."""

@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError, instance, real, shown, whole
+
+from padforge.design.common.validation import InputError, instance, real, shown, whole
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.monitor import FibreFault, Monitor
 from padforge.sense.health.trained_model import refuse_other_pad

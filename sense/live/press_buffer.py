@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
 from padforge.sense.health.fibre_prediction import RELEASED
 from padforge.sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
 from padforge.sense.recordings.processing.limits import Array

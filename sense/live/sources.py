@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from padforge.design.common.errors import InputError, real
+
 from padforge.design.common.files import read_json
 from padforge.design.common.settings import validated
+from padforge.design.common.validation import InputError, real
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recorder import FORMAT, START
@@ -108,7 +109,7 @@ def simulated(model: Path) -> "SimulatedConverter":
     Raises:
         InputError: its recording is not beside it, or of another kind.
     """
-    from padforge.design.pad.morphology import Morphology  # needs what only other jobs need
+    from padforge.design.morphology import Morphology  # needs what only other jobs need
     from padforge.sense.rig.emulators.live_pad import SimulatedConverter
 
     path = model / RECORDED / START

@@ -6,8 +6,9 @@ from math import ceil, isnan
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError, instance, shown, whole
-from padforge.design.criteria.fibre_loss import lost_subsets
+
+from padforge.design.common.validation import InputError, instance, shown, whole
+from padforge.design.objectives.fibre_loss import lost_subsets
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 

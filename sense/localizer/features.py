@@ -11,6 +11,7 @@ Readings may be missing (NaN): short gaps are bridged, and a fibre that lacks to
 from dataclasses import dataclass
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
 Window = tuple[int, int]

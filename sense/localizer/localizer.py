@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import InputError, instance, shown
+
 from padforge.design.common.files import read_json
+from padforge.design.common.validation import InputError, instance, shown
 from padforge.sense.health.trained_model import files_of, refuse_other_pad
 from padforge.sense.recordings.processing.limits import Array, Floats, Mask
 from padforge.sense.recordings.recording import Recording

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import InputError, instance, shown
+
 from padforge.design.common.files import write_text, writing
+from padforge.design.common.validation import InputError, instance, shown
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.recordings.recording import Recording
 

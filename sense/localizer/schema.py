@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from reprlib import repr as shortened
 from typing import Annotated, Any, Literal
 
-from padforge.design.common.errors import InputError
+from pydantic import Field, JsonValue, ValidationError
+
 from padforge.design.common.settings import Settings
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import (
     LEAST_SPREAD_V,
     MAX_FIBRES,
@@ -15,7 +17,6 @@ from padforge.sense.recordings.processing.limits import (
     MIN_RATE_HZ,
 )
 from padforge.sense.settings import Features, Method, Split
-from pydantic import Field, JsonValue, ValidationError
 
 from .features import PASTS, PHASES, SIZES
 

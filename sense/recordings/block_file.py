@@ -14,8 +14,9 @@ from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import open_in_place, read_bytes
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_BYTES, MAX_FIBRES, Array, Mask
 
 _MAGIC = b"PFB1"

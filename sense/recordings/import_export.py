@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from padforge.design.common.errors import InputError
-from padforge.design.common.errors import path as as_path
-from padforge.design.pad.published_files.matlab import load_mat
+from padforge.design.common.mat_files import load_mat
+from padforge.design.common.validation import InputError
+from padforge.design.common.validation import path as as_path
 from padforge.sense.recordings.processing.limits import Array
 
 from .block_file import read_blocks

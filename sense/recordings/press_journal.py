@@ -6,8 +6,8 @@ from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any, NamedTuple
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import open_in_place, read_bytes
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_INDEX, MAX_MM, MAX_N
 
 

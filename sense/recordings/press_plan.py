@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.settings import or_default
-from padforge.design.pad.courses.keep_out import keep_outs, outside
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.design.paths.keep_outs import keep_outs, outside
 from padforge.design.settings import PadSettings
 from padforge.sense.recordings.formats.csv_table import CsvTable
 from padforge.sense.recordings.processing.limits import MAX_MM, Array, Indices, Mask, as_numbers, refuse_beyond

@@ -17,8 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import InputError, mapping, shown, whole
-from padforge.design.common.errors import path as as_path
+
 from padforge.design.common.files import (
     UNFINISHED,
     lock,
@@ -30,6 +29,8 @@ from padforge.design.common.files import (
     write_json,
     writing,
 )
+from padforge.design.common.validation import InputError, mapping, shown, whole
+from padforge.design.common.validation import path as as_path
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, read_blocks, write_at

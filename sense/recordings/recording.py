@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError, instance, shown
-from padforge.design.common.errors import path as as_path
+
 from padforge.design.common.files import held, read_json, scratch, sync, writing
+from padforge.design.common.validation import InputError, instance, shown
+from padforge.design.common.validation import path as as_path
 from padforge.sense.recordings.processing import limits
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 

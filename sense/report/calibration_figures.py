@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
-from padforge.design.common.figures import ALARM, INK, canvas, explain, save_figure
+
+from padforge.design.common.plotting import ALARM, INK, canvas, explain, save_figure
 
 from .fibre_loss_figure import label_losses
 

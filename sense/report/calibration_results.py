@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import check_replaceable, refuse_unwritable, staged, write_json
 from padforge.design.common.profiling import stage
+from padforge.design.common.validation import InputError
 from padforge.sense.health.learning import learn_health
 from padforge.sense.health.model_folder import health_files
 from padforge.sense.localizer.calibration.calibration import calibrate, left_out

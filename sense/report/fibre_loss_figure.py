@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from padforge.design.common.figures import FAINT, HORIZONTAL, INK, VERTICAL, explain, save_figure, tidy
+
+from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, explain, save_figure, tidy
 
 _WIDTH = 0.36
 

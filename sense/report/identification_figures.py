@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from padforge.design.common.figures import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, head, save_figure, tidy
-from padforge.design.pad.courses.curves import flatten
+
+from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, head, save_figure, tidy
+from padforge.design.paths.curves import flatten
 from padforge.sense.twin.identified_pad import Identification
 
 COLUMNS = ("measured", "predicted", "left over")

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
 from padforge.design.common.files import check_replaceable, provenance, refuse_unwritable, staged, write_json
-from padforge.design.common.page.elements import PageSection, figures, paragraph, table
+from padforge.design.common.page import PageSection, figures, paragraph, table
 from padforge.design.common.profiling import stage
 from padforge.sense.recordings.processing.limits import Array, Mask
 
 if TYPE_CHECKING:
-    from padforge.design.pad.morphology import Morphology
-    from padforge.design.pad.twin import Twin
+    from padforge.design.morphology import Morphology
+    from padforge.design.twin import Twin
     from padforge.sense.recordings.recording import Recording
     from padforge.sense.twin.identified_pad import Identification
 

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from padforge.design.common.figures import ALARM, FAINT, INK, canvas, explain, save_figure
+
+from padforge.design.common.plotting import ALARM, FAINT, INK, canvas, explain, save_figure
 from padforge.sense.localizer.calibration.learning_curve import power_law
 
 

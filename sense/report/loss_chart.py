@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 
-from padforge.design.common.figures import ALARM, INK
+from padforge.design.common.plotting import ALARM, INK
 
 _CELL = 40
 _MOST_NUMBERS = 16

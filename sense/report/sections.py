@@ -7,9 +7,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import read_bytes
-from padforge.design.common.page.elements import PageSection, beside, figures, folded, heading, paragraph, table
+from padforge.design.common.page import PageSection, beside, figures, folded, heading, paragraph, table
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.press_journal import read_journal
 from padforge.sense.recordings.processing.limits import MAX_FIBRES
 from padforge.sense.recordings.recorder import JOURNAL

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.settings import RigSettings
 

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import provenance, scratch
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
-from padforge.design.pad.morphology import Morphology
-from padforge.design.pad.twin import Twin
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings
+from padforge.design.twin import Twin
 from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.recordings.press_plan import PressPlan, free_of, size_of
 from padforge.sense.recordings.recorder import refuse_begun, refuse_existing

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from padforge.design.common import command_line as common
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.morphology import Morphology
 
     from .study import Study
 
@@ -50,8 +51,8 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             as_json: bool,
             **options: Any,
         ) -> None:
-            from padforge.design.common.computing import cluster
             from padforge.design.common.files import refuse_unwritable
+            from padforge.design.common.parallel import cluster
 
             from .study import run, study_lines
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.settings import validated
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 
 if TYPE_CHECKING:
     from padforge.sense.recordings.recording import Recording
@@ -78,7 +78,7 @@ def _load(name: str, seed: int) -> tuple[str, Morphology]:
 def _found(grid: int, method: Literal["descent", "genetic"], knots: int | None, seed: int) -> Morphology:
     """What a search finds for the published contact: by gradients from a single start, under the default rules; or as
     published, where rules count for nothing. So many knots, or the default."""
-    from padforge.design.optimisers.search import search
+    from padforge.design.optimize.search import search
     from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, SearchSettings
 
     pad = PUBLISHED_PAD.model_copy(update={"grid": grid})

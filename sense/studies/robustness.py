@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.errors import InputError
-from padforge.design.common.figures import CURVES, FAINT, INK, tidy
-from padforge.design.criteria.fibre_loss import lost_subsets
-from padforge.design.evaluation.localisation_error import Loss, PressSets, batches
-from padforge.design.pad.contact import lattice, signals, signals_quantized
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.plotting import CURVES, FAINT, INK, tidy
+from padforge.design.common.validation import InputError
+from padforge.design.contact import lattice, signals, signals_quantized
+from padforge.design.morphology import Morphology
+from padforge.design.networks import Loss, PressSets, batches
+from padforge.design.objectives.fibre_loss import lost_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from padforge.sense.recordings.processing.limits import Array
 

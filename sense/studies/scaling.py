@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.errors import InputError
-from padforge.design.common.figures import CURVES, FAINT, INK, tidy
-from padforge.design.evaluation.levenberg_marquardt import fit
-from padforge.design.evaluation.localisation_error import fresh_presses, training_presses
-from padforge.design.pad.contact import signals
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.plotting import CURVES, FAINT, INK, tidy
+from padforge.design.common.validation import InputError
+from padforge.design.contact import signals
+from padforge.design.morphology import Morphology
+from padforge.design.networks import fit, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from padforge.sense.recordings.processing.limits import Array
 

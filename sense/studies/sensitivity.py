@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.figures import CURVES, FAINT, INK, tidy
-from padforge.design.evaluation.levenberg_marquardt import fit_many
-from padforge.design.evaluation.localisation_error import PressSets
-from padforge.design.pad.contact import signals
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.plotting import CURVES, FAINT, INK, tidy
+from padforge.design.contact import signals
+from padforge.design.morphology import Morphology
+from padforge.design.networks import PressSets, fit_many
 from padforge.design.settings import Contact
 
 from .pads import described

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from padforge.design.common.checkpoints import Checkpoints, State
-from padforge.design.common.computing import one_torch_thread, run_tasks
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import provenance, write_json, write_text
+from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,8 +95,8 @@ def run(
         InputError: tasks to go on from that belong to other settings, a folder that cannot be written, or in which the
             same study is at work.
     """
-    from padforge.design.common.figures import save_figure
     from padforge.design.common.files import refuse_unwritable, staged
+    from padforge.design.common.plotting import save_figure
 
     refuse_unwritable(out)
     # What is kept goes by the number of a task, so the tasks and their order count as much as the settings.

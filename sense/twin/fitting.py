@@ -8,8 +8,9 @@ otherwise: fibres lie beside it by smooth curves, Gaussian with a standard devia
 from dataclasses import dataclass, replace
 
 import numpy as np
-from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices, Mask
 from scipy.linalg import cho_factor, cho_solve
+
+from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices, Mask
 
 from .kernels.response import along_fibre
 from .laid_pad import ASIDE, AWAY, COUNTS, ELEMENTS, OWN, SENSITIVITY, SHARED, SPLINES, LaidPad, own_values

@@ -4,14 +4,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
+
 from padforge.design import Morphology
-from padforge.design.common.errors import InputError, instance, whole
-from padforge.design.pad.twin import MOST_LOOKS, TwinReadings
+from padforge.design.common.validation import InputError, instance, whole
 from padforge.design.settings import sensed_rectangle
+from padforge.design.twin import MOST_LOOKS, TwinReadings
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.recordings.simulation.strengths import strengths
-from threadpoolctl import threadpool_limits
 
 from .fitting import Fit, Freedom, fit
 from .identified_pad import Identification

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from padforge.design import Morphology
-from padforge.design.pad.courses.curves import lengths
-from padforge.design.pad.twin import Twin, TwinChannel, TwinReadings, TwinScatter
+from padforge.design.paths.curves import lengths
+from padforge.design.twin import Twin, TwinChannel, TwinReadings, TwinScatter
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
 from .fitting import Fit

@@ -10,10 +10,11 @@ the angle between fibre and press.
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from padforge.design import Morphology
-from padforge.design.pad.courses.curves import flatten
-from padforge.design.pad.twin import Frame
+from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
+from padforge.design.twin import Frame
 from padforge.sense.recordings.processing.limits import Array, Indices
 
 from .kernels.response import along_fibre, channel_response

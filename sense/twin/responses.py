@@ -8,11 +8,12 @@ place by the response model, and S the covariance of what that model leaves of p
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+
 from padforge.sense.localizer.features import DOWN, press_inputs
 from padforge.sense.localizer.response.response_model import STEPS, ResponseModel, settled
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 from padforge.sense.recordings.recording import Recording
-from scipy.interpolate import RegularGridInterpolator
 
 ALIKE = 0.15
 """Share of its depth by which another press may differ that counts as deep as one."""

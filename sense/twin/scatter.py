@@ -6,10 +6,11 @@ Where channels share a part of it, the products of their differences are common 
 """
 
 import numpy as np
-from padforge.design.pad.twin import TwinScatter
-from padforge.sense.recordings.processing.limits import Array
 from scipy.optimize import nnls
 from scipy.spatial import KDTree
+
+from padforge.design.twin import TwinScatter
+from padforge.sense.recordings.processing.limits import Array
 
 from .laid_pad import LaidPad
 from .responses import Responses

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from padforge.design.pad.twin import Frame
-from padforge.sense.recordings.processing.limits import Array, Mask
 from scipy.optimize import linear_sum_assignment, minimize
+
+from padforge.design.twin import Frame
+from padforge.sense.recordings.processing.limits import Array, Mask
 
 from .laid_pad import Plan
 from .responses import Responses

@@ -1,7 +1,8 @@
 """What tests of design share."""
 
 import pytest
-from padforge.design.benchmarking import harness
+
+from padforge.benchmarks import harness
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def taken(monkeypatch):
 @pytest.fixture
 def one_thread():
     """Torch computes on one thread, as in a search: several that wait for a busy machine take many times as long."""
-    from padforge.design.common.computing import one_torch_thread
+    from padforge.design.common.parallel import one_torch_thread
 
     with one_torch_thread():
         yield

@@ -4,12 +4,12 @@ import tomllib
 
 import numpy as np
 import pytest
-from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
-from padforge.design.common.settings import commented_toml
-from padforge.design.criteria.information import information
-from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Layout, sensed_rectangle
 
 from padforge import design
+from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
+from padforge.design.common.settings import commented_toml
+from padforge.design.objectives.published import information
+from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Layout, sensed_rectangle
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}

@@ -6,10 +6,10 @@ from importlib import invalidate_caches
 from pathlib import Path
 
 import pytest
-from padforge.design import Morphology
-from padforge.sense.recordings.recording import Recording
 
 from padforge.cli import main
+from padforge.design import Morphology
+from padforge.sense.recordings.recording import Recording
 from tests.docs.pages import BLOCK, ROOT
 
 PAGE = ROOT / "docs" / "devices.md"

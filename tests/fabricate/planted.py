@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from padforge.design.pad.knots import assemble
-from padforge.design.pad.morphology import Morphology
+from scipy.interpolate import PchipInterpolator
+
+from padforge.design.morphology import Morphology, assemble
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.fabricate.materials import FibreSettings, SiliconeSettings
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
-from scipy.interpolate import PchipInterpolator
 
 
 def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:

@@ -13,16 +13,16 @@ import pytest
 import shapely
 import trimesh
 from build123d import Solid, import_step
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import sha256
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.fabricate import export
 from padforge.fabricate.export import FORMATS, build
 from padforge.fabricate.mesh_files import COLOURS
 from padforge.fabricate.mould.cad import model
 from padforge.fabricate.mould.prisms import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
-
 from tests.fabricate.planted import level_pad, with_settings
 
 PAD = Morphology.random(1, 2, seed=7)

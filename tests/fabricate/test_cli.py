@@ -4,11 +4,11 @@ import sys
 
 import pytest
 from click.testing import CliRunner
-from padforge.design.common.errors import InputError
-from padforge.design.pad.morphology import Morphology
-from padforge.fabricate.cli import fabricate
 from PIL import Image
 
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.fabricate.cli import fabricate
 from tests.fabricate.planted import level_pad
 
 FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg"}
@@ -116,11 +116,14 @@ def test_imports_and_a_build_without_step_and_png_stay_light(morphology, tmp_pat
     """One after the other in one process, each with more behind it than the one before."""
     always = ["build123d", "OCP", "torch", "matplotlib"]
     light = [
-        ("import fabricate", [*always, "trimesh", "manifold3d", "shapely", "pydantic"]),
-        ("import fabricate.cli", [*always, "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
-        ("import fabricate.settings", [*always, "trimesh", "manifold3d", "shapely", "numpy"]),
-        ("import fabricate.export, design", [*always, "trimesh", "manifold3d"]),
-        (f"fabricate.build(design.Morphology.load({str(morphology)!r}), {str(tmp_path)!r}, ['stl', 'svg'])", always),
+        ("import padforge.fabricate", [*always, "trimesh", "manifold3d", "shapely", "pydantic"]),
+        ("import padforge.fabricate.cli", [*always, "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
+        ("import padforge.fabricate.settings", [*always, "trimesh", "manifold3d", "shapely", "numpy"]),
+        ("import padforge.fabricate.export, padforge.design", [*always, "trimesh", "manifold3d"]),
+        (
+            f"padforge.fabricate.build(padforge.design.Morphology.load({str(morphology)!r}), {str(tmp_path)!r}, ['stl', 'svg'])",
+            always,
+        ),
     ]
     code = (
         "import sys\n"

@@ -11,7 +11,8 @@ import trimesh
 import trimesh.exchange.stl
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.fabricate.checks.findings import Finding
 from padforge.fabricate.checks.mesh_checks import check_mesh, inspect_mesh, sound
 from padforge.fabricate.mesh_files import read_mesh, write_3mf, write_stl

@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.settings import Spec, commented_toml
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.fabricate.materials import (
     FIBRES,
     SILICONES,
@@ -18,7 +19,6 @@ from padforge.fabricate.materials import (
 )
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
-
 from tests.fabricate.planted import with_settings
 
 

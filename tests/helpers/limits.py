@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
+
 from padforge.design import InputError, Spec
 from padforge.design.common.settings import Settings
 

@@ -4,9 +4,9 @@ import json
 from types import SimpleNamespace
 
 import pytest
-from padforge.design import Morphology, Spec
-from padforge.design.report import comparison
 
+from padforge.design import Morphology, Spec
+from padforge.design import compare as comparison
 from tests.helpers.door import called
 
 

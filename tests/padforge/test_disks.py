@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
-from padforge.design.common.files import unchanged, write_json
-from padforge.design.pad.morphology import Morphology
 
+from padforge.design.common.files import unchanged, write_json
+from padforge.design.morphology import Morphology
 from tests.helpers.door import contents
 from tools.hostile_inputs.files import CHEAP, require_whole_file
 

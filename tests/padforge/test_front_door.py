@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings, Spec
 
 import padforge
 from padforge import design, fabricate, sense
+from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings, Spec
 from tests.helpers.door import called, refused, started
 
 
@@ -25,7 +25,7 @@ def test_help_loads_no_heavy_library() -> None:
 
 
 def test_design_works_without_torch_and_without_cad() -> None:
-    modules = loaded_by("import design; design.signals(design.Morphology.straight(1), [[1, 1]])")
+    modules = loaded_by("from padforge import design; design.signals(design.Morphology.straight(1), [[1, 1]])")
     assert "numba" in modules
     assert not modules & {"torch", "build123d", "OCP"}
 
@@ -120,7 +120,7 @@ def test_all_that_the_packages_hand_out_is_there() -> None:
 
 def test_the_stages_have_one_import_name(tmp_path: Path) -> None:
     """A checkout shows `design` beside a lab's own folder of that name only to who works in the checkout."""
-    code = "import padforge.design.pad.morphology as m, padforge; print(m.__name__, m.Morphology is padforge.Morphology)"
+    code = "import padforge.design.morphology as m, padforge; print(m.__name__, m.Morphology is padforge.Morphology)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["padforge.design.pad.morphology", "True"]
+    assert done.stdout.split() == ["padforge.design.morphology", "True"]
     assert not [finder for finder in sys.meta_path if type(finder).__module__.startswith("padforge")]

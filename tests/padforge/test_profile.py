@@ -8,9 +8,10 @@ from importlib.machinery import PathFinder
 
 import numpy as np
 import pytest
+
 from padforge.design import Morphology, signals, signals_sparse
 from padforge.design.common import profiling
-from padforge.design.optimisers.search import SearchRun, search
+from padforge.design.optimize.search import SearchRun, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
 from padforge.sense import RigSettings, calibrate, simulate

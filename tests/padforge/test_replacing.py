@@ -5,10 +5,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from padforge.design.common.files import sha256, write_json
-from padforge.design.pad.morphology import Morphology
-from padforge.sense.recordings.recorder import Recorder
 
+from padforge.design.common.files import sha256, write_json
+from padforge.design.morphology import Morphology
+from padforge.sense.recordings.recorder import Recorder
 from tests.helpers.door import called, refused
 
 SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nlost = 1\n[rules]\nenforce = false\n"

@@ -9,14 +9,14 @@ import threading
 import time
 from pathlib import Path
 
-import padforge.sense.cli.calibration
 import pytest
 import trimesh
-from padforge.design.common.checkpoints import Checkpoints
-from padforge.design.common.files import sha256
 from safetensors.numpy import load_file
 
 import padforge.run
+import padforge.sense.cli.calibration
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.files import sha256
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
 

@@ -9,16 +9,15 @@ import annotated_types
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.settings import Settings, Spec, commented_toml
-from padforge.design.criteria.rules import check_rules
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.design.objectives.rules import check_rules
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.fabricate.checks import plan_checks
 from padforge.fabricate.settings import FabricationSettings
-
-from padforge.run import Run, check_ahead
-from padforge.tables import sections
+from padforge.run import Run, check_ahead, sections
 
 MODELS = sections()
 DEFAULTS = commented_toml(MODELS).encode()

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
-from padforge.sense.settings import LocalizerSettings, RigSettings
 
+from padforge.design.common.validation import InputError
+from padforge.sense.settings import LocalizerSettings, RigSettings
 from tests.helpers.limits import require_ends
 
 

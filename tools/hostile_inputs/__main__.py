@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from padforge.cli import main as padforge_main
 from tools.threads import on_one_thread
 
 from . import calls, command_lines, spoilt_files
@@ -92,7 +93,7 @@ class Tally:
 def command(*words: str) -> None:
     """The command line, in this process."""
     sys.argv = ["padforge", *words]
-    main()
+    padforge_main()
 
 
 def drawn(rng: Rng, workplace: Workplace) -> Hostile:

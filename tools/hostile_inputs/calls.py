@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from padforge.design import InputError
-from padforge.design.common.errors import Fault, shown
-from padforge.sense.health.health_model import DETECTED
 
-import padforge
 from padforge import design, fabricate, sense
+from padforge.design import InputError
+from padforge.design.common.validation import Fault, shown
+from padforge.report import write_report
+from padforge.sense.health.health_model import DETECTED
 
 from .texts import Rng, pick
 from .values import ODD, spoiled

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from padforge.fabricate.mesh_files import read_mesh
 
+from padforge.fabricate.mesh_files import read_mesh
 from tests.helpers.door import call
 
 CHEAP = """

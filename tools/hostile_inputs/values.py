@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design import InputError, Morphology
 
+from padforge.design import InputError, Morphology
 from tools.hostile_inputs.files import SPECIAL
 
 Array = NDArray[np.float64]

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
 from padforge.fabricate.checks.findings import Finding, Status, as_places
 from padforge.fabricate.mould.plan import Plan
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.findings import Finding
 from padforge.fabricate.checks.mesh_checks import inspect_mesh
 from padforge.fabricate.mesh_files import read_mesh

@@ -1,6 +1,7 @@
 """Whether the pillars that leave holes print, and keep off the fibres."""
 
 import shapely
+
 from padforge.fabricate.checks.findings import Finding, Place, Status, as_places, verdict
 from padforge.fabricate.mould.plan import Plan, overlap
 

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from padforge.design.pad.courses.bending import bend_radius, traced_curve
-from padforge.design.pad.courses.curves import beziers, flatten, slope_beziers
-from padforge.fabricate.checks.findings import Finding, Status, as_places, graded, verdict
-from padforge.fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
 from shapely import ops
 from shapely.geometry.base import BaseGeometry
+
+from padforge.design.paths.bends import bend_radius, traced_curve
+from padforge.design.paths.curves import beziers, flatten, slope_beziers
+from padforge.fabricate.checks.findings import Finding, Status, as_places, graded, verdict
+from padforge.fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
 
 _SPECK_MM2 = 0.01
 """Silicone too thin over less than this area is a corner, not a wall."""

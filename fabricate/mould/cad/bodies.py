@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 from build123d import Face, Plane, Solid, Vector, Wire
+from shapely import affinity
+
 from padforge.fabricate.mould.plan import polygon_rings
 from padforge.fabricate.mould.prisms import Body, Prism
-from shapely import affinity
 
 from .outlines.pieces import arc_through
 

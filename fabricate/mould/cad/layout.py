@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
+
 from padforge.fabricate.mould import parts
 from padforge.fabricate.mould.plan import Plan
-from shapely.geometry.base import BaseGeometry
 
 from .outlines.drawing import GRID_MM, Drawing
 from .outlines.joints import joints, with_joints

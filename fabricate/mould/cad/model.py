@@ -15,15 +15,16 @@ from build123d import Color, Compound, Location, Solid
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure
-from padforge.design.common.errors import InputError
-from padforge.design.common.figures import HORIZONTAL, VERTICAL
-from padforge.design.pad.morphology import Morphology
+from shapely.geometry.base import BaseGeometry
+
+from padforge.design.common.plotting import HORIZONTAL, VERTICAL
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.fabricate.mould.assembly import conductive_plan, pins, well_outlines
 from padforge.fabricate.mould.parts import INTO_FLOOR_MM
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.mould.prisms import COLOURS, Body
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
-from shapely.geometry.base import BaseGeometry
 
 from . import layout
 from .bodies import body_solid, prism_solids

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+
 from padforge.fabricate.mould.plan import Plan, polygon_rings
 
 Array = NDArray[np.float64]

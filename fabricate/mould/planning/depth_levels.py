@@ -6,7 +6,7 @@ two fibres of a family cross. Where they do, each family takes as many as its cr
 
 from collections.abc import Iterable, Sequence
 
-from padforge.design.pad.courses.curves import Crossing
+from padforge.design.paths.curves import Crossing
 
 
 def fibre_levels(counts: tuple[int, int], clashes: Sequence[Crossing], deep_horizontal: bool) -> tuple[int, ...]:

@@ -12,8 +12,9 @@ from functools import cached_property
 
 import numpy as np
 import shapely
-from padforge.design.pad.courses.curves import cubic
-from padforge.design.pad.knots import Array
+
+from padforge.design.morphology import Array
+from padforge.design.paths.curves import cubic
 from padforge.design.settings import Layout
 from padforge.fabricate.settings import LeadRoom
 

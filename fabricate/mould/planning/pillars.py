@@ -4,8 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import shapely
-from padforge.design.pad.knots import Array
 from shapely.geometry.base import BaseGeometry
+
+from padforge.design.morphology import Array
 
 _AT_WALL_MM = 1e-3
 """What comes so near to a wall reaches it."""

@@ -11,11 +11,12 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 import shapely
-from padforge.design.common.figures import FAINT, INK, PAPER
-from padforge.design.pad.knots import Array
+from shapely.geometry.base import BaseGeometry
+
+from padforge.design.common.plotting import FAINT, INK, PAPER
+from padforge.design.morphology import Array
 from padforge.fabricate.mould.plan import Plan, polygon_rings
 from padforge.fabricate.report.fibre_layers import COLOURS, FAMILIES, layers
-from shapely.geometry.base import BaseGeometry
 
 FILE = "orientation.svg"
 _TURNED = (

@@ -8,6 +8,7 @@ changes by more than `ALIKE` while it is held.
 """
 
 import numpy as np
+
 from padforge.sense.localizer.features import REST
 from padforge.sense.recordings.processing.limits import Array
 

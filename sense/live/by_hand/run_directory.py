@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import provenance
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.press_journal import read_journal
 from padforge.sense.recordings.processing.limits import MAX_MM, Array, as_numbers, refuse_beyond
 from padforge.sense.recordings.recorder import JOURNAL, START, Recorder

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+
 from padforge.sense.live.press_buffer import HISTORY, SLACK, Ring
 from padforge.sense.live.sources import connected
 from padforge.sense.localizer.features import REST, bridged

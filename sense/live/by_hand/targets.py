@@ -1,7 +1,8 @@
 """Where a person is asked to press, in an order that is kind to the hand and fair to what is learnt."""
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.press_plan import free_of, planned, size_of
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.rig.planning.setup import Setup

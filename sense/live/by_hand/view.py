@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
 from padforge.design import Morphology
-from padforge.design.pad.courses.curves import flatten
+from padforge.design.paths.curves import flatten
 
 from .session import WORDS
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 from .kernels.press_stream import RING, WINDOWS
 from .streaming import POLES

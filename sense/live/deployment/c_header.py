@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+
 from padforge.design.common.files import write_text
 from padforge.sense.localizer.localizer import UNKNOWN, Localizer
 from padforge.sense.localizer.locating import MEASURED

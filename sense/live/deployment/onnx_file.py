@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import onnxruntime
-from padforge.design.common.errors import Fault, InputError
+
 from padforge.design.common.files import atomic
+from padforge.design.common.validation import Fault, InputError
 from padforge.sense.health.trained_model import refuse_other_pad
 from padforge.sense.localizer.features import DOWN, bridged, press_inputs
 from padforge.sense.localizer.localizer import Localizer

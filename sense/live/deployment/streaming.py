@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from padforge.sense.localizer.features import Inputs, bridged
 from padforge.sense.recordings.processing.limits import Array, Floats, Indices, Mask
 from padforge.sense.recordings.recording import Recording

@@ -6,8 +6,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from padforge.design.common.computing import one_torch_thread
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.parallel import one_torch_thread
+from padforge.design.common.validation import InputError
 from padforge.sense.health.trained_model import refuse_other_pad
 from padforge.sense.localizer.calibration.calibration import CHECKED, learn, radii, split_presses, split_unseen
 from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses

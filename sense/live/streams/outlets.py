@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
-from padforge.design.common.errors import InputError, shown
-from padforge.design.common.page.local_page.listening import END_S, POLL_S, ConnectionServer, listening, refuse_open
+from padforge.design.common.server import END_S, POLL_S, ConnectionServer, listening, refuse_open
+from padforge.design.common.validation import InputError, shown
 from padforge.sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
 from .messages import Message

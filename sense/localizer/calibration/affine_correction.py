@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
+
 from padforge.sense.localizer.features import Inputs
 from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.localizer.network import Weights

@@ -8,11 +8,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError, instance, real
+
 from padforge.design.common.files import provenance
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import or_default, validated
-from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.common.validation import InputError, instance, real
+from padforge.design.objectives.fibre_loss import lost_subsets
 from padforge.sense import settings
 from padforge.sense.localizer.evaluation import conformal, evaluate, held_back
 from padforge.sense.localizer.features import PHASES, press_inputs
@@ -82,7 +83,7 @@ def calibrate(
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
-    from padforge.design.common.computing import one_torch_thread
+    from padforge.design.common.parallel import one_torch_thread
 
     with stage("train"), one_torch_thread():
         localizer = learn(recording, training, options, rng, progress, time_budget)

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from padforge.design.common.checkpoints import Checkpoints, State
-from padforge.design.common.computing import one_torch_thread, run_tasks
-from padforge.design.common.errors import InputError, instance, path, shown, whole
 from padforge.design.common.files import provenance
+from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
-from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.common.validation import InputError, instance, path, shown, whole
+from padforge.design.objectives.fibre_loss import lost_subsets
 from padforge.sense import settings
 from padforge.sense.localizer.evaluation import by_place, errors_by_loss
 from padforge.sense.localizer.localizer import Found, Localizer

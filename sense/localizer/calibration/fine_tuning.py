@@ -10,12 +10,13 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from padforge.design.common.computing import one_torch_thread
+from torch import Tensor
+
+from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.health.trained_model import one_cycle
 from padforge.sense.localizer.network import Weights
 from padforge.sense.localizer.response.observer import Observer
 from padforge.sense.recordings.processing.limits import Floats
-from torch import Tensor
 
 from .networks.masked_network import draw_alive, entries, forward, inputs_at, misses
 from .networks.training_presses import TrainingPresses

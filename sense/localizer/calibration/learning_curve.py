@@ -10,10 +10,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from padforge.design.common.computing import one_torch_thread, run_tasks
-from padforge.design.common.errors import InputError, instance
+
 from padforge.design.common.files import provenance
+from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
+from padforge.design.common.validation import InputError, instance
 from padforge.sense import settings
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recordings.processing.limits import Array, Indices

@@ -13,9 +13,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError, instance, whole
+
 from padforge.design.common.files import provenance
-from padforge.design.criteria.fibre_loss import lost_subsets
+from padforge.design.common.validation import InputError, instance, whole
+from padforge.design.objectives.fibre_loss import lost_subsets
 from padforge.sense.localizer.evaluation import conformal, distances, error_row
 from padforge.sense.localizer.features import Inputs
 from padforge.sense.localizer.localizer import Found, Localizer, joined

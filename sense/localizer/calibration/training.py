@@ -22,13 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from padforge.design.common.computing import one_torch_thread, run_tasks
+from torch import Tensor
+
+from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.sense import settings
 from padforge.sense.health.trained_model import average_in, one_cycle
 from padforge.sense.localizer.network import LEAST_LOG, MOST_LOG, OUTPUTS, Weights
 from padforge.sense.localizer.response.observer import TOLD, Observer
 from padforge.sense.recordings.processing.limits import Floats
-from torch import Tensor
 
 from .networks.masked_network import draw_alive, entries, forward_fast, initial, inputs_at, misses
 from .networks.training_presses import TrainingPresses, as_unseen

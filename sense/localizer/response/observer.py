@@ -12,7 +12,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array, Mask
 
 from .response_model import looked_up

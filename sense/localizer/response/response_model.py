@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
 BUMPS = 21

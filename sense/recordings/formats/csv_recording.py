@@ -16,8 +16,9 @@ from pathlib import Path
 from reprlib import repr as shortened
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import atomic, writing
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
 from padforge.sense.recordings.recording import Recording
 

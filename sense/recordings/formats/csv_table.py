@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-from padforge.design.common.errors import MOST_VALUES, InputError
+
 from padforge.design.common.files import require_file
+from padforge.design.common.validation import MOST_VALUES, InputError
 from padforge.sense.recordings.processing.limits import MAX_BYTES, Array
 
 UNKNOWN = -1.7e308

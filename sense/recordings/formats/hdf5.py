@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import atomic, writing
-from padforge.design.pad.published_files.hdf5_datasets import plain_datasets
+from padforge.design.common.mat_files import plain_datasets
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.recording import Recording
 
 from .assembly import MEASURES, assembled

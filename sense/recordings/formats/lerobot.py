@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import scratch, write_json, writing
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Indices
 from padforge.sense.recordings.recorder import refuse_existing
 from padforge.sense.recordings.recording import Recording

@@ -11,8 +11,8 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
-from padforge.design.common.errors import InputError, instance, shown
-from padforge.design.common.errors import path as as_path
+from padforge.design.common.validation import InputError, instance, shown
+from padforge.design.common.validation import path as as_path
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6}

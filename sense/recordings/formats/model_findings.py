@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from padforge.design.common.errors import instance
-from padforge.design.common.errors import path as as_path
+from padforge.design.common.validation import instance
+from padforge.design.common.validation import path as as_path
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recording import Recording
 

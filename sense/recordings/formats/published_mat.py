@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from padforge.design.common.errors import InputError
-from padforge.design.pad.published_files.matlab import load_mat
+
+from padforge.design.common.mat_files import load_mat
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recording import Recording
 

@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.computing import in_chunks
-from padforge.design.common.errors import InputError, instance, real, shown, whole
+
+from padforge.design.common.parallel import in_chunks
+from padforge.design.common.validation import InputError, instance, real, shown, whole
 
 from .kernels import clipping, total_variation_l1, total_variation_l2
 from .kernels import running_median as median_kernel

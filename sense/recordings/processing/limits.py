@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from padforge.design.common.errors import MOST_VALUES, InputError, shown
+
+from padforge.design.common.validation import MOST_VALUES, InputError, shown
 
 MAX_FIBRES = 512
 MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5

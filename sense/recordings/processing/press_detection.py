@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import InputError, whole
+
+from padforge.design.common.validation import InputError, whole
 
 from .kernels.pad_state import unknown
 from .kernels.press_detection import find

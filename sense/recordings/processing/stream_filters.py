@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from padforge.design.common.errors import InputError, whole
+
+from padforge.design.common.validation import InputError, whole
 
 from .filters import KERNELS, NOBODY, Fidelity, check_variation, checked_readings, median_of, window_reach
 from .kernels import clipping

@@ -14,11 +14,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
+
 from padforge.design import Contact, Morphology
-from padforge.design.pad.contact import relative_stretch
+from padforge.design.contact import relative_stretch
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.settings import RigSettings
-from scipy.signal import lfilter
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095

@@ -1,9 +1,10 @@
 """The simulated rig: the published protocol on the simulated pad."""
 
 import numpy as np
+
 from padforge.design import Contact, Morphology, Twin
-from padforge.design.common.errors import MOST_VALUES, InputError, instance, whole
 from padforge.design.common.settings import or_default
+from padforge.design.common.validation import MOST_VALUES, InputError, instance, whole
 from padforge.design.settings import PadSettings
 from padforge.sense.recordings.press_plan import free_of, planned_in, size_of, uniform
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array

@@ -5,11 +5,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+
 from padforge.design import Contact, Morphology, Twin
-from padforge.design.common.errors import InputError
-from padforge.design.pad.contact import relative_stretch
-from padforge.design.pad.twin import TwinChannel
+from padforge.design.common.validation import InputError
+from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
+from padforge.design.twin import TwinChannel
 from padforge.sense.recordings.press_plan import Free, free_of, size_of, told_pad
 from padforge.sense.recordings.processing.limits import Array
 

@@ -6,9 +6,10 @@ drifts over minutes; how far a fibre comes back beyond its rest, set against its
 """
 
 import numpy as np
+from scipy.optimize import nnls
+
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices
 from padforge.sense.recordings.recording import Recording
-from scipy.optimize import nnls
 
 from .pad_model import DELAY_S, DRIFT_S, TRAVEL_S
 

@@ -9,6 +9,7 @@ and stays in the times.
 from collections import deque
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array, Indices
 
 Point = tuple[float, float]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, Literal
 
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 Group = Literal["padforge.arms", "padforge.boards"]
 

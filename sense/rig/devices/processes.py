@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 ROOT = Path(__file__).parents[3]
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from padforge.design.common.errors import Fault
+from padforge.design.common.validation import Fault
 from padforge.sense.recordings.processing.limits import Array, Indices
 
 Pose = tuple[float, float, float, float, float, float]

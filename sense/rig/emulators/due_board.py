@@ -7,6 +7,7 @@ It samples by the host's clock at a rate that may be off by some ppm, and fails 
 import time
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.rig.boards.due import framing
 from padforge.sense.rig.boards.due.framing import (

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from padforge.design import Contact, Morphology, signals
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.simulation.pad_model import TRAVEL_S, LivePad

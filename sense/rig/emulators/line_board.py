@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+
 from padforge.sense.rig.boards.line.framing import ASK, Header, header_line, sample_line
 
 from .serial_board import OUT_BYTES, SerialBoard, Source

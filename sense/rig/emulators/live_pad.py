@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+
 from padforge.design import Contact, Morphology, signals
 from padforge.design.settings import PadSettings
 from padforge.sense.recordings.press_plan import planned

@@ -5,6 +5,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array, Indices
 
 from .serial_device import SerialDevice

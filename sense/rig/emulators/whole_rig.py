@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 import numpy as np
+
 from padforge.design import Contact, Morphology, signals
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.simulation.pad_model import SUPPLY_V, LivePad
 from padforge.sense.rig.arms.printer.driver import Printer

@@ -3,12 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
+
 from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.localizer.locating import locate
 from padforge.sense.recordings.press_plan import Free, PressPlan, uniform
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recording import Recording
-from scipy.spatial import KDTree
 
 EVERY = 20
 """Presses between two looks at how well the localizer finds them."""

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.errors import InputError, shown
 from padforge.design.common.files import read_json
+from padforge.design.common.validation import InputError, shown
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.settings import RigSettings
 

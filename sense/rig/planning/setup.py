@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import provenance, read_json
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
-    from padforge.design.pad.morphology import Morphology
+    from padforge.design.morphology import Morphology
     from padforge.design.settings import Contact, PadSettings
     from padforge.sense.recordings.press_plan import PressPlan
     from padforge.sense.recordings.recorder import Recorder
@@ -39,6 +39,7 @@ class Setup:
 def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
     """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
+
     from padforge.sense.recordings.press_plan import PressPlan, all_free, free_of, planned, size_of
     from padforge.sense.recordings.recorder import START
 

@@ -1,6 +1,7 @@
 """From the samples of a converter to the readings of a recording: means over a whole number of samples."""
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.rig.devices.protocols import ConverterSamples
 

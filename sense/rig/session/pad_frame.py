@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.rig.devices.protocols import Pose, RigFault
 from padforge.sense.settings import RigSettings

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 import numpy as np
+
 from padforge.sense.recordings.press_plan import PressPlan
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recorder import STATE_COLUMNS, Recorder

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from padforge.design.common.figures import ALARM, CURVES, FAINT, INK, head, tidy
+
+from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, head, tidy
 
 COLUMNS = 2
 """Recordings side by side whose errors are shown."""

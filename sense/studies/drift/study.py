@@ -12,12 +12,13 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.errors import InputError
-from padforge.design.criteria.information import idle_share
-from padforge.design.evaluation.localisation_error import training_presses
-from padforge.design.pad.contact import signals
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.contact import signals
+from padforge.design.morphology import Morphology
+from padforge.design.networks import training_presses
+from padforge.design.objectives.published import idle_share
 from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
 from padforge.sense.localizer.calibration.calibration import split_presses
 from padforge.sense.localizer.evaluation import distances
@@ -199,7 +200,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
         (3, W) times s, readings and filtered readings V; "marks": (SHOWN, 3, 2) times s and values V; and "levels":
         (L, 3) times s, and values V before and in presses.
     """
-    from padforge.design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.networks import fit_many
 
     recording = source()
     begun, lifted, places_mm = recording.begun, recording.lifted, recording.presses_mm

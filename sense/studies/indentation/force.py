@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.figures import CURVES, FAINT, INK, head, tidy
-from padforge.design.evaluation.localisation_error import fresh_presses
-from padforge.design.pad.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.plotting import CURVES, FAINT, INK, head, tidy
+from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
+from padforge.design.morphology import Morphology
+from padforge.design.networks import fresh_presses
 from padforge.design.settings import between_fibres
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.studies.pads import described
@@ -119,7 +120,7 @@ def committee(
     inputs: Array, targets: Array, rng: np.random.Generator, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """The mean of networks that learnt from (Q, D) inputs and (Q, O) targets, each with its own split and weights."""
-    from padforge.design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.networks import fit_many
 
     members = fit_many(inputs, targets, rng.spawn(MEMBERS), hidden, epochs)
     return lambda given: np.mean([network(given) for network in members], axis=0)

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.figures import INK, draw_confusions, head
-from padforge.design.evaluation.localisation_error import fresh_presses
-from padforge.design.pad.contact import signals
-from padforge.design.pad.indentation import Indenter, indented_signals
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.plotting import INK, draw_confusions, head
+from padforge.design.contact import signals
+from padforge.design.indentation import Indenter, indented_signals
+from padforge.design.morphology import Morphology
+from padforge.design.networks import fresh_presses
 from padforge.design.settings import Contact, between_fibres
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.studies.pads import described

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 
 LABELLED = "fixed labels"
@@ -80,7 +81,7 @@ def learnt(
     way: Way, given: Array, places: Array, rng: np.random.Generator, members: int, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """What finds pairs (T, 2, 2) from signals (T, D), having learnt from signals (Q, D) of pairs (Q, 2, 2)."""
-    from padforge.design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.networks import fit_many
 
     targets = way.targets(places)
     networks = fit_many(given, targets[0], rng.spawn(members), hidden, epochs, also=targets[1:])

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from padforge.design.common.checkpoints import State
-from padforge.design.common.figures import CURVES, INK, draw_confusions, head, tidy
-from padforge.design.evaluation.localisation_error import fresh_presses
-from padforge.design.pad.contact import signals
-from padforge.design.pad.morphology import Morphology
+from padforge.design.common.plotting import CURVES, INK, draw_confusions, head, tidy
+from padforge.design.contact import signals
+from padforge.design.morphology import Morphology
+from padforge.design.networks import fresh_presses
 from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.studies.indentation.force import COUNTS, readings
@@ -86,7 +87,7 @@ def _located(
 
 def _counted(pad: Morphology, presses: int, test: int, members: int, hidden: int, epochs: int, seed: int) -> State:
     """Confusions (MOST+1, MOST+1) on the test presses: how often i contacts, by row, were taken for j."""
-    from padforge.design.evaluation.levenberg_marquardt import fit_many
+    from padforge.design.networks import fit_many
 
     rng = np.random.default_rng([6, seed])
     places = _drawn(pad, presses + test, MOST, rng)

@@ -4,12 +4,13 @@ import csv
 import json
 
 import pytest
-from padforge.design.benchmarking import harness, suite, table
-from padforge.design.benchmarking.comparison import read_earlier, worsenings
-from padforge.design.benchmarking.harness import Bench, BenchRounds, BenchTrial, measure_round
-from padforge.design.benchmarking.suite import run_benches
-from padforge.design.benchmarking.table import bench_lines
-from padforge.design.common.errors import InputError
+
+from padforge.benchmarks import harness, suite, table
+from padforge.benchmarks.comparison import read_earlier, worsenings
+from padforge.benchmarks.harness import Bench, BenchRounds, BenchTrial, measure_round
+from padforge.benchmarks.suite import run_benches
+from padforge.benchmarks.table import bench_lines
+from padforge.design.common.validation import InputError
 
 
 def bench(error=0.1, work=lambda: None, name="x"):

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from matplotlib.patches import Circle, Polygon
+
 from padforge.design import Contact, InputError, Morphology, SearchRun, Spec, Twin, draw_plan, score, search
-from padforge.design.cli.main import design
+from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
-from padforge.design.criteria.score import AMBIGUITY_NOISE, ambiguities
-from padforge.design.evaluation.expected_error import error_terms, expected_errors, straight_full_scale
-from padforge.design.optimisers.twin_search import state_folders
-from padforge.design.pad.twin import Frame, TwinChannel, TwinScatter
-from padforge.design.report.files import found_before, search_lines
-from padforge.design.report.twin_settings import settings_for_twin
+from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
+from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design.optimize.twin_search import settings_for_twin, state_folders
+from padforge.design.run import found_before, search_lines
 from padforge.design.settings import PadSettings, SearchSettings
+from padforge.design.twin import Frame, TwinChannel, TwinScatter
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
 QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")

@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
-from padforge.design.cli.editor.answers import Answers
-from padforge.design.cli.editor.session import Session
-from padforge.design.cli.main import design
+from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
-from padforge.design.criteria.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design.editor.edits import Answers
+from padforge.design.editor.session import Session
+from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
 
 
 def session(tmp_path, pad=None, **size):

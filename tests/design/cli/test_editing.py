@@ -15,10 +15,9 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from padforge.design import Morphology
-from padforge.design.cli.editing import edit
-from padforge.design.cli.main import design
 
+from padforge.design import Morphology
+from padforge.design.cli import design, edit
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Ctrl-C is a signal here")
@@ -138,7 +137,7 @@ def test_mistakes_are_told_before_a_page_is_there(tmp_path: Path, pad: Path, arg
 
 @pytest.mark.slow
 def test_it_takes_no_torch() -> None:
-    code = "import design.cli.editor.session, sys; sys.exit('torch' in sys.modules)"
+    code = "import padforge.design.editor.session, sys; sys.exit('torch' in sys.modules)"
     root = Path(__file__).resolve().parents[3]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 

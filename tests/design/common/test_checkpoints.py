@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.checkpoints import Checkpoints
-from padforge.design.common.errors import InputError
-from padforge.design.optimisers.search import SearchResult, SearchRun, search
-from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.validation import InputError
+from padforge.design.optimize.search import SearchResult, SearchRun, search
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from tests.design.pad.damage import damages, read_damaged
 from tools.kills import killed
 

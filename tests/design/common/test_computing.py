@@ -10,8 +10,9 @@ from functools import partial
 
 import pytest
 import torch
-from padforge.design.common.computing import cluster, forget_outdated, one_torch_thread, run_tasks
-from padforge.design.common.errors import Fault
+
+from padforge.design.common.parallel import cluster, forget_outdated, one_torch_thread, run_tasks
+from padforge.design.common.validation import Fault
 
 
 @pytest.fixture
@@ -139,7 +140,7 @@ def test_an_end_from_outside_is_told_and_crashes_nothing() -> None:
 import os, signal, sys, threading
 import click, torch
 from padforge.design.common.command_line import run_to_end
-from padforge.design.common.computing import run_tasks
+from padforge.design.common.parallel import run_tasks
 sys.argv = ["padforge"]
 at_work = threading.Barrier(5, lambda: threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start())
 def train():

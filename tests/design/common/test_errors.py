@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from padforge.design.common import errors
-from padforge.design.common.errors import InputError, what_to_install
+
+from padforge.design.common import validation as errors
+from padforge.design.common.validation import InputError, what_to_install
 
 LONGEST = "a" * errors.LONGEST_PATH
 

@@ -10,12 +10,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from padforge.design.common import files
-from padforge.design.common.errors import InputError
-from padforge.design.common.files import locks
-from padforge.design.common.files.folders import EXCHANGE
 
-CLAIM = "import sys\nfrom pathlib import Path\nfrom design.common.files import claimed\n"
+from padforge.design.common import files
+from padforge.design.common.files import EXCHANGE
+from padforge.design.common.validation import InputError
+
+CLAIM = "import sys\nfrom pathlib import Path\nfrom padforge.design.common.files import claimed\n"
 ANOTHER = CLAIM + "try:\n  with claimed(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
 
 
@@ -214,8 +214,8 @@ def windows(monkeypatch):
                 raise PermissionError(13, "in use")
         taken[handle] = (about.st_dev, about.st_ino)
 
-    monkeypatch.setattr(locks, "fcntl", None)
-    monkeypatch.setattr(locks, "LOCKS", False)
+    monkeypatch.setattr(files, "fcntl", None)
+    monkeypatch.setattr(files, "LOCKS", False)
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))  # pyright: ignore
     monkeypatch.setattr(os, "O_TEMPORARY", 0, raising=False)
 
@@ -232,10 +232,10 @@ def test_without_flock_two_runs_do_not_write_into_one_folder_and_a_locked_file_i
     (tmp_path / "journal").write_bytes(b"line\n")
     with (tmp_path / "journal").open("r+b", buffering=0) as first, (tmp_path / "journal").open("rb") as second:
         first.seek(3)
-        locks.lock(first, "busy")
+        files.lock(first, "busy")
         assert first.tell() == 3
         with pytest.raises(InputError, match="busy"):
-            locks.lock(second, "busy")
+            files.lock(second, "busy")
         assert second.read() == b"line\n"
 
 

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from padforge.design.common import files
-from padforge.design.common.errors import InputError
-from padforge.design.common.files.folders import EXCHANGE
 
+from padforge.design.common import files
+from padforge.design.common.files import EXCHANGE
+from padforge.design.common.validation import InputError
 from tools.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")

@@ -10,12 +10,12 @@ from http.client import HTTPConnection, HTTPResponse
 from typing import Any
 
 import pytest
-from padforge.design.common.errors import InputError
-from padforge.design.common.page.elements import PageSection, html_pieces, table
-from padforge.design.common.page.elements import page as whole_page
-from padforge.design.common.page.local_page import listening
-from padforge.design.common.page.local_page.listening import HOST
-from padforge.design.common.page.local_page.local_page import LocalPage
+
+from padforge.design.common import server as listening
+from padforge.design.common.page import PageSection, html_pieces, table
+from padforge.design.common.page import page as whole_page
+from padforge.design.common.server import HOST, LocalPage
+from padforge.design.common.validation import InputError
 
 PAGE = "<!doctype html><title>x</title><style>p { margin: 0 }</style><script>1</script>"
 

@@ -5,12 +5,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.design import Contact, Morphology
-from padforge.design.criteria.ambiguity import ambiguity, full_scale, sharpness
-from padforge.design.criteria.fibre_loss import draw_losses, loss_shares, lost_subsets
-from padforge.design.criteria.score import ambiguities, free_presses
-from padforge.design.evaluation.ambiguity_map import ambiguity_map
-from padforge.design.pad.contact import relative_stretch, signals
+from padforge.design.contact import relative_stretch, signals
+from padforge.design.objectives.ambiguity_map import ambiguity_map
+from padforge.design.objectives.fibre_loss import draw_losses, loss_shares, lost_subsets
+from padforge.design.objectives.score import ambiguities, ambiguity, free_presses, full_scale, sharpness
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")

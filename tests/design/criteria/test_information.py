@@ -4,19 +4,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from padforge.benchmarks import objective
 from padforge.design import Contact, Morphology, published_objective, signals
-from padforge.design.criteria import benchmark as objective
-from padforge.design.criteria.information import (
+from padforge.design.contact import boustrophedon
+from padforge.design.objectives.published import (
     disorder,
     disorder_area,
     idle_share,
     information,
     joint_entropy,
+    published_presses,
     published_sharpness,
+    published_terms,
     quantize,
 )
-from padforge.design.criteria.published_objective import published_presses, published_terms
-from padforge.design.pad.contact import boustrophedon
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from padforge.design import Morphology
-from padforge.design.criteria.differentiable import span_samples
-from padforge.design.criteria.penalties import COMMON, penalties
-from padforge.design.criteria.rules import check_rules
-from padforge.design.pad.contact import fibre_axes
-from padforge.design.pad.courses.curves import crossings, lengths, refine
-from padforge.design.settings import PadSettings, RulesSettings
 from scipy.interpolate import PchipInterpolator
+
+from padforge.design import Morphology
+from padforge.design.contact import fibre_axes
+from padforge.design.objectives.penalties import COMMON, penalties
+from padforge.design.objectives.rules import check_rules
+from padforge.design.paths.curves import crossings, lengths, refine
+from padforge.design.settings import PadSettings, RulesSettings
+from padforge.design.torch_signals import span_samples
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NONE = RulesSettings(

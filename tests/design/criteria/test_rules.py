@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from padforge.design import InputError, Morphology, Spec, crossings
-from padforge.design.criteria.rules import check_rules
-from padforge.design.pad.courses.common_length import common_stretches
-from padforge.design.pad.courses.curves import crossing_angles, flatten, slopes
-from padforge.design.settings import PUBLISHED, RulesSettings
 from scipy.interpolate import PchipInterpolator
+
+from padforge.design import InputError, Morphology, Spec, crossings
+from padforge.design.objectives.rules import check_rules
+from padforge.design.paths.curves import common_stretches, crossing_angles, flatten, slopes
+from padforge.design.settings import PUBLISHED, RulesSettings
 
 NONE = RulesSettings(
     min_bend_radius_mm=0,

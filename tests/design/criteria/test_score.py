@@ -3,9 +3,10 @@
 import math
 
 import pytest
+
 from padforge.design import Contact, InputError, Morphology
-from padforge.design.criteria.published_objective import published_terms
-from padforge.design.criteria.score import score
+from padforge.design.objectives.published import published_terms
+from padforge.design.objectives.score import score
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
+
 from padforge.design import Contact, Morphology
-from padforge.design.criteria.information import disorder, disorder_area
-from padforge.design.criteria.penalties import penalties
-from padforge.design.criteria.rules import check_rules
-from padforge.design.criteria.score import score
-from padforge.design.optimisers.parametrization import Fibres
-from padforge.design.pad.knots import assemble
-from padforge.design.report.plan_drawing import draw_plan
+from padforge.design.morphology import assemble
+from padforge.design.objectives.penalties import penalties
+from padforge.design.objectives.published import disorder, disorder_area
+from padforge.design.objectives.rules import check_rules
+from padforge.design.objectives.score import score
+from padforge.design.optimize.gradient import Fibres
+from padforge.design.plan_drawing import draw_plan
 from padforge.design.settings import PadSettings, RulesSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from padforge.design.evaluation import expected_error as module
-from padforge.design.evaluation.expected_error import (
+
+from padforge.design.contact import lattice, relative_stretch, signals
+from padforge.design.morphology import Morphology
+from padforge.design.objectives import expected_error as module
+from padforge.design.objectives.expected_error import (
     BY_LEARNING,
     BY_NOISE,
     RIDGE,
@@ -19,9 +22,7 @@ from padforge.design.evaluation.expected_error import (
     straight_full_scale,
     window_presses,
 )
-from padforge.design.pad.contact import lattice, relative_stretch, signals
-from padforge.design.pad.courses.curves import lengths
-from padforge.design.pad.morphology import Morphology
+from padforge.design.paths.curves import lengths
 from padforge.design.settings import (
     Contact,
     PadSettings,

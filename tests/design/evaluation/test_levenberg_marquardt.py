@@ -3,14 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from padforge.design.common.errors import InputError
-from padforge.design.evaluation import benchmark
-from padforge.design.evaluation.levenberg_marquardt import ColumnScale, Network, first_weights, fit, fit_many
-from padforge.design.evaluation.variable_projection import (
+
+from padforge.benchmarks import networks as benchmark
+from padforge.design.common.validation import InputError
+from padforge.design.networks import (
     RIDGE,
+    ColumnScale,
     Fit,
+    Network,
     curvature,
     dual_curvature,
+    first_weights,
+    fit,
+    fit_many,
     neurons_of,
     pull_back,
     with_ones,

@@ -6,10 +6,11 @@ import os
 import numpy as np
 import pytest
 import torch
+
 from padforge.design import Contact, Morphology, signals
-from padforge.design.common.errors import InputError
-from padforge.design.evaluation.contacts_believed import beside_straight, contacts_in_question, errors_by_contact
-from padforge.design.evaluation.localisation_error import PressSets, fresh_presses, localisation_error, training_presses
+from padforge.design.common.validation import InputError
+from padforge.design.contact_comparison import beside_straight, contacts_in_question, errors_by_contact
+from padforge.design.networks import PressSets, fresh_presses, localisation_error, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
 
 

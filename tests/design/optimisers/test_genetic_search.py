@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from padforge.design.criteria.published_objective import published_objective, published_presses, published_terms
-from padforge.design.optimisers.genetic_search import GeneticSearch
-from padforge.design.optimisers.problem import SearchProblem
+
+from padforge.design.objectives.published import published_objective, published_presses, published_terms
+from padforge.design.optimize.genetic import GeneticSearch
+from padforge.design.optimize.problem import SearchProblem
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT

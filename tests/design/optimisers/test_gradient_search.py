@@ -5,17 +5,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
+
 from padforge.design import Contact, Morphology
-from padforge.design.criteria.differentiable import arc_lengths, pchip_slopes
-from padforge.design.criteria.rules import check_rules
-from padforge.design.criteria.score import score
-from padforge.design.evaluation.expected_error import expected_errors
-from padforge.design.optimisers.gradient_search import GradientSearch
-from padforge.design.optimisers.parametrization import OTHER_START, Fibres, border_of, first_course
-from padforge.design.optimisers.problem import SearchProblem
-from padforge.design.optimisers.search import search
-from padforge.design.pad.contact import fibre_axes
-from padforge.design.pad.courses.curves import lengths, refine
+from padforge.design.contact import fibre_axes
+from padforge.design.objectives.expected_error import expected_errors
+from padforge.design.objectives.rules import check_rules
+from padforge.design.objectives.score import score
+from padforge.design.optimize.gradient import OTHER_START, Fibres, GradientSearch, border_of, first_course
+from padforge.design.optimize.problem import SearchProblem
+from padforge.design.optimize.search import search
+from padforge.design.paths.curves import lengths, refine
 from padforge.design.settings import (
     PUBLISHED_CONTACT,
     PUBLISHED_PAD,
@@ -24,7 +24,7 @@ from padforge.design.settings import (
     RulesSettings,
     SearchSettings,
 )
-from scipy.interpolate import PchipInterpolator
+from padforge.design.torch_signals import arc_lengths, pchip_slopes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False)

@@ -5,27 +5,28 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+
+from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, InputError, Morphology
-from padforge.design.criteria.rules import check_rules
-from padforge.design.criteria.score import AMBIGUITY_NOISE, ambiguities, ambiguity_terms, score
-from padforge.design.evaluation.expected_error import error_terms, expected_errors
-from padforge.design.evaluation.localisation_error import localisation_error
-from padforge.design.optimisers import benchmark
-from padforge.design.optimisers.search import SearchRun, search
-from padforge.design.pad.courses.curves import refine
+from padforge.design.networks import localisation_error
+from padforge.design.objectives.expected_error import error_terms, expected_errors
+from padforge.design.objectives.rules import check_rules
+from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities, ambiguity_terms, score
+from padforge.design.optimize.search import SearchRun, search
+from padforge.design.paths.curves import refine
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)
 SMALL = SearchSettings(knots=3, starts=2, steps=25, population=10, generations=3, lost=1)
 QUICK = SMALL.model_copy(update={"starts": 1, "steps": 1, "generations": 1})
-REPAIR = "padforge.design.optimisers.gradient_search.REPAIR_STEPS"
+REPAIR = "padforge.design.optimize.gradient.REPAIR_STEPS"
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
 def test_a_search_depends_on_the_seed_and_not_on_how_it_runs(method, monkeypatch):
     pad, settings = PadSettings(grid=1), SMALL.model_copy(update={"method": method})
     first, reported = search(pad, None, settings, FREE), []
-    monkeypatch.setattr("padforge.design.optimisers.start.SLICE_S", -1.0)  # a slice ends after its first step
+    monkeypatch.setattr("padforge.design.optimize.search.SLICE_S", -1.0)  # a slice ends after its first step
     with ThreadPoolExecutor(1) as executor:
         run = SearchRun(lambda *progress: reported.append(progress), executor=executor)
         sliced = search(pad, None, settings, FREE, run=run)

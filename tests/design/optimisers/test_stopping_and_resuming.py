@@ -13,13 +13,13 @@ from typing import cast
 import click
 import numpy as np
 import pytest
-from padforge.design import InputError, PadSettings, RulesSettings, SearchRun, SearchSettings, search
-from padforge.design.common import computing
-from padforge.design.common.checkpoints import Checkpoints
-from padforge.design.common.command_line import run_to_end
-from padforge.design.optimisers import stopping
 
 from padforge.cli import cli
+from padforge.design import InputError, PadSettings, RulesSettings, SearchRun, SearchSettings, search
+from padforge.design.common import parallel as computing
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.command_line import run_to_end
+from padforge.design.optimize import problem as stopping
 
 PAD = PadSettings(grid=1)
 SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, lost=1)

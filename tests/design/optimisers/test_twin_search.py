@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from padforge.design.evaluation.contacts_believed import ContactErrors
-from padforge.design.evaluation.localisation_error import LossError
-from padforge.design.optimisers import twin_search
-from padforge.design.optimisers.search import SearchRun
-from padforge.design.optimisers.twin_search import choose, search_for_twin
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.contact_comparison import ContactErrors
+from padforge.design.morphology import Morphology
+from padforge.design.networks import LossError
+from padforge.design.optimize import twin_search
+from padforge.design.optimize.search import SearchRun
+from padforge.design.optimize.twin_search import choose, search_for_twin
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
@@ -38,7 +39,7 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
     rules, expected, monkeypatch
 ):
     """What a criterion promises does not count."""
-    monkeypatch.setattr("padforge.design.optimisers.gradient_search.REPAIR_STEPS", 20)
+    monkeypatch.setattr("padforge.design.optimize.gradient.REPAIR_STEPS", 20)
 
     def judged(pads, contacts, size, scatter, seed, subsets):
         assert set(pads) == ({"usual", "straight fibres", "twin", "from usual"} if expected != "twin" else {"twin"})

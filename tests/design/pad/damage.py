@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from hypothesis import strategies as st
+
 from padforge.design import InputError
 
 T = TypeVar("T")

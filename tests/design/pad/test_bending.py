@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from padforge.design import Morphology, flatten
-from padforge.design.pad.courses.bending import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
-from padforge.design.pad.courses.curves import beziers, slope_beziers
 from scipy.interpolate import PchipInterpolator
 
+from padforge.design import Morphology, flatten
+from padforge.design.paths.bends import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
+from padforge.design.paths.curves import beziers, slope_beziers
 from tests.design.pad.wild_pads import SEEDS, wild_pads
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])

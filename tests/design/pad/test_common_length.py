@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import shapely
-from padforge.design.pad.courses.common_length import common_stretches
-from padforge.design.pad.courses.curves import flatten
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.morphology import Morphology
+from padforge.design.paths.curves import common_stretches, flatten
 
 LEVEL = np.array([[-9.0, 0.0], [9.0, 0.0]])
 

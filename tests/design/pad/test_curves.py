@@ -5,12 +5,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design import Morphology, crossings, flatten
-from padforge.design.criteria.differentiable import pchip_sample
-from padforge.design.pad.courses.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
-from padforge.design.pad.kernels.pchip import sample_curves
 from scipy.interpolate import PchipInterpolator
 
+from padforge.design import Morphology, crossings, flatten
+from padforge.design.kernels.pchip import sample_curves
+from padforge.design.paths.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
+from padforge.design.torch_signals import pchip_sample
 from tests.design.pad.wild_pads import SEEDS, longest_signals, wild_pads
 
 pads = st.builds(Morphology.random, st.integers(1, 3), st.integers(0, 10), SEEDS)

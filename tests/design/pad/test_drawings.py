@@ -11,14 +11,14 @@ from click.testing import CliRunner
 from ezdxf import new, units  # pyright: ignore[reportPrivateImportUsage]
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.design import Contact, InputError, Morphology, PadSettings, draw_plan, flatten
-from padforge.design.cli.main import design
-from padforge.design.common.figures import save_figure
-from padforge.design.pad.courses.drawings.plan import import_plan
+from padforge.design.cli import design
+from padforge.design.common.plotting import save_figure
+from padforge.design.paths.import_plan import import_plan
 from padforge.design.settings import Layout
 from padforge.fabricate import Plan
 from padforge.fabricate.report.track_drawings import tracks_dxf
-
 from tests.design.pad.damage import damages, read_damaged
 
 LAYOUT = Layout.of((2, 3), (10.0, 12.0))

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from padforge.design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.pad.contact import fibre_axes, signals_and_spans
-from padforge.design.pad.knots import assemble
-from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
+from padforge.design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
+from padforge.design.contact import fibre_axes, signals_and_spans
+from padforge.design.morphology import assemble
+from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from tests.design.pad import wild_pads as wild
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design import Morphology
-from padforge.design.pad.courses.fitting import fitted_knots
-from padforge.design.pad.courses.spare_knots import HAIR, with_spares, without_spares
 from scipy.interpolate import PchipInterpolator
+
+from padforge.design import Morphology
+from padforge.design.paths.fitting import HAIR, fitted_knots, with_spares, without_spares
 
 
 def off(knots, points):

@@ -5,14 +5,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.design import InputError, Morphology
-from padforge.design.criteria.penalties import penalties
-from padforge.design.criteria.rules import check_rules
-from padforge.design.criteria.score import free_presses
-from padforge.design.pad.contact import fibre_axes
-from padforge.design.pad.courses.bending import bend_radius, rolled_turns
-from padforge.design.pad.courses.keep_out import keep_outs, outside, require_free_ends
-from padforge.design.pad.courses.passing import passing, straight_course
+from padforge.design.contact import fibre_axes
+from padforge.design.objectives.penalties import penalties
+from padforge.design.objectives.rules import check_rules
+from padforge.design.objectives.score import free_presses
+from padforge.design.paths.bends import bend_radius, rolled_turns
+from padforge.design.paths.keep_outs import keep_outs, outside, passing, require_free_ends, straight_course
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)

@@ -8,16 +8,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.criteria.differentiable import pchip_slopes, press_signals
-from padforge.design.pad.contact import fibre_axes, signals_and_spans
-from padforge.design.pad.kernels.measured_signals import PRECISION
-from padforge.design.pad.knots import kernel_ends
-from padforge.design.settings import DEFAULT_PITCH_MM, Layout
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.optimize import brentq
 
+from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
+from padforge.design.contact import fibre_axes, signals_and_spans
+from padforge.design.kernels.measured_signals import PRECISION
+from padforge.design.morphology import kernel_ends
+from padforge.design.settings import DEFAULT_PITCH_MM, Layout
+from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
 
 REACHES = {

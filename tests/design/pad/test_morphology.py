@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design import InputError, Morphology, signals
-from padforge.design.pad.knots import assemble
-from padforge.design.settings import PUBLISHED_CONTACT
 
+from padforge.design import InputError, Morphology, signals
+from padforge.design.morphology import assemble
+from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.pad.damage import damages, read_damaged
 from tests.design.pad.wild_pads import SEEDS, wild_pads
 

@@ -15,10 +15,10 @@ import pytest
 import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design import InputError, Morphology
-from padforge.design.pad.published_files.matlab import load_mat
-from padforge.sense import import_mat
 
+from padforge.design import InputError, Morphology
+from padforge.design.common.mat_files import load_mat
+from padforge.sense import import_mat
 from tests.design.pad.damage import damages, read_damaged
 
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized
-from padforge.design.criteria.rules import check_rules
-from padforge.design.criteria.score import ambiguities
-from padforge.design.pad.contact import signals_sparse
-from padforge.design.pad.courses.curves import crossings, lengths
-from padforge.design.pad.indentation import Indenter, indented_signals
+from padforge.design.contact import signals_sparse
+from padforge.design.indentation import Indenter, indented_signals
+from padforge.design.objectives.rules import check_rules
+from padforge.design.objectives.score import ambiguities
+from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 ROUND = Contact(radius=0.6, sides=None)

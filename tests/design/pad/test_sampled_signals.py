@@ -6,12 +6,12 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
-from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.criteria.published_objective import published_terms
-from padforge.design.pad.contact import boustrophedon
-from padforge.design.settings import PUBLISHED_CONTACT
 from scipy.interpolate import PchipInterpolator
 
+from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
+from padforge.design.contact import boustrophedon
+from padforge.design.objectives.published import published_terms
+from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.pad.wild_pads import SEEDS, contacts
 
 SETS = [

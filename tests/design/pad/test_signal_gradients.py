@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given, settings
-from padforge.design import Contact, Morphology, signals
-from padforge.design.criteria.differentiable import pchip_slopes, press_signals
-from padforge.design.pad.contact import fibre_axes
-from padforge.design.pad.knots import kernel_ends
-from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 
+from padforge.design import Contact, Morphology, signals
+from padforge.design.contact import fibre_axes
+from padforge.design.morphology import kernel_ends
+from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
+from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import SEEDS, wild_contacts, wild_pads
 
 REACH = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))

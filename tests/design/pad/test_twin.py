@@ -6,10 +6,11 @@ from functools import reduce
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology, Twin
-from padforge.design.pad.contact import relative_stretch
-from padforge.design.pad.courses.curves import flatten
-from padforge.design.pad.twin import Frame, TwinChannel, TwinReadings, TwinScatter
+from padforge.design.contact import relative_stretch
+from padforge.design.paths.curves import flatten
+from padforge.design.twin import Frame, TwinChannel, TwinReadings, TwinScatter
 
 PAD = Morphology.random(2, knots=3, seed=5)
 DISTANCE = np.linspace(0, 1.6, 9)

@@ -5,8 +5,9 @@ from typing import Literal
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+
 from padforge.design import Contact, Morphology
-from padforge.design.pad.knots import assemble
+from padforge.design.morphology import assemble
 
 Array = NDArray[np.float64]
 KINDS = ("random", "steps", "lattice", "border", "alike", "edge", "needles", "level")

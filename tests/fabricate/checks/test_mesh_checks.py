@@ -5,11 +5,11 @@ import pytest
 import shapely
 import trimesh
 from manifold3d import Manifold, OpType
+
 from padforge.fabricate.checks import slices
 from padforge.fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
 from padforge.fabricate.checks.surface import Surface
 from padforge.fabricate.settings import PrinterSettings
-
 from tests.fabricate.checks.trays import CROSS, FLOOR, block, faults, inspected, line, near, prism, tray
 
 

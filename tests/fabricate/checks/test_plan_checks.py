@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from padforge.design.pad.courses.curves import beziers, cubic
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.morphology import Morphology
+from padforge.design.paths.curves import beziers, cubic
 from padforge.design.settings import RulesSettings
 from padforge.fabricate.checks.findings import Finding
 from padforge.fabricate.checks.mesh_checks import SOUND
@@ -16,7 +17,6 @@ from padforge.fabricate.checks.plan_checks.fibre_strain import strains
 from padforge.fabricate.checks.plan_checks.tracks import thinner
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
-
 from tests.fabricate.planted import level_pad, with_settings
 
 

@@ -3,8 +3,9 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.fabricate.checks.self_intersections import penetrating, places
 from scipy.optimize import linprog
+
+from padforge.fabricate.checks.self_intersections import penetrating, places
 
 CUBE = np.asarray(trimesh.creation.box((10, 10, 10)).triangles)
 

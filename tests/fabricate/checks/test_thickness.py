@@ -7,9 +7,9 @@ import trimesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from manifold3d import CrossSection, Manifold, Mesh, OpType
+
 from padforge.fabricate.checks.mesh_checks import SOUND
 from padforge.fabricate.settings import PrinterSettings
-
 from tests.fabricate.checks.trays import (
     CROSS,
     DEPTH,

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from padforge.design.pad.knots import Array
-from padforge.fabricate.mould.plan import Plan
 from scipy.spatial import KDTree
 
+from padforge.design.morphology import Array
+from padforge.fabricate.mould.plan import Plan
 from tests.fabricate.planted import exact_fibre
 
 G_CODE = re.compile(r"([A-Z])([-+]?\d+(?:\.\d+)?)")

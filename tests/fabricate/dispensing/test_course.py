@@ -5,14 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from padforge.design.pad.knots import assemble
-from padforge.design.pad.morphology import Morphology
+from scipy.interpolate import PchipInterpolator
+
+from padforge.design.morphology import Morphology, assemble
 from padforge.fabricate.dispensing.clearance import check_course
 from padforge.fabricate.dispensing.course import Stroke, laying_steps
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.laying import guide
-from scipy.interpolate import PchipInterpolator
-
 from tests.fabricate.planted import with_settings
 
 

@@ -5,13 +5,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.dispensing.course import laying_steps
 from padforge.fabricate.dispensing.files import dispensing
 from padforge.fabricate.dispensing.picture import ways_svg
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.laying import guide
-
 from tests.fabricate.dispensing.machines import Run, apart, exact_course, run_gcode, run_urscript
 from tests.fabricate.planted import level_pad, with_settings
 

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-from padforge.design.common.errors import InputError
-from padforge.design.pad.morphology import Morphology
+from shapely import affinity
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.mould.assembly import (
     bed_frame,
@@ -21,8 +23,6 @@ from padforge.fabricate.mould.mesh import arrays, mesh
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.mould.prisms import Body, Prism
 from padforge.fabricate.settings import WELL_MM
-from shapely import affinity
-
 from tests.fabricate.planted import with_settings
 
 EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}

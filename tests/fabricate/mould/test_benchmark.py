@@ -2,8 +2,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from padforge.design.pad.morphology import Morphology
-from padforge.fabricate.mould import benchmark as bench
+
+from padforge.benchmarks import mould as bench
+from padforge.design.morphology import Morphology
 from padforge.fabricate.mould.cad.model import FITS_MM, mould_model
 from padforge.fabricate.mould.cad.outlines.pieces import FINE_MM
 from padforge.fabricate.mould.plan import Plan

@@ -5,15 +5,14 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
-from padforge.design.pad.knots import assemble
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology, assemble
 from padforge.fabricate.checks.mesh_checks import sound
 from padforge.fabricate.checks.plan_checks import check
 from padforge.fabricate.mould.assembly import mould_body
 from padforge.fabricate.mould.mesh import arrays, mesh
 from padforge.fabricate.mould.plan import Plan
-
 from tests.fabricate.planted import with_settings
 
 ENDS = {

@@ -7,16 +7,16 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
-from padforge.design.pad.courses.curves import Crossing
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.design.paths.curves import Crossing
 from padforge.fabricate.mould.assembly import mould_body
 from padforge.fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan
 from padforge.fabricate.mould.planning.depth_levels import fibre_levels
 from padforge.fabricate.mould.planning.numerals import number_strokes
 from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
-
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 

@@ -9,7 +9,8 @@ import shapely
 from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.checks.plan_checks import check_plan, meshed
 from padforge.fabricate.dispensing.course import laying_steps, turned_over

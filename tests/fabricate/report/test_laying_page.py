@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
-from padforge.design.pad.morphology import Morphology
+from scipy.integrate import quad
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.export import build
 from padforge.fabricate.mould.assembly import plan_mesh
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.laying import guide, orientation, print_settings
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
-from scipy.integrate import quad
-
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 

@@ -6,12 +6,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.laying.orientation import TURN_DEG, orientation_svg, sentence
 from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
-
 from tests.fabricate.planted import with_settings
 
 SVG, XLINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}"

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from padforge.design.common.figures import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
-from padforge.design.pad.morphology import Morphology
+from PIL import Image
+
+from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
+from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.findings import Finding, as_places
 from padforge.fabricate.mould.assembly import plan_mesh
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.fibre_layers import layers
 from padforge.fabricate.report.pictures import CARE, draw_findings, draw_mould, draw_tracks
 from padforge.fabricate.report.relief import FLOOR, NUMBER, RIDGE, WALL, mesh_relief, mould_relief
-from PIL import Image
-
 from tests.fabricate.planted import level_pad, with_settings
 
 PLAN = Plan(level_pad(1.8, 1.2))

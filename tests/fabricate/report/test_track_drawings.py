@@ -14,13 +14,13 @@ import pytest
 import shapely
 from ezdxf.document import Drawing
 from ezdxf.entities import LWPolyline
-from padforge.design.pad.morphology import Morphology
+from scipy.interpolate import PchipInterpolator
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.mould.plan import Plan
 from padforge.fabricate.report.fibre_layers import layers
 from padforge.fabricate.report.laying.orientation import sentence
 from padforge.fabricate.report.track_drawings import tracks_dxf, tracks_svg
-from scipy.interpolate import PchipInterpolator
-
 from tests.fabricate.planted import level_pad, with_settings
 
 PAD = Morphology.random(3, 3, seed=7)
@@ -191,7 +191,7 @@ def test_dxf_is_sound_and_complete(tmp_path):
 @pytest.mark.slow
 def test_dxf_is_the_same_in_every_process():
     script = (
-        "import sys; from padforge.design.pad.morphology import Morphology; from padforge.fabricate.mould.plan import Plan;"
+        "import sys; from padforge.design.morphology import Morphology; from padforge.fabricate.mould.plan import Plan;"
         " from padforge.fabricate.report import track_drawings; assert 'ezdxf' not in sys.modules;"
         " sys.stdout.write(track_drawings.tracks_dxf(Plan(Morphology.random(3, 3, seed=7))))"
     )

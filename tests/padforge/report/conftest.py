@@ -4,12 +4,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from padforge.design.common.figures import save_figure
+
 from padforge.design.common.files import provenance
-from padforge.design.report.plan_drawing import draw_plan
+from padforge.design.common.plotting import save_figure
+from padforge.design.plan_drawing import draw_plan
 from padforge.design.settings import Contact
 from padforge.fabricate import build
-
 from padforge.report import write_report
 from tests.padforge.report.documents import (
     PAD,

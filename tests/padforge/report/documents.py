@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+
 from padforge.design.common.files import provenance
-from padforge.design.pad.morphology import Morphology
+from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 HOSTILE = '</script><img src="x" onerror="document.title=1"> & <b>'

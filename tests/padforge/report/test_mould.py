@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from padforge.fabricate.report.mould_view import Packed, packed
 
+from padforge.fabricate.report.mould_view import Packed, packed
 from padforge.report import write_report
 from tests.helpers.chromium import SOFTWARE_GL, Chromium
 

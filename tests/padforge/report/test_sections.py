@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from markupsafe import escape
-from padforge.design.common.errors import Fault, InputError
+
 from padforge.design.common.files import provenance
-from padforge.design.pad.morphology import Morphology
-from padforge.design.report.contact_section import contact_line
+from padforge.design.common.validation import Fault, InputError
+from padforge.design.contact_comparison import contact_line
+from padforge.design.morphology import Morphology
 from padforge.fabricate import build
+from padforge.report import write_report
 from padforge.sense.recordings.recorder import Recorder
 from padforge.sense.recordings.recording import Recording
-
-from padforge.report import write_report
 from tests.padforge.report.documents import (
     HOSTILE,
     PAD,

@@ -7,13 +7,13 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+
+from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.settings import Spec
 from padforge.sense.cli.calibration import run_calibration
 from padforge.sense.health import fibre_prediction
 from padforge.sense.rig.operation import record_simulated
-
-from padforge.cli import main
 from tests.helpers.once import Once
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"

@@ -3,9 +3,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 import padforge.sense.cli.calibration
 import padforge.sense.report.calibration_figures
-import pytest
 from padforge.sense.localizer.calibration import fine_tuning
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+
 from padforge.sense import Localizer, Recording
 from padforge.sense.cli.live import view_lines
 from padforge.sense.live.page_server import LivePage
 from padforge.sense.live.streams import messages
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.rig.emulators import live_pad
-
 from tests.sense.live.conftest import first_presses
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.sense import Localizer, Recording
 from padforge.sense.localizer.locating import locate
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import scipy.io
 from mcap.reader import make_reader
+
 from padforge.sense import Recording, export_csv
 
 

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
 from padforge.design.common.files import sha256
-from padforge.design.pad.twin import TwinChannel
+from padforge.design.twin import TwinChannel
 from padforge.sense import Recording
 from padforge.sense.live.page_server import LivePage
 from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.settings import RigSettings
-from padforge.sense.twin.benchmark import printed_pad
 
 ROWS = """
 import noise.mat --out r                        | noise.mat

@@ -8,6 +8,8 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+
+from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
@@ -15,8 +17,6 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.rig import operation
 from padforge.sense.settings import RigSettings
-from padforge.sense.twin.benchmark import printed_pad
-
 from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 

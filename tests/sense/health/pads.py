@@ -5,6 +5,7 @@ from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
+
 from padforge.sense import Recording
 from padforge.sense.health import fibre_prediction, learning
 from padforge.sense.health.health_model import HealthModel

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
+from scipy.stats import t as student
+
 from padforge.sense.health import fault_likelihoods
 from padforge.sense.health.alarm_thresholds import Tail, climb
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, FaultLikelihoods, noise_of
 from padforge.sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE
-from scipy.stats import t as student
-
 from tests.sense.health.pads import Array
 
 PRESSES, FIBRES = 5, 3

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+
 from padforge.sense.health import fibre_prediction
 from padforge.sense.health.fibre_prediction import (
     COMPONENTS,

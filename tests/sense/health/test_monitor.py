@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from padforge.design import Morphology
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense import Localizer, Recording, open_recording
 from padforge.sense import settings as sense_settings
@@ -19,7 +20,6 @@ from padforge.sense.health.monitor import TEXTS, FibreFault, Monitor, examine, f
 from padforge.sense.health.schema import LEAST_PRESSES
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V
 from padforge.sense.recordings.simulation.published_protocol import simulate
-
 from tests.sense.health.pads import BAD_FROM, LEARNT, PRESSES, faulty, later, learn, spoilt
 
 FEW = 320

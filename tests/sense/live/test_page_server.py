@@ -10,10 +10,10 @@ from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 
 import pytest
-from padforge.design.common.page.local_page import local_page
-from padforge.design.common.page.local_page.listening import HOST
-from padforge.sense.live.page_server import LivePage
 
+from padforge.design.common import server as local_page
+from padforge.design.common.server import HOST
+from padforge.sense.live.page_server import LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'

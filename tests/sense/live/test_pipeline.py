@@ -6,17 +6,17 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import padforge.sense.live.pipeline
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
+import padforge.sense.live.pipeline
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, locate
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.live.pipeline import Estimate, Live
 from padforge.sense.live.press_buffer import HISTORY, SLACK, Press
 from padforge.sense.recordings.processing.press_detection import Event
-
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
 

@@ -4,10 +4,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-import padforge.sense.live.sources
 import pytest
+
+import padforge.sense.live.sources
 from padforge.design import Morphology
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
 from padforge.sense import Recording
 from padforge.sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
@@ -16,7 +17,6 @@ from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.emulators.live_pad import SimulatedConverter
 from padforge.sense.settings import RigSettings
-
 from tests.sense.rig.devices.fakes import Time
 
 

@@ -15,8 +15,9 @@ from typing import IO
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
-from padforge.design.common.page.local_page import listening
+
+from padforge.design.common import server as listening
+from padforge.design.common.validation import InputError
 from padforge.sense import Live, Localizer, Recording
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.live.pipeline import Estimate

@@ -1,8 +1,9 @@
 """The localizer bench: it holds every way, and its networks are those they stand for. No times are asserted."""
 
 import pytest
-from padforge.design.benchmarking import harness
-from padforge.sense.localizer.calibration import benchmark as bench
+
+from padforge.benchmarks import harness
+from padforge.benchmarks import localizer as bench
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, evaluate, import_mat, locate
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.localizer.calibration.calibration import learnable, left_out, proven, split_presses

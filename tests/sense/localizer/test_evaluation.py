@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.localizer.evaluation import by_place, conformal, error_row, errors_by_loss, idle_share
 from padforge.sense.localizer.localizer import Found, Measured

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, evaluate
 from padforge.sense.localizer.calibration import fibre_loss_study as loss_study
 from padforge.sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
 from padforge.sense.report import fibre_loss_figure
 from padforge.sense.settings import LocalizerSettings as Options
-
 from tests.helpers.door import Ended, call
 
 

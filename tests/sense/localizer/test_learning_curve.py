@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
 from padforge.sense.settings import LocalizerSettings as Options
-
 from tests.helpers.door import called
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)

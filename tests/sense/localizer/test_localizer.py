@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording
 from padforge.sense.localizer.localizer import UNKNOWN, Found, Measured, joined
 from padforge.sense.localizer.locating import write_places

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
-from padforge.sense import Localizer, Recording
 
+from padforge.design.common.validation import InputError
+from padforge.sense import Localizer, Recording
 from tools.kills import killed
 
 Change = Callable[[Any], dict[str, Any]]

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, evaluate
 from padforge.sense.localizer.calibration import fine_tuning
 from padforge.sense.localizer.calibration.affine_correction import fit_correction
@@ -17,7 +18,6 @@ from padforge.sense.localizer.calibration.recalibration import CrossValidation, 
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.localizer.localizer import Found
 from padforge.sense.localizer.response.response_model import looked_up
-
 from tests.helpers.door import called
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])

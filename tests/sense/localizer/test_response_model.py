@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses, as_unseen
 from padforge.sense.localizer.response.response_model import RIDGE_HISTORY, STEPS, ResponseModel, looked_up, settled
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.localizer import network
 from padforge.sense.localizer.calibration import training
 from padforge.sense.localizer.calibration.networks import masked_network

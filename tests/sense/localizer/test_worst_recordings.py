@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, evaluate, locate, recalibrate
 from padforge.sense.localizer.calibration import fine_tuning
 from padforge.sense.localizer.features import FEATURES
 from padforge.sense.localizer.response.response_model import ResponseModel
 from padforge.sense.settings import LocalizerSettings
-
 from tests.sense.health.pads import faulty
 
 TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, lost=2, test_share=0.3)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.design import Morphology
 from padforge.sense import Recording, RigSettings, simulate
 from padforge.sense.recordings.formats.ros.exporting import export_bag

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.block_file import BlockWriter, block_dtype, read_blocks
 
 

@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from padforge.design.common.errors import InputError
+from PIL import Image
+
+from padforge.design.common.validation import InputError
 from padforge.sense import (
     Recorder,
     Recording,
@@ -22,7 +24,6 @@ from padforge.sense import (
 )
 from padforge.sense.cli.main import sense
 from padforge.sense.recordings.import_export import arm_states, export_file
-from PIL import Image
 
 
 @pytest.mark.parametrize("name", ["run", "run.csv", "run.h5", "run.mcap"])

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology
 from padforge.design.common.settings import validated
 from padforge.design.settings import PadSettings

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording
 
 

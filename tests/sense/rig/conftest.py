@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
+
 from padforge.sense.rig.arms.ur5.driver import UR5
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.rig.emulators import whole_rig

@@ -9,11 +9,11 @@ from unittest import mock
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from padforge.sense.rig import safety
 from padforge.sense.rig.devices.protocols import ArmState, Pose, RigFault
 from padforge.sense.rig.safety import Limits, Vector, require_safe, tilt_deg, wait_until_still, watch
 from padforge.sense.settings import RigSettings
-
 from tests.sense.rig.devices.fakes import Time
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)

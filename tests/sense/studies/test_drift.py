@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology
 from padforge.sense import Recording, open_recording
 from padforge.sense.recordings.simulation.published_protocol import simulate

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology
-from padforge.design.pad.indentation import Indenter
+from padforge.design.indentation import Indenter
 from padforge.sense.studies.indentation.force import COUNTS, Learning, force_study, readings
 from padforge.sense.studies.indentation.shape import FOOTPRINTS, SETS, circumradius, shape_study
 from padforge.sense.studies.study import run

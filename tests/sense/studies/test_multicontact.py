@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+
 from padforge.design import Morphology, signals
-from padforge.design.common.computing import one_torch_thread
+from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.studies.multicontact.pairs import (
     LABELLED,
     WAYS,

@@ -11,6 +11,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+
 from padforge.design import Contact, Morphology
 from padforge.sense.studies import robustness
 from padforge.sense.studies.pads import load_pads

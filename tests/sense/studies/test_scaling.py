@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology, signals
 from padforge.sense.studies import scaling, sensitivity
 from padforge.sense.studies.scaling import around, scaling_study, shares, spread_presses

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+
 from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings
-from padforge.design.optimisers.search import SearchResult
+from padforge.design.optimize.search import SearchResult
 from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.settings import RigSettings
 from padforge.sense.studies import scaling, sensitivity
@@ -25,7 +26,6 @@ from padforge.sense.studies.multicontact.study import multicontact_study
 from padforge.sense.studies.pads import described, load_pads
 from padforge.sense.studies.robustness import robustness_study
 from padforge.sense.studies.study import Findings, Study, Task, run, study_lines
-
 from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
@@ -217,7 +217,7 @@ def test_pads_are_searched_for_with_so_many_knots_by_either_method(monkeypatch: 
         asked.append((pad.grid, settings.method, settings.knots, settings.seed))
         return SearchResult(Morphology.straight(pad.grid), {}, [], "start 1", {})
 
-    monkeypatch.setattr("padforge.design.optimisers.search.search", remembered)
+    monkeypatch.setattr("padforge.design.optimize.search.search", remembered)
     names = ("optimised", "optimised-5", "genetic-1@2", "optimised-30@3")
     assert tuple(load_pads(names, seed=4)) == names
     assert asked == [(4, "descent", 21, 4), (4, "descent", 5, 4), (2, "genetic", 1, 4), (3, "descent", 30, 4)]

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+
+from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
-from padforge.design.pad.twin import Twin
-from padforge.sense.twin.benchmark import printed_pad
+from padforge.design.twin import Twin
 from padforge.sense.twin.responses import Responses
 
 PLAN = Morphology.random(2, knots=3, seed=5)

@@ -1,8 +1,9 @@
 """The twin bench: it holds every way, and judges what it was told to. No times are asserted."""
 
 import pytest
-from padforge.design.benchmarking import harness
-from padforge.sense.twin import benchmark as bench
+
+from padforge.benchmarks import harness
+from padforge.benchmarks import twin as bench
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from padforge.sense.twin.fitting import Freedom, fit
 from padforge.sense.twin.laid_pad import AWAY, COUNTS, LaidPad, Plan
 from padforge.sense.twin.responses import Responses

@@ -8,15 +8,16 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+
+from padforge.benchmarks.twin import printed_pad
 from padforge.design import InputError, Morphology
-from padforge.design.pad.twin import Twin
 from padforge.design.settings import PadSettings
+from padforge.design.twin import Twin
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.report.identification_results import identification_lines
 from padforge.sense.settings import RigSettings
 from padforge.sense.twin import identification, wiring
-from padforge.sense.twin.benchmark import printed_pad
 from padforge.sense.twin.identification import identify
 from padforge.sense.twin.identified_pad import Identification
 

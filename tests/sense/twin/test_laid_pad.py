@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from padforge.design.pad.twin import Frame
+
+from padforge.design.twin import Frame
 from padforge.sense.twin.kernels.response import along_fibre, channel_response
 from padforge.sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, Plan, own_values
 from padforge.sense.twin.responses import Responses

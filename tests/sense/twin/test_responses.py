@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from padforge.design import Morphology, Twin
-from padforge.design.pad.twin import TwinReadings
+from padforge.design.twin import TwinReadings
 from padforge.sense import Recording, RigSettings, simulate
 from padforge.sense.twin.responses import information, of_one_depth, responses
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from padforge.fabricate.mould.plan import polygon_rings
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from padforge.fabricate.mould.plan import polygon_rings
 
 from .drawing import GRID_MM, Drawing, Edge, Vertex, edges
 from .pieces import Piece

@@ -10,8 +10,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from padforge.fabricate.mould.plan import polygon_rings
 from shapely.geometry.base import BaseGeometry
+
+from padforge.fabricate.mould.plan import polygon_rings
 
 from .pieces import Piece
 

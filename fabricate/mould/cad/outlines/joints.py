@@ -3,9 +3,10 @@
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from padforge.design.pad.courses.curves import slopes
-from padforge.fabricate.mould.plan import Plan, polygon_rings
 from shapely.geometry.base import BaseGeometry
+
+from padforge.design.paths.curves import slopes
+from padforge.fabricate.mould.plan import Plan, polygon_rings
 
 Array = NDArray[np.float64]
 Joints = dict[tuple[float, float], Array]

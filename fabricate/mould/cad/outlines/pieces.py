@@ -15,9 +15,10 @@ from itertools import pairwise
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from padforge.fabricate.mould.plan import polygon_rings
 from scipy.interpolate import BSpline
 from shapely.geometry.base import BaseGeometry
+
+from padforge.fabricate.mould.plan import polygon_rings
 
 from .joints import Joints
 from .splines import breaks, lengths, spline, stretch

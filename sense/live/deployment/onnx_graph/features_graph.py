@@ -1,10 +1,11 @@
-"""What `padforge.sense.localizer.features` computes, as nodes of an ONNX graph: from readings to the windows of presses."""
+"""What `sense.localizer.features` computes, as nodes of an ONNX graph: from readings to the windows of presses."""
 
 from typing import Any
 
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
+
 from padforge.sense.localizer import features
 from padforge.sense.localizer.features import DOWN, MEDIAN, PAST, REST, SIZES, SLOW, SLOW_SAMPLES, UP, Window
 from padforge.sense.recordings.processing.limits import Array

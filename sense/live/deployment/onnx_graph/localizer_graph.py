@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import onnx
 from onnx import TensorProto, helper
+
 from padforge.sense.localizer.features import SIZES
 from padforge.sense.localizer.localizer import UNKNOWN, Localizer
 from padforge.sense.localizer.locating import MEASURED

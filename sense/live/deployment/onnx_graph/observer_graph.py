@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 from onnx import TensorProto
+
 from padforge.sense.localizer.response.observer import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, Observer
 
 from .features_graph import END, GraphNodes

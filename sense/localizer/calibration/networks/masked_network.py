@@ -1,12 +1,13 @@
-"""The masked network in torch, for training it: what `padforge.sense.localizer.network` computes in NumPy, and first weights."""
+"""The masked network in torch, for training it: what `sense.localizer.network` computes in NumPy, and first weights."""
 
 import torch
+from torch import Tensor
+from torch.nn import functional
+
 from padforge.sense import settings
 from padforge.sense.localizer.network import EPSILON, OUTPUTS
 from padforge.sense.localizer.response.observer import Observer
 from padforge.sense.localizer.response.response_model import looked_up
-from torch import Tensor
-from torch.nn import functional
 
 WHOLE = 0.25
 """Share of training presses that keep all fibres; the others lose 1 .. `lost`, each as often."""

@@ -1,11 +1,12 @@
 """The published localizer as a preset: 50 tanh neurons trained by Levenberg-Marquardt.
 
 It knows no lost fibres; the published way is to train another network for every set of them (`fibre_loss_study`). Set
-torch to one thread: see `padforge.design.evaluation.levenberg_marquardt`.
+torch to one thread: see `padforge.design.networks`.
 """
 
 import numpy as np
-from padforge.design.evaluation.levenberg_marquardt import fit
+
+from padforge.design.networks import fit
 from padforge.sense.localizer.network import Weights
 
 from .training_presses import TrainingPresses

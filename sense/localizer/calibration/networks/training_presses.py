@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from padforge.sense.localizer.response.response_model import leverages, looked_up
 from padforge.sense.recordings.processing.limits import Floats, Mask
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from padforge.sense.recordings.formats.model_findings import ModelFindings
 from padforge.sense.recordings.recording import Recording
 

@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError, real
+
+from padforge.design.common.validation import InputError, real
 from padforge.sense.recordings.processing.limits import MAX_S, Array
 from padforge.sense.recordings.recording import Recording
 

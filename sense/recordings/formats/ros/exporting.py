@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError
+
 from padforge.design.common.files import UNFINISHED, staged, writing
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.formats.model_findings import ModelFindings, export_path
 from padforge.sense.recordings.processing.limits import Array, as_numbers
 from padforge.sense.recordings.recorder import STATE_COLUMNS

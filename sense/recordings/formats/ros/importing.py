@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError, shown
+
+from padforge.design.common.validation import InputError, shown
 from padforge.sense.recordings.formats.assembly import assembled
 from padforge.sense.recordings.formats.mapping import (
     MILLIMETRES,

@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-from padforge.design.common.computing import forget_outdated
+from padforge.design.common.parallel import forget_outdated
 
 forget_outdated(Path(__file__).parent)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+
 from padforge.sense.recordings.recorder import STATE_COLUMNS
 from padforge.sense.rig.devices.protocols import ArmState, Array, Pose, RigFault
 from padforge.sense.rig.safety import require_numbers

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+
 from padforge.sense.recordings.recorder import STATE_COLUMNS
 from padforge.sense.rig.devices.protocols import ArmState, Array, RigFault
 from padforge.sense.rig.safety import require_numbers

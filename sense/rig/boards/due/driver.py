@@ -5,7 +5,8 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.rig.boards.block_reader import BlockReader
 from padforge.sense.rig.boards.inputs import chosen_inputs
 from padforge.sense.rig.boards.sample_clock import SampleClock

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from padforge.sense.rig.boards.block_reader import BlockReader
 from padforge.sense.rig.boards.byte_stream import ByteStream
 from padforge.sense.rig.boards.inputs import chosen_inputs

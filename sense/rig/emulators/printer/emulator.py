@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.rig.arms.printer.motion import Place
 from padforge.sense.rig.emulators.serial_device import SerialDevice

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+
 from padforge.sense.rig.arms.ur5.rtde_frames import PAUSED, PLAYING, RUNNING, STOPPED
 
 from .motion import Array, Motion

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from numpy.typing import ArrayLike
+
 from padforge.design.common.files import unfinished_file
 from padforge.sense.rig.devices.processes import start
 from padforge.sense.rig.devices.protocols import Array, Pose, RigFault

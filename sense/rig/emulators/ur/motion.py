@@ -3,6 +3,7 @@
 from typing import Protocol
 
 import numpy as np
+
 from padforge.sense.recordings.processing.limits import Array
 
 

@@ -1,6 +1,6 @@
 """Process of the UR emulator: its sockets, its clock, and the faults its parent switches on.
 
-Run as `python -m padforge.sense.rig.emulators.ur.server`; orders and answers are lines of JSON on stdin and stdout, and the end
+`python -m padforge.sense.rig.emulators.ur.server`; orders and answers are JSON lines on stdin and stdout, and the end
 of stdin ends it. The clock catches up on cycles the process has slept through, so that the stream has no gap.
 """
 
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from padforge.sense.rig.arms.ur5 import rtde_frames as frames
 
 from .controller import RATES_HZ, VERSIONS, Controller, Series, SpringySurface

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+
 from padforge.sense.recordings.processing.limits import Array, Indices
 
 COLUMNS = 8

@@ -12,17 +12,17 @@ from build123d import Compound, GeomType, Solid, import_step
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure
-from padforge.design.common.errors import InputError
-from padforge.design.pad.courses.curves import lengths
-from padforge.design.pad.morphology import Morphology
+from scipy.spatial import KDTree
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.design.paths.curves import lengths
 from padforge.fabricate.mould.assembly import conductive_plan, holder_body, lid_body, mould_body, well_outlines
 from padforge.fabricate.mould.cad import model as of_model
 from padforge.fabricate.mould.cad.model import FITS_MM, Model, assembly, body_model, build_mould, models, mould_model
 from padforge.fabricate.mould.cad.step_file import write_step
 from padforge.fabricate.mould.mesh import mesh
 from padforge.fabricate.mould.plan import Plan
-from scipy.spatial import KDTree
-
 from tests.fabricate.planted import exact_fibre, level_pad, mild_pad, winding_pad, with_settings
 
 PLAIN: dict[str, object] = {"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0}

@@ -8,14 +8,14 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.pad.morphology import Morphology
+from scipy.interpolate import BSpline, PchipInterpolator
+from scipy.spatial import KDTree
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.mould.cad.outlines.joints import joints, with_joints
 from padforge.fabricate.mould.cad.outlines.pieces import FINE_MM, Piece, arc_through, ring_pieces
 from padforge.fabricate.mould.cad.outlines.splines import MOST_SPANS, breaks, lengths, spline, stretch
 from padforge.fabricate.mould.plan import Plan, polygon_rings
-from scipy.interpolate import BSpline, PchipInterpolator
-from scipy.spatial import KDTree
-
 from tests.fabricate.planted import exact_fibre, with_settings
 
 Array = np.ndarray

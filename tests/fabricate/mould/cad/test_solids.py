@@ -10,7 +10,10 @@ import shapely
 from build123d import GeomType, Solid
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.pad.morphology import Morphology
+from scipy.special import ellipe
+from shapely.geometry.base import BaseGeometry
+
+from padforge.design.morphology import Morphology
 from padforge.fabricate.mould.assembly import holder_body, lid_body, pins, sizes
 from padforge.fabricate.mould.cad.bodies import body_solid, prism_solids
 from padforge.fabricate.mould.cad.layout import Span, Surface
@@ -21,9 +24,6 @@ from padforge.fabricate.mould.cad.walls import FLOOR, RIM, Walls
 from padforge.fabricate.mould.mesh import mesh as body_mesh
 from padforge.fabricate.mould.plan import Plan, polygon_rings
 from padforge.fabricate.mould.prisms import Body, Prism, cylinder
-from scipy.special import ellipe
-from shapely.geometry.base import BaseGeometry
-
 from tests.fabricate.planted import with_settings
 
 

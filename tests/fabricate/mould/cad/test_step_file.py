@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from build123d import Color, Compound, Cylinder, Location, Solid, Vector, export_step, import_step
+
 from padforge.fabricate.mould.cad.step_file import said_once, write_step
 
 HEAD = "ISO-10303-21;\nHEADER;\nFILE_NAME('a','2000-01-01T00:00:00',(''),(''),'','','');\nENDSEC;\n"

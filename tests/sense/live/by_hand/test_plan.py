@@ -7,8 +7,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+
 from padforge.design import Contact, Morphology
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
 from padforge.sense.live.by_hand.run_directory import opened
 from padforge.sense.live.by_hand.session import record_by_hand

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import padforge.sense.live.sources
 import pytest
 from numpy.typing import ArrayLike
+
+import padforge.sense.live.sources
 from padforge.design import Contact, Morphology
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.live.by_hand import session
 from padforge.sense.live.by_hand.session import record_by_hand
@@ -24,7 +25,6 @@ from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.emulators.finger import SCATTER_MM, Finger
 from padforge.sense.rig.planning.setup import Setup
 from padforge.sense.settings import RigSettings
-
 from tests.sense.conftest import QUICK
 from tests.sense.rig.devices.fakes import Time
 

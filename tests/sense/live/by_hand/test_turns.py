@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from padforge.sense.live.by_hand.judging import BACK, LEARNT, Judge, answers
 from padforge.sense.live.by_hand.turns import SEEN_S, SETTLE_S, Turns
 

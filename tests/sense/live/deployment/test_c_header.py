@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.live.deployment import streaming
 from padforge.sense.live.deployment.budget import CODE, Budget, state_bytes, table_bytes
 from padforge.sense.live.deployment.c_header import c_header
-
 from tests.sense.live.deployment.conftest import BUDGET, Told, compiled, program_of, tutorial
 
 OFF_MM = 1e-3

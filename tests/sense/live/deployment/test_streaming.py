@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from padforge.sense import Recording
 from padforge.sense.live.deployment.kernels import press_stream
 from padforge.sense.live.deployment.streaming import POLES, Detector, commanded, held, owners, seen

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, LocalizerSettings, Recording, calibrate
 from padforge.sense.live.deployment import student as students
 from padforge.sense.live.deployment.budget import CODE, STEP, Budget, state_bytes, table_bytes, widest
 from padforge.sense.live.deployment.student import Student, as_int8, examine, split, teach
 from padforge.sense.localizer.calibration import training as trainings
 from padforge.sense.recordings.import_export import open_recording
-
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recordings.formats.assembly import FOUND, assembled
 from padforge.sense.recordings.formats.mapping import Part

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording, export_csv, import_csv
 from padforge.sense.recordings.formats import csv_table
 from padforge.sense.recordings.press_plan import read_plan

@@ -8,7 +8,8 @@ import pytest
 import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, open_recording
 from padforge.sense.recordings.import_export import import_file
 

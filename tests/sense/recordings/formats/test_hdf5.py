@@ -8,7 +8,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording, export_hdf5, import_hdf5, open_recording
 
 MAPPING = "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recordings.formats import lerobot
 from padforge.sense.recordings.formats.lerobot import export_lerobot

@@ -1,7 +1,8 @@
 """Mappings: what they name, and what they leave to guess."""
 
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.recordings.formats.mapping import Part, chosen, parse_mapping
 
 NAMES = ["t_ms", "Time [s]", "ch1", "ch2", "a,b", "a:b", "px", "py", "contact"]

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.io
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import import_mat
 
 MAT = "para5_long_first4500.mat"

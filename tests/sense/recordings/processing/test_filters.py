@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from padforge.design.common.errors import InputError
+
+from padforge.benchmarks.filter import fibre, iterated, linear_program
+from padforge.design.common.validation import InputError
 from padforge.sense import TotalVariation, open_recording, running_median, total_variation
-from padforge.sense.recordings.processing.benchmark import fibre, iterated, linear_program
 from padforge.sense.recordings.processing.filters import stretches
 
 STEP_V = 3.3 / 1023

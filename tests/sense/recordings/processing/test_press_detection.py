@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.design import Morphology
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 from padforge.design.settings import Counts
 from padforge.sense import Recording, RigSettings, import_mat, simulate
 from padforge.sense.recordings.processing.press_alignment import as_detected

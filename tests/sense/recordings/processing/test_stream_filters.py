@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import RunningMedian, TotalVariation, running_median, total_variation
 
 VALUES = st.one_of(st.integers(-3, 3).map(float), st.floats(-10, 10), st.just(np.nan))

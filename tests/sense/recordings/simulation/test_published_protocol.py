@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology, signals, signals_quantized
-from padforge.design.pad.contact import relative_stretch
+from padforge.design.contact import relative_stretch
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 from padforge.sense import RigSettings, simulate
 from padforge.sense.recordings.simulation.pad_model import (

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.design import Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Localizer, Recording, calibrate, evaluate, locate

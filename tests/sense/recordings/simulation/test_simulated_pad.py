@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from padforge.design import InputError, Morphology, Twin
-from padforge.design.pad.contact import relative_stretch
-from padforge.design.pad.twin import Frame, TwinChannel, TwinReadings
+from padforge.design.contact import relative_stretch
+from padforge.design.twin import Frame, TwinChannel, TwinReadings
 from padforge.sense import Recording, RigSettings, simulate
 from padforge.sense.recordings.simulation.simulated_pad import measured
 from padforge.sense.recordings.simulation.strengths import strengths

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.rig.boards import block_reader
 from padforge.sense.rig.boards.due import driver as due_driver
 from padforge.sense.rig.boards.due.driver import Arduino
@@ -20,7 +21,6 @@ from padforge.sense.rig.boards.line.framing import Header
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.emulators.due_board import EmulatedBoard
 from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
-
 from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from padforge.sense.rig.boards.sample_clock import SampleClock
 from scipy.optimize import linprog
+
+from padforge.sense.rig.boards.sample_clock import SampleClock
 
 SETTLE_S = 0.5
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recordings.recorder import STATE_COLUMNS

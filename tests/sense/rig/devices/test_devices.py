@@ -8,7 +8,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense.rig.arms.ur5.driver import UR5
 from padforge.sense.rig.boards.due import serial_link as due_link
 from padforge.sense.rig.boards.due.driver import Arduino

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+
 from padforge.design import Contact, Morphology
 from padforge.sense.rig.emulators.finger import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, Stroke
 from padforge.sense.settings import RigSettings

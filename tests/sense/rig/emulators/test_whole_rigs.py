@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recordings.press_journal import read_journal
@@ -32,8 +34,6 @@ from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.rig.session.press_loop import Report, Session
 from padforge.sense.rig.session.retreat import HEIGHT_MM
 from padforge.sense.settings import RigSettings
-
-from padforge.cli import main
 
 pytest.importorskip("rtde_control")
 pytest.importorskip("serial")

@@ -1,4 +1,5 @@
 import numpy as np
+
 from padforge.sense.localizer.calibration.calibration import calibrate
 from padforge.sense.recordings.press_plan import PressPlan, planned
 from padforge.sense.recordings.recorder import Recorder
@@ -6,7 +7,6 @@ from padforge.sense.recordings.recording import Recording
 from padforge.sense.rig.planning.adaptive_plan import EVERY, Steering, uncertainty
 from padforge.sense.rig.session.press_loop import Session
 from padforge.sense.settings import LocalizerSettings
-
 from tests.sense.rig.devices.fakes import FIBRES, PAD, RIG, FakeArm, FakeConverter, Time
 
 

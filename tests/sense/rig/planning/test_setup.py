@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
-from padforge.design.pad.morphology import Morphology
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 from padforge.sense.recordings.press_plan import planned
 from padforge.sense.recordings.recorder import START

@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+
 from padforge.sense.rig.session.disk_thread import DiskThread
 
 

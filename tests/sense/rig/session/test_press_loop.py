@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.recordings.press_journal import read_journal
 from padforge.sense.recordings.press_plan import PressPlan
 from padforge.sense.recordings.recorder import Recorder
@@ -15,7 +16,6 @@ from padforge.sense.recordings.recording import Recording
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.session.averaging import Averager
 from padforge.sense.rig.session.press_loop import Session, require_safe_plan
-
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))

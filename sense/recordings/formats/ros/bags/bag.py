@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from padforge.design.common.errors import InputError, shown
+
+from padforge.design.common.validation import InputError, shown
 
 MOST_CHUNK_BYTES = 2**26
 """Most that one chunk may hold, unpacked; recorders make them of 1 to 4 MiB."""

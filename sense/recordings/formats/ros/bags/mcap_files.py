@@ -4,7 +4,7 @@ import struct
 import zlib
 from typing import BinaryIO
 
-from padforge.design.common.errors import InputError, shown
+from padforge.design.common.validation import InputError, shown
 
 from .bag import CUT, MOST_CHUNK_BYTES, Bag, Topic
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from padforge.design.common.errors import InputError
 from padforge.design.common.files import read_bytes, require_file
+from padforge.design.common.validation import InputError
 
 from .bag import CUT, Bag, Topic
 from .mcap_files import read_mcap

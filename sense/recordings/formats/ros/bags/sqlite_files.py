@@ -5,7 +5,7 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
-from padforge.design.common.errors import InputError
+from padforge.design.common.validation import InputError
 
 from .bag import MOST_BYTES, Bag
 

@@ -12,7 +12,8 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
-from padforge.design.common.errors import InputError
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording, import_bag
 from padforge.sense.recordings.formats.ros.bags import bag as limits
 

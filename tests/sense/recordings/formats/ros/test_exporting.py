@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from padforge.design.common.errors import InputError
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recordings.formats.model_findings import FaultFound, ModelFindings
 from padforge.sense.recordings.formats.ros import exporting
 from padforge.sense.recordings.formats.ros.exporting import export_bag
 from padforge.sense.recordings.formats.ros.importing import import_bag
 from padforge.sense.recordings.import_export import export_file
-from rosbags.interfaces import QosDurability
-from rosbags.rosbag2 import Reader
 
 
 def others_read(path: Path) -> tuple[dict[str, list[tuple[int, Any]]], dict[str, str]]:

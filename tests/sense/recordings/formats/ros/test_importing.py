@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from padforge.design.common.errors import InputError
+from rosbags.rosbag2 import Reader
+
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording, open_recording
 from padforge.sense.recordings.formats.ros.exporting import export_bag
 from padforge.sense.recordings.formats.ros.importing import import_bag
 from padforge.sense.recordings.import_export import import_file
-from rosbags.rosbag2 import Reader
 
 from .foreign import STORE, Message, array, make, pose, wrench, write_bag
 

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+
 from padforge.sense.rig.arms.printer import marlin
 from padforge.sense.rig.arms.printer.motion import StraightMove
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from padforge.sense.rig.arms.printer import marlin
 from padforge.sense.rig.arms.printer.driver import Printer
 from padforge.sense.rig.arms.printer.link import MarlinLink
@@ -17,7 +18,6 @@ from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
 from padforge.sense.rig.emulators.printer import firmware
 from padforge.sense.rig.emulators.printer.emulator import EmulatedPrinter
 from padforge.sense.settings import RigSettings
-
 from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")

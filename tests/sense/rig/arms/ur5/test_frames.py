@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.rig.arms.ur5 import messages
 from padforge.sense.rig.arms.ur5 import rtde_frames as frames
 from padforge.sense.rig.arms.ur5.rtde_reader import VARIABLES, HostClock, RtdeReader

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+
 from padforge.sense.recordings.recorder import STATE_COLUMNS
 from padforge.sense.rig.arms.ur5 import driver as ur5
 from padforge.sense.rig.arms.ur5 import link as ur5_link

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.sense.rig.boards.due import framing
 from padforge.sense.rig.boards.due.framing import (
     Ack,
@@ -18,7 +19,6 @@ from padforge.sense.rig.boards.due.framing import (
     encode,
 )
 from padforge.sense.rig.emulators.due_board import judge_settings
-
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"

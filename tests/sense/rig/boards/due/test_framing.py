@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.rig.boards.due.driver import Assembler
 from padforge.sense.rig.boards.due.framing import (
     FULL_SCALE,

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.sense.rig.boards.line import framing
 from padforge.sense.rig.boards.line.driver import Assembler, Lines
 from padforge.sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line
 from padforge.sense.rig.devices.protocols import ConverterSamples
-
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"

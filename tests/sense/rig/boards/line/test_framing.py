@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from padforge.sense.rig.boards.line import framing
 from padforge.sense.rig.boards.line.driver import Assembler, Lines
 from padforge.sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from padforge.sense.rig.arms.ur5 import rtde_frames as ur_frames
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.rig.emulators.ur import controller as ur_controller

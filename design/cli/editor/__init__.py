@@ -1,1 +1,0 @@
-"""Drawing fibres by hand, in a browser of this machine."""

@@ -1,1 +1,0 @@
-"""Pages for the browsers of this machine, told of what happens as it happens."""

@@ -1,0 +1,421 @@
+"""The exact contact rule: integrals along PCHIP spans inside the press, no sampling.
+
+Frame: a fibre travels along t and moves across along v; both are taken from the press centre. A span is the cubic
+t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 in a parameter s whose zero is the point of the span abreast of the
+centre, so that small presses keep their relative accuracy.
+
+A polygon is two chains over t, upper and lower, linear between shared breakpoints; a circle is its own chain. PCHIP
+spans are monotone, so most pieces are taken or left whole by comparing ends; only where the fibre and a chain may
+meet are roots sought.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from padforge.design.kernels.geometry import (
+    EPS,
+    INVERSE,
+    MANHATTAN,
+    PROFILE,
+    SCRATCH,
+    UNIFORM,
+    in_frame,
+    roots_in_unit,
+    sort,
+    touched_range,
+    weigh,
+)
+from padforge.design.kernels.pchip import piece_of
+
+# G7-K15 nodes and weights on [-1, 1], positive half, the centre last; Gauss weights for every second node
+NODES = np.array(
+    [
+        0.991455371120812639206854697526329,
+        0.949107912342758524526189684047851,
+        0.864864423359769072789712788640926,
+        0.741531185599394439863864773280788,
+        0.586087235467691130294144691693013,
+        0.405845151377397166906606412076961,
+        0.207784955007898467600689403773245,
+        0.0,
+    ]
+)
+KRONROD = np.array(
+    [
+        0.022935322010529224963732008058970,
+        0.063092092629978553290700663189204,
+        0.104790010322250183839876322541518,
+        0.140653259715525918745189590510238,
+        0.169004726639267902826583426598550,
+        0.190350578064785409913256402421014,
+        0.204432940075298892414161999234649,
+        0.209482141084727828012999174891714,
+    ]
+)
+GAUSS = np.array(
+    [
+        0.129484966168869693270611432679082,
+        0.279705391489276667901467771423780,
+        0.381830050505118944950369775488975,
+        0.417959183673469387755102040816327,
+    ]
+)
+HALVINGS = 48
+PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
+"""To which a piece is integrated where it is no closed form, as a share; of a profile, as a share at weight 1."""
+PIECES, PATIENCE = 500, 100
+"""Beyond PIECES, what counts as precise doubles with every PATIENCE more: where rounding is all that is left, halving
+would never end."""
+
+
+@njit(cache=True, error_model="numpy")
+def across(span: Any, s: float) -> float:
+    """v at s."""
+    return span[2] + s * (span[3] + s * (span[4] + s * span[5]))
+
+
+@njit(cache=True, error_model="numpy")
+def _density(span: Any, s: float, law: Any) -> float:
+    """Weighted length per unit of s."""
+    rise = span[3] + s * (2 * span[4] + 3 * s * span[5])
+    run = span[1] + abs(rise) if law.length == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
+    if law.weight == UNIFORM:
+        return run
+    t, v = span[0] + span[1] * s, across(span, s)
+    return run * weigh(t * t + v * v, law)
+
+
+@njit(cache=True, error_model="numpy")
+def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
+    """15-point Kronrod integral over [a, b] and its error estimate (difference to 7-point Gauss, sharpened).
+
+    The estimate is a share of the integral, but for a profile, whose weights may cancel, of what it would be at weight
+    1; there it is the plain difference, as sharpening holds for smooth functions only, and splines bend at their knots.
+    """
+    middle, half = 0.5 * (a + b), 0.5 * (b - a)
+    centre = _density(span, middle, law)
+    fine, coarse = KRONROD[7] * centre, GAUSS[3] * centre
+    for i in range(7):
+        x = half * NODES[i]
+        pair = _density(span, middle - x, law) + _density(span, middle + x, law)
+        fine += KRONROD[i] * pair
+        if i % 2 == 1:
+            coarse += GAUSS[i // 2] * pair
+    if law.weight == PROFILE:
+        run = span[1] + abs(across(span, b) - across(span, a)) / (b - a)  # spans are monotone
+        return fine * half, abs(fine - coarse) / run
+    gap = abs(fine - coarse) / fine if fine > 0 else 0.0
+    return fine * half, min(1.0, (200 * gap) ** 1.5)
+
+
+@njit(cache=True, error_model="numpy")
+def precise(error: float, pieces: int, law: Any) -> bool:
+    """Whether a piece need not be halved, the `pieces`-th that is looked at."""
+    least = PROFILE_PRECISION if law.weight == PROFILE else PRECISION
+    return error <= least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
+
+
+@njit(cache=True, error_model="numpy")
+def length_element(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
+    """Integral of the density over a stretch [a, b] that lies wholly inside the press."""
+    if law.weight == UNIFORM and law.length == MANHATTAN:
+        mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
+        return (b - a) * (span[1] + abs(mean_rise))
+    total, pieces = 0.0, 0
+    stack[0, 0], stack[0, 1] = a, b
+    top = 0
+    while top >= 0:
+        low, high = stack[top]
+        part, error = kronrod(span, low, high, law)
+        pieces += 1
+        if precise(error, pieces, law) or top >= HALVINGS:
+            total += part
+            top -= 1
+        else:
+            middle = 0.5 * (low + high)
+            stack[top, 1] = middle
+            top += 1
+            stack[top, 0], stack[top, 1] = middle, high
+    return total
+
+
+_PROBES = (0.5, 0.22, 0.78)
+_CLEAR = 1e6  # tolerances a value must be away from zero to be believed without a second look
+
+
+@njit(cache=True, error_model="numpy")
+def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
+    """Append to out[count:] where the span crosses the circle of `radius` in (a, b), as parameters s."""
+    w = b - a
+    t0, t1 = span[0] + span[1] * a, span[1] * w
+    v0, v3 = across(span, a), span[5] * w**3
+    v1, v2 = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w, (span[4] + 3 * a * span[5]) * w * w
+    p[0] = (t0 - radius) * (t0 + radius) + v0 * v0
+    p[1] = 2 * (t0 * t1 + v0 * v1)
+    p[2] = t1 * t1 + v1 * v1 + 2 * v0 * v2
+    p[3] = 2 * (v0 * v3 + v1 * v2)
+    p[4] = v2 * v2 + 2 * v1 * v3
+    p[5] = 2 * v2 * v3
+    p[6] = v3 * v3
+    end = roots_in_unit(p, np.int64(6), 16 * EPS * radius * radius, out, count, work)
+    for i in range(count, end):
+        out[i] = a + w * out[i]
+    return end
+
+
+@njit(cache=True, error_model="numpy")
+def _line_roots(
+    span: Any, a: float, b: float, at_a: float, at_b: float, tolerance: float, out: Any, count: Any, work: Any, p: Any
+) -> int:
+    """Append to out[count:] where the span crosses a line that runs from `at_a` at s = a to `at_b` at s = b."""
+    w = b - a
+    p[0] = across(span, a) - at_a
+    p[1] = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w - (at_b - at_a)
+    p[2] = (span[4] + 3 * a * span[5]) * w * w
+    p[3] = span[5] * w**3
+    end = roots_in_unit(p, np.int64(3), tolerance, out, count, work)
+    for i in range(count, end):
+        out[i] = a + w * out[i]
+    return end
+
+
+@njit(cache=True, error_model="numpy")
+def _keep(stretches: Any, count: Any, begin: float, end: float) -> int:
+    """Append [begin, end] to stretches[:count], joined to the last one where they meet; returns the new count."""
+    if count > 0 and stretches[count - 1, 1] == begin:
+        stretches[count - 1, 1] = end
+        return count
+    stretches[count, 0], stretches[count, 1] = begin, end
+    return count + 1
+
+
+@njit(cache=True, error_model="numpy")
+def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> Any:
+    """`stretches_inside` of a circle."""
+    roots, work, p, _, stretches = scratch
+    count = circle_roots(span, a, b, radius, roots, np.int64(0), work, p)
+    found, begin = np.int64(0), a
+    for i in range(count + 1):
+        end = b if i == count else roots[i]
+        # no sign changes between roots, but a touch may lie there: the largest of three values has the sign
+        largest = 0.0
+        for share in _PROBES:
+            s = begin + share * (end - begin)
+            t, v = span[0] + span[1] * s, across(span, s)
+            depth = radius * radius - t * t - v * v
+            if abs(depth) > abs(largest):
+                largest = depth
+            if abs(largest) > _CLEAR * radius * tolerance:
+                break
+        if largest >= -2 * radius * tolerance:
+            found = _keep(stretches, found, begin, end)
+        begin = end
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _between_lines(
+    span: Any, here: float, after: float, lines: Any, near: Any, tolerance: float, found: Any, scratch: Any
+) -> Any:
+    """Append to the `found` stretches where the span is between two lines, upper and lower, that are near."""
+    roots, work, p, _, stretches = scratch
+    (u0, u1, l0, l1), count = lines, np.int64(0)
+    if near[0]:
+        count = _line_roots(span, here, after, u0, u1, tolerance, roots, count, work, p)
+    if near[1]:
+        count = _line_roots(span, here, after, l0, l1, tolerance, roots, count, work, p)
+    sort(roots, count)
+    begin = here
+    for i in range(count + 1):
+        end = after if i == count else roots[i]
+        above, below = 0.0, 0.0
+        for share in _PROBES:
+            s = begin + share * (end - begin)
+            x, at = (s - here) / (after - here), across(span, s)
+            to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
+            above = to_upper if abs(to_upper) > abs(above) else above
+            below = to_lower if abs(to_lower) > abs(below) else below
+            if min(abs(above), abs(below)) > _CLEAR * tolerance:
+                break
+        if above >= -tolerance and below >= -tolerance:
+            found = _keep(stretches, found, begin, end)
+        begin = end
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float, scratch: Any) -> Any:
+    """Stretches of [a, b] on which the span lies inside the press, ascending, into the last of `scratch`.
+
+    Args:
+        span: (6,) r, h, e0..e3.
+        shape: of `in_frame`; its chains are (3, B) breakpoints t, upper v, lower v of a polygon, B = 0 for a circle.
+        tolerance: how far outside still counts as on the boundary.
+        scratch: of `make_scratch`.
+
+    Returns:
+        How many stretches there are.
+    """
+    stretches = scratch[4]
+    (chains, reach, law), r, h = shape, span[0], span[1]
+    radius, inner = law.radius, reach[4]
+    # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
+    t0, t1, v, v1 = r + h * a, r + h * b, across(span, a), across(span, b)
+    far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v1))
+    if far_t * far_t + far_v * far_v < inner * inner:
+        return _keep(stretches, np.int64(0), a, b)
+    near_t, near_v = max(t0, -t1, 0.0), max(min(v, v1), -max(v, v1), 0.0)
+    if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
+        return 0
+    breaks, upper, lower = chains
+    last = len(breaks) - 1
+    a = max(a, ((-radius if last < 0 else breaks[0]) - r) / h)
+    b = min(b, ((radius if last < 0 else breaks[last]) - r) / h)
+    if b <= a:
+        return 0
+    if last < 0:
+        return _inside_circle(span, a, b, radius, tolerance, scratch)
+    found, here, v, k = np.int64(0), a, across(span, a), piece_of(r + h * a, breaks, last)
+    while here < b:
+        after = b if k == last - 1 else min(b, (breaks[k + 1] - r) / h)
+        if after <= here:
+            k += 1
+            continue
+        v_after, t0, t1 = across(span, after), r + h * here, r + h * after
+        far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v_after))
+        if far_t * far_t + far_v * far_v < inner * inner:  # as for the whole span: no chain is near
+            found, here, v, k = _keep(stretches, found, here, after), after, v_after, k + 1
+            continue
+        width = breaks[k + 1] - breaks[k]
+        x0, x1 = (t0 - breaks[k]) / width, (t1 - breaks[k]) / width
+        u0, u1 = upper[k] + (upper[k + 1] - upper[k]) * x0, upper[k] + (upper[k + 1] - upper[k]) * x1
+        l0, l1 = lower[k] + (lower[k + 1] - lower[k]) * x0, lower[k] + (lower[k + 1] - lower[k]) * x1
+        least, most = min(v, v_after), max(v, v_after)
+        if most <= min(u0, u1) and least >= max(l0, l1):
+            found = _keep(stretches, found, here, after)
+        elif least <= max(u0, u1) + tolerance and most >= min(l0, l1) - tolerance:
+            near = most >= min(u0, u1), least <= max(l0, l1)
+            found = _between_lines(span, here, after, (u0, u1, l0, l1), near, tolerance, found, scratch)
+        here, v = after, v_after
+        k += 1
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
+    """Signal of a stretch inside the press; the 1/d weight has a kink where it is cut off, which is split at."""
+    roots, work, p, stack, _ = scratch
+    if law.weight != INVERSE:
+        return length_element(span, a, b, law, stack)
+    count = circle_roots(span, a, b, law.radius / 100, roots, np.int64(0), work, p)
+    total, begin = 0.0, a
+    for i in range(count):
+        total += length_element(span, begin, roots[i], law, stack)
+        begin = roots[i]
+    return total + length_element(span, begin, b, law, stack)
+
+
+@njit(cache=True, error_model="numpy")
+def local_cubic(
+    t0: float, t1: float, v0: float, v1: float, d0: float, d1: float, ct: float, cv: float, out: Any
+) -> float:
+    """The span from knot (t0, v0) to (t1, v1) with end slopes d0, d1 about its point abreast of the centre (ct, cv).
+
+    Writes r, h, e0..e3 to out (6,) and returns the share s0 of the span before that point: s runs from -s0 to 1 - s0.
+    """
+    h, rise = t1 - t0, v1 - v0
+    s0 = min(max((ct - t0) / h, 0.0), 1.0)
+    a1, a2, a3 = h * d0, 3 * rise - h * (2 * d0 + d1), h * (d0 + d1) - 2 * rise
+    out[0] = 0.0 if 0 < s0 < 1 else (t0 - ct if s0 == 0 else t1 - ct)
+    out[1] = h
+    out[2] = (v0 - cv) + s0 * (a1 + s0 * (a2 + s0 * a3)) if s0 < 1 else v1 - cv
+    out[3] = a1 + s0 * (2 * a2 + 3 * s0 * a3)
+    out[4] = a2 + 3 * s0 * a3
+    out[5] = a3
+    return s0
+
+
+@njit(cache=True, error_model="numpy")
+def fibre_signal(
+    t: Any, v: Any, d: Any, ct: float, cv: float, shape: Any, span: Any, scratch: Any
+) -> tuple[float, int]:
+    """Signal of one fibre for the press at (ct, cv), and how many spans were looked at.
+
+    Args:
+        t, v, d: (n,) knots and slopes. shape: of `in_frame`; its extents (5,) are least and greatest t, least and
+            greatest v, radius of the circle inside.
+    """
+    _, reach, law = shape
+    n, begin, end = len(t), ct + reach[0], ct + reach[1]
+    if end <= t[0] or begin >= t[n - 1]:
+        return 0.0, 0
+    tolerance = 4 * EPS * (abs(cv) + law.radius)
+    total, visited, j = 0.0, 0, piece_of(begin, t, n)
+    while j < n - 1 and t[j] < end:
+        if min(v[j], v[j + 1]) <= cv + reach[3] + tolerance and max(v[j], v[j + 1]) >= cv + reach[2] - tolerance:
+            s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
+            for i in range(stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
+                total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], law, scratch)
+            visited += 1
+        j += 1
+    return total, visited
+
+
+@njit(cache=True, error_model="numpy")
+def make_scratch(breaks: int) -> Any:
+    """Work arrays of one thread: roots, root finder's stack, polynomial, quadrature's stack, stretches inside.
+
+    Each of the pieces between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it in 7 parts.
+    """
+    return np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((HALVINGS + 2, 2)), np.empty((4 * breaks + 8, 2))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def exact_signals(
+    travel: Any,
+    cross: Any,
+    slope: Any,
+    strays: Any,
+    ends: Any,
+    presses: Any,
+    chains: tuple[Any, Any],
+    reach: Any,
+    law: Any,
+    begin: int,
+    end: int,
+    starts: Any,
+    fibre: Any,
+    signal: Any,
+) -> int:
+    """Signals of pads for presses, only of fibres a press can touch; returns how many spans were looked at.
+
+    Args:
+        travel, cross, slope: (P, F, n) knots and slopes. strays: (P, 2) of `family_strays`. ends: `Ends`.
+        presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
+        chains: two (3, B), reach: (2, 5): the shape in the frame of each family. law: a `Law`.
+        starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
+            `signal`; or empty for dense signals (P Q F,), zeros before.
+    """
+    fibres = travel.shape[1]
+    span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
+    visited = 0
+    for index in range(begin, end):
+        p, q = index // len(presses), index % len(presses)
+        slot = starts[q] if len(starts) else 0
+        for family in range(2):
+            ct, cv = presses[q, family], presses[q, 1 - family]
+            shape = in_frame((chains, reach, law), family)
+            first, last = touched_range(cv, reach[family], strays[p, family], ends, family)
+            for f in range(first, last):
+                t, v, d = travel[p, f], cross[p, f], slope[p, f]
+                value, spans = fibre_signal(t, v, d, ct, cv, shape, span, scratch)
+                visited += spans
+                if len(starts):
+                    fibre[slot], signal[slot] = f, value
+                    slot += 1
+                else:
+                    signal[index * fibres + f] = value
+    return visited

@@ -1,1 +1,0 @@
-"""How fibres are found."""

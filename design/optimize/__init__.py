@@ -1,0 +1,1 @@
+"""Search for a pad: gradient and genetic, from many starts, resumable."""

@@ -1,1 +1,0 @@
-"""The pad: fibres as curves, and what they signal for a press."""

@@ -1,1 +1,0 @@
-"""Drawings of fibres from elsewhere: curves of SVG and DXF files, and the pad they make."""

@@ -1,7 +1,0 @@
-"""Compiled kernels: pure functions on arrays, in grid units."""
-
-from pathlib import Path
-
-from padforge.design.common.computing import forget_outdated
-
-forget_outdated(Path(__file__).parent)

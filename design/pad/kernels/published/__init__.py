@@ -1,1 +1,0 @@
-"""The published way to see a pad: sampled fibres, and the information in their signals."""

@@ -1,1 +1,0 @@
-"""The design on paper: the plan, and its part of the report."""

@@ -1,0 +1,627 @@
+"""The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+
+from padforge.design.common.settings import Settings, as_python, as_tuple, none_as
+from padforge.design.common.validation import InputError, real, shown, whole
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from scipy.interpolate import CubicSpline
+
+DEFAULT_PITCH_MM = 11.25
+"""Of the built pad."""
+MOST_FIBRES = 1024
+"""Most fibres of a family, of a pad that is made of tiles too."""
+
+Pair = tuple[float, float]
+Counts = int | tuple[int, int]
+"""M horizontals and M verticals, or (horizontals, verticals)."""
+Pitch = float | Pair
+"""Distance of neighbouring fibre ends, mm: both ways, or along x and along y."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """H horizontal and V vertical fibres, whose ends lie evenly along the edges of a rectangle.
+
+    Horizontal fibre i runs along x at the height of i pitches along y, i = 1..H, vertical fibre i along y at i pitches
+    along x, i = 1..V. The pad is V + 1 pitches wide and H + 1 high. Places are in grid units, which are equally long
+    both ways: the pitch, or the geometric mean of two, so that a pad turned by 90 degrees answers alike.
+
+    Attributes:
+        horizontals, verticals: H and V, 0 to MOST_FIBRES each, one fibre or more in all.
+        pitch_x_mm: distance of neighbouring verticals' ends. pitch_y_mm: of horizontals'. Both 0.1 to 1000 mm.
+
+    Raises:
+        InputError: no fibre, too many, or a pitch out of range.
+    """
+
+    horizontals: int
+    verticals: int
+    pitch_x_mm: float
+    pitch_y_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("horizontals", "verticals"):
+            object.__setattr__(self, name, whole(name, getattr(self, name), 0, MOST_FIBRES))
+        for name in ("pitch_x_mm", "pitch_y_mm"):
+            object.__setattr__(self, name, real(name.removesuffix("_mm"), getattr(self, name), 0.1, 1000))
+        if not self.fibres:
+            raise InputError("a pad of 0 horizontals and 0 verticals has no fibre, allowed is 1 or more in all")
+
+    @classmethod
+    def of(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
+        """From what is short: M or (H, V), and one pitch or (along x, along y); a layout is itself.
+
+        Raises:
+            InputError: anything else, or what the class refuses.
+        """
+        if isinstance(fibres, Layout):
+            return fibres
+        if isinstance(fibres, tuple | list):
+            horizontals, verticals = _two("fibres", fibres)
+        else:
+            horizontals = verticals = whole("grid", fibres, 1, MOST_FIBRES)
+        if isinstance(pitch_mm, tuple | list):
+            along_x, along_y = _two("pitch_mm", pitch_mm)
+        else:
+            along_x = along_y = real("pitch_mm", pitch_mm, 0.1, 1000)
+        return cls(horizontals, verticals, along_x, along_y)
+
+    @property
+    def fibres(self) -> int:
+        """H + V."""
+        return self.horizontals + self.verticals
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """(H, V)."""
+        return self.horizontals, self.verticals
+
+    @property
+    def families(self) -> tuple[slice, slice]:
+        """The rows of the horizontals and of the verticals among all fibres."""
+        return slice(0, self.horizontals), slice(self.horizontals, self.fibres)
+
+    def family(self, fibre: int) -> int:
+        """Of the fibre of that index: 0 of a horizontal, 1 of a vertical. It is the axis that it travels along."""
+        return int(fibre >= self.horizontals)
+
+    @property
+    def is_square(self) -> bool:
+        """Whether it is of as many fibres both ways, of one pitch."""
+        return self.horizontals == self.verticals and self.pitch_x_mm == self.pitch_y_mm
+
+    @property
+    def pitch_mm(self) -> Pitch:
+        """The pitch where there is one, else (along x, along y)."""
+        return self.pitch_x_mm if self.pitch_x_mm == self.pitch_y_mm else (self.pitch_x_mm, self.pitch_y_mm)
+
+    @cached_property
+    def unit_mm(self) -> float:
+        """A grid unit, mm."""
+        one = self.pitch_x_mm == self.pitch_y_mm
+        return self.pitch_x_mm if one else math.sqrt(self.pitch_x_mm * self.pitch_y_mm)
+
+    @cached_property
+    def spacing(self) -> Pair:
+        """The pitches along x and along y, grid units."""
+        return self.pitch_x_mm / self.unit_mm, self.pitch_y_mm / self.unit_mm
+
+    @cached_property
+    def extent(self) -> Pair:
+        """Width and height of the pad, grid units: places on it are between (0, 0) and these."""
+        return (self.verticals + 1) * self.spacing[0], (self.horizontals + 1) * self.spacing[1]
+
+    @property
+    def size_mm(self) -> Pair:
+        """Width and height of the pad from fibre end to fibre end, mm."""
+        return (self.verticals + 1) * self.pitch_x_mm, (self.horizontals + 1) * self.pitch_y_mm
+
+    @cached_property
+    def levels(self) -> "NDArray[np.float64]":
+        """(F,) cross coordinate at which each fibre ends, grid units."""
+        import numpy as np  # settings alone take none
+
+        rows = np.concatenate([np.arange(1.0, count + 1) for count in self.counts])
+        found = rows * np.repeat(self.spacing[::-1], self.counts)
+        found.setflags(write=False)
+        return found
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """It as keys of `[pad]`."""
+        counts: dict[str, Any] = {"horizontals": self.horizontals, "verticals": self.verticals}
+        if self.horizontals == self.verticals:
+            counts = {"grid": self.horizontals, "horizontals": "grid", "verticals": "grid"}
+        return {**counts, "pitch_mm": self.pitch_mm}
+
+    def __str__(self) -> str:
+        """It in words: `4 + 4 fibres, pitch 11.25 mm`."""
+        pitch = (
+            f"{self.pitch_x_mm:g}"
+            if self.pitch_x_mm == self.pitch_y_mm
+            else (f"{self.pitch_x_mm:g} and {self.pitch_y_mm:g}")
+        )
+        return f"{self.horizontals} + {self.verticals} fibres, pitch {pitch} mm"
+
+
+def _two(name: str, values: Sequence[Any]) -> tuple[Any, Any]:
+    if len(values) != 2:
+        raise InputError(f"{name} is {shown(values)}, expected one number or two")
+    return values[0], values[1]
+
+
+Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *none_as("circle")]
+
+
+MEASURED_REACH = (
+    *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
+    *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
+)
+"""How the built pad answers: about a Gaussian of standard deviation 6.2 mm, with a smooth end in place of its tails."""
+MAX_OVERSHOOT = 0.15
+"""By which a spline may leave the range of the two points it runs between, share of the largest weight: smooth profiles
+stay far below it, one that leaves its points would count for what nobody has measured."""
+
+Point = tuple[Annotated[float, Field(ge=0, le=1e4)], Annotated[float, Field(ge=-1e3, le=1e3)]]
+
+
+def _points(value: object) -> object:
+    """Lists, as files have them, as the tuples that a frozen model holds."""
+    return tuple(as_tuple(point) for point in value) if isinstance(value, list | tuple) else value
+
+
+class Contact(Settings):
+    """`[contact]`: what a press does to a fibre: by a reach that was measured, or as published by a shape around it.
+
+    The signal of a fibre is the integral of a weight over its length: that of `reach` by distance d to the press
+    centre; or, where `reach` is empty, `weight` inside a regular polygon or circle (paper, formulas (1), (2)), which is
+    meant as well where `radius`, `sides` or `weight` are given and `reach` is not. Shapes are in grid units, as
+    published; a press that was measured is as wide in mm on pads of any pitch.
+
+    Attributes:
+        radius: circumradius K of the shape, > 0.
+        sides: D >= 3, or None for a circle ("circle" in pad.toml).
+        weight: "uniform" (1), "inverse_square" (1 / (K + d^2)) or "inverse" (1 / max(d, K / 100), which is the
+            paper's 1 / d kept finite within a hundredth of the radius).
+        length: "manhattan" (|dx| + |dy|, as the published code has it, and the default of shapes) or "euclidean", the
+            default of a reach.
+        reach: points (distance in mm, weight) from distance 0 to where the weight is 0 and stays so, joined by a cubic
+            spline over d^2, which may leave their range by MAX_OVERSHOOT. A weight may be below 0. MEASURED_REACH if
+            nothing of the contact is given.
+    """
+
+    radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, where reach is []")
+    sides: Sides = Field(default=30, description='sides D of the object, or "circle", where reach is []')
+    weight: Literal["uniform", "inverse_square", "inverse"] = Field(
+        default="uniform", description="weight of a fibre element where reach is []: 1, 1/(K + d^2) or 1/d"
+    )
+    length: Literal["manhattan", "euclidean"] = Field(
+        default="euclidean", description="length of a fibre element: euclidean, or |dx| + |dy| as published"
+    )
+    reach: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
+        default=MEASURED_REACH, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]]; [] for a shape"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_one_kind(cls, given: object) -> object:
+        """What is left out, by what is given: a shape as published, or a reach."""
+        given = as_python(given)  # `Settings` does so later, and an array says not whether it is empty
+        if not isinstance(given, Mapping):
+            return given
+        reach = given.get("reach", () if _SHAPE & given.keys() else MEASURED_REACH)
+        shape = isinstance(reach, list | tuple) and not reach
+        return {"reach": reach, "length": "manhattan" if shape else "euclidean", **given}
+
+    @field_validator("reach")
+    @classmethod
+    def _ends_in_nothing(cls, reach: tuple[Point, ...], info: ValidationInfo) -> tuple[Point, ...]:
+        if not reach:
+            return reach
+        for name, value in info.data.items():
+            # else a radius that is set beside the reach `padforge init` has written would change nothing
+            if name in _SHAPE and value != cls.model_fields[name].default:
+                raise ValueError(f"{name} is {value}, which counts where reach is []")
+        distances, weights = zip(*reach, strict=True)
+        if len(reach) < 3 or distances[0] != 0 or any(a >= b for a, b in pairwise(distances)):
+            raise ValueError("it must be of 3 points or more, whose distances ascend from 0")
+        if weights[-1] != 0 or not any(weights):
+            raise ValueError("the last weight must be 0, and some other one not")
+        if reach != MEASURED_REACH:  # so that the default needs no SciPy, which takes a while to load
+            _check_overshoot(reach)
+        return reach
+
+    def profile_points(self, unit_mm: float) -> tuple[Point, ...]:
+        """Return the measured profile as the kernels take it, on a pad of some grid unit.
+
+        Args:
+            unit_mm: the pad's grid unit, mm.
+
+        Returns:
+            Points (distance in grid units, weight) of `reach`.
+        """
+        return tuple((distance_mm / unit_mm, weight) for distance_mm, weight in self.reach)
+
+
+def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":
+    """Fit the cubic spline of a measured profile over the squared distance, so that it is smooth at the centre as well.
+
+    It meets 0 without a kink at its end.
+
+    Args:
+        points: (distance, weight), the last of weight 0.
+    """
+    import numpy as np  # settings alone take none
+    from scipy.interpolate import CubicSpline
+
+    distance, weight = np.array(points).T
+    return CubicSpline(distance**2, weight, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
+
+
+def _check_overshoot(points: tuple[Point, ...]) -> None:
+    """Refuse points between which their spline swings far beyond them."""
+    spline = profile_spline(points)
+    slack = MAX_OVERSHOOT * max(abs(weight) for _, weight in points)
+    extremes = [square for square in spline.derivative().roots(extrapolate=False).tolist() if math.isfinite(square)]
+    for (begin, first), (end, second) in pairwise(points):
+        low, high = min(first, second) - slack, max(first, second) + slack
+        for weight in (float(spline(square)) for square in extremes if begin**2 < square < end**2):
+            if not low <= weight <= high:
+                raise ValueError(
+                    f"between the points at {begin:g} and {end:g} mm their spline comes to {weight:.3g}, "
+                    f"allowed is {low:.3g} to {high:.3g}; points closer together keep it there"
+                )
+
+
+_SHAPE = {"radius", "sides", "weight"}
+
+PUBLISHED_CONTACT = Contact(radius=0.6)
+"""The paper's: a polygon of 30 sides, Manhattan lengths. Functions that restate the paper take it for None."""
+
+
+TRACK_WIDTH_MM = 0.4
+"""Width of a track where the mould does not say another."""
+MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
+"""Least limit on what two tracks have in common: two that cross straight and at a right angle have two widths."""
+
+MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *none_as("any")]
+MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *none_as("any")]
+
+
+class RulesSettings(Settings):
+    """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`check_rules` has the formulas).
+
+    Attributes:
+        max_crossings: greatest number of crossings of a horizontal with a vertical fibre, or None for any number
+            ("any" in pad.toml). Every horizontal has to cross every vertical, so a limit below grid^2 cannot be met.
+        max_common_track_mm: greatest length in which a horizontal and a vertical fibre run nearer to each other than
+            the width of a track, 0.4 mm, or None for any ("any" in pad.toml). There the shallow track has no floor of
+            silicone, and the adhesive alone keeps the fibres apart. At the default straight fibres may cross at 23.6
+            degrees or more: they have 0.8 mm / sin(angle) in common.
+    """
+
+    enforce: bool = Field(
+        default=True, description="false drops every rule: an explicit choice to design the unbuildable"
+    )
+    min_bend_radius_mm: float = Field(default=1.0, ge=0, le=1000, description="least bend radius of a fibre, mm")
+    min_gap_mm: float = Field(
+        default=0.8, ge=0, le=1000, description="least gap between centre lines of a family, or folds of a fibre, mm"
+    )
+    same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
+    max_crossings: MaxCrossings = Field(
+        default=None, description='crossings of horizontals with verticals allowed (at least grid^2), or "any"'
+    )
+    min_crossing_angle_deg: float = Field(
+        default=0.0, ge=0, le=90, description="least angle at which horizontals cross verticals, degrees"
+    )
+    max_common_track_mm: MaxCommon = Field(
+        default=2.0, description='length for which a horizontal may run on a vertical, within 0.4 mm, mm, or "any"'
+    )
+    border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
+    keep_out_mm: float = Field(
+        default=1.5, ge=0, le=1000, description="least distance of a fibre to a keep-out of [pad], mm"
+    )
+    max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
+
+
+Share = Annotated[float, Field(ge=0, le=1e6)]
+
+Lost = Annotated[
+    Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Share, ...], Field(min_length=1, max_length=9)],
+    BeforeValidator(as_tuple),
+]
+
+
+WEIGHTS = (1.0, 1e-7, 5e-6)
+"""Published alpha, beta and gamma: of entropy, sharpness and disorder (formula (5))."""
+SIDE = 7
+"""The published search presses 7 x 7 places."""
+LEVELS = 4096
+"""Levels of the published 12-bit converter."""
+MOST_LEVELS = 2**24
+
+
+class Scatter(NamedTuple):
+    """How the response of a fibre scatters from press to press at the same position.
+
+    Attributes:
+        floor: standard deviation of what does not depend on the response, of a straight fibre's full scale, > 0.
+        share: standard deviation of what is proportional to the response, share of it.
+        common: share of the latter's variance that all fibres have in common.
+    """
+
+    floor: float
+    share: float = 0.0
+    common: float = 0.0
+
+    def gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
+        """Draw by what each response (presses, fibres) is more or less than usual, about 1."""
+        own, common = rng.standard_normal(shape), rng.standard_normal((shape[0], 1))
+        return 1 + self.share * (math.sqrt(1 - self.common) * own + math.sqrt(self.common) * common)
+
+    def scaled(self, factor: float) -> "Scatter":
+        """Return the same scatter, louder by a factor."""
+        return Scatter(self.floor * factor, self.share * factor, self.common)
+
+
+class SearchSettings(Settings):
+    """`[search]`: how the fibres are found.
+
+    Attributes:
+        noise, scatter, scatter_common: the defaults are what the responses of a built pad scatter by.
+        lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
+        weights, presses, levels: of the published objective, alpha, beta and gamma; the side of its square of presses;
+            and the levels that signals are rounded up to.
+        contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
+    """
+
+    method: Literal["descent", "genetic"] = Field(
+        default="descent", description="gradients of the expected error, or the genetic search as published"
+    )
+    knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
+    starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
+    steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
+    population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
+    generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
+    weights: Annotated[tuple[Share, Share, Share], BeforeValidator(as_tuple)] = Field(
+        default=WEIGHTS, description="weights of entropy, sharpness and disorder in the genetic search"
+    )
+    presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
+    levels: int = Field(default=LEVELS, ge=1, le=MOST_LEVELS, description="levels of a signal in the genetic search")
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
+    lost: Lost = Field(
+        default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
+    )
+    noise: float = Field(
+        default=0.02,
+        ge=1e-9,
+        le=10,
+        description="standard deviation of a response's noise, of the full scale of straight fibres",
+    )
+    scatter: float = Field(
+        default=0.18, ge=0, le=1, description="scatter of a response from press to press, share of the response"
+    )
+    scatter_common: float = Field(
+        default=0.36, ge=0, le=0.99, description="share of that scatter's variance that all fibres have in common"
+    )
+    sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
+    contacts: Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="further contacts to serve as well, each a table like [contact]"
+    )
+    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where presses are told apart")
+
+    @property
+    def usual_contact(self) -> Contact:
+        """What is designed for where nothing else is asked: the measured contact, by the published method its own."""
+        return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
+
+    @property
+    def response_scatter(self) -> Scatter:
+        """How responses scatter that are designed for."""
+        return Scatter(self.noise, self.scatter, self.scatter_common)
+
+    @field_validator("lost", "weights")
+    @classmethod
+    def _some_weight(cls, weights: int | tuple[float, ...]) -> int | tuple[float, ...]:
+        if isinstance(weights, tuple) and sum(weights) == 0:
+            raise ValueError("one of the weights must be above 0")
+        return weights
+
+
+Millimetres = Annotated[float, Field(gt=0, le=1e6)]
+Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
+Rectangle = tuple[tuple[float, float], tuple[float, float]]
+"""Low and high corner, grid units."""
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Polygon = tuple[tuple[Coordinate, Coordinate], ...]
+"""Its corners, mm from the middle of the pad."""
+
+
+def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
+    """Low and high corner, in grid units, of what is pressed on a pad.
+
+    Of V verticals the outermost lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. "beyond" is
+    0.5 to V + 0.5 pitches, half a pitch beyond the outermost; "fibres" is 1 to V, as published. It is never less than
+    half the pad: 0.5 to 1.5 for V = 1, 0.25 to 0.75 for V = 0. A size lies about the middle.
+    """
+    sides = []
+    for axis, count in enumerate((layout.verticals, layout.horizontals)):
+        if isinstance(sensed_mm, str):
+            side = (count if sensed_mm == "beyond" else count - 1) * layout.spacing[axis]
+            sides.append(max(side, layout.extent[axis] / 2) if count < 2 else side)
+        else:
+            sides.append(sensed_mm[axis] / layout.unit_mm)
+    width, height = sides
+    x, y = (extent / 2 for extent in layout.extent)
+    return (x - width / 2, y - height / 2), (x + width / 2, y + height / 2)
+
+
+def between_fibres(layout: Layout) -> Rectangle:
+    """What is pressed as published: between the outermost fibres, grid units."""
+    return sensed_rectangle(layout, "fibres")
+
+
+def _side_lengths(value: object) -> object:
+    if isinstance(value, str) and value not in ("beyond", "fibres"):
+        raise ValueError('allowed are [width, height], "beyond" and "fibres"')
+    return as_tuple(value)
+
+
+BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *none_as("flat")]
+Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *none_as("grid")]
+PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
+
+
+def _pitches(value: object) -> object:
+    value = as_tuple(value)
+    each = value if isinstance(value, tuple) else (value,)
+    if any(isinstance(pitch, int | float) and (pitch < 0.1 or pitch > 1000) for pitch in each):
+        raise ValueError("allowed is 0.1 to 1000, or [along x, along y] of these")
+    if isinstance(value, tuple) and len(value) != 2:
+        raise ValueError("allowed is a number or two, [along x, along y]")
+    return value
+
+
+def _polygons(value: object) -> object:
+    """Lists, as files have them, as the tuples that a frozen model holds."""
+    if not isinstance(value, list | tuple):
+        return value
+    return tuple(
+        tuple(as_tuple(corner) for corner in polygon) if isinstance(polygon, list | tuple) else polygon
+        for polygon in value
+    )
+
+
+class PadSettings(Settings):
+    """`[pad]`: what the pad is, and which part of it is pressed.
+
+    Attributes:
+        horizontals, verticals: of either family, where `grid` says nothing of it; None: as `grid`. 0 leaves it out: the
+            pad is then a strip one pitch wide, and the fibres of the other family run across it, one pitch long.
+        pitch_mm: of neighbouring fibre ends, both ways, or (along x, along y).
+        leads: "one side": the lower edge, as a connector wants; they come down beside the pad, nested.
+        sensed_mm: (width, height), at most the pad's own; "beyond": half a pitch beyond the outermost fibres, or
+            "fibres": between them, as published. Designs are for presses there; `sensed_rectangle` says where that is.
+        keep_out_mm: polygons, of 3 corners or more, that no fibre enters: holes, screws, a connector. Each has an area
+            and no crossing of its own sides, and lies on the pad at least in part.
+        bent_radius_mm: None for a pad that stays flat. It is cast flat either way.
+    """
+
+    MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
+
+    grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), where the next two do not say")
+    horizontals: Count = Field(
+        default=None,
+        description='fibres along x, or as "grid"; 0: a strip along x, its fibres run across, one pitch long',
+    )
+    verticals: Count = Field(
+        default=None,
+        description='fibres along y, or as "grid"; 0: a strip along y, its fibres run across, one pitch long',
+    )
+    pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_pitches)] = Field(
+        default=DEFAULT_PITCH_MM, description="distance of neighbouring fibre ends, mm, or [along x, along y]"
+    )
+    deep_family: Literal["horizontal", "vertical"] = Field(
+        default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
+    )
+    leads: Literal["edges", "one side"] = Field(
+        default="edges", description='ends of fibres leave on all four "edges", or all of them on "one side", the lower'
+    )
+    sensed_mm: Annotated[Sensed, BeforeValidator(_side_lengths)] = Field(
+        default="beyond",
+        description='pressed [width, height] about the middle, mm; "beyond" the outermost fibres by half a pitch, or '
+        'between "fibres"',
+    )
+    keep_out_mm: Annotated[tuple[Polygon, ...], BeforeValidator(_polygons), Field(max_length=64)] = Field(
+        default=(), description="polygons [[x, y], ...] from the middle, mm, that no fibre enters"
+    )
+    bent_radius_mm: BentRadius = Field(
+        default=None, description='radius of the cylinder about y that the pad is worn on, mm, or "flat"'
+    )
+
+    @property
+    def layout(self) -> Layout:
+        """Where its fibres end."""
+        horizontals = self.grid if self.horizontals is None else self.horizontals
+        verticals = self.grid if self.verticals is None else self.verticals
+        return Layout.of((horizontals, verticals), self.pitch_mm)
+
+    @property
+    def sensed(self) -> Rectangle:
+        """`sensed_rectangle` of this pad."""
+        return sensed_rectangle(self.layout, self.sensed_mm)
+
+    def of(self, layout: Layout) -> "PadSettings":
+        """These settings of a pad of that layout.
+
+        Raises:
+            InputError: what they ask for is not on that pad.
+        """
+        return type(self)(**{**self.model_dump(), **layout.settings})
+
+    @model_validator(mode="after")
+    def _of_some_fibres(self) -> "PadSettings":
+        if self.horizontals == 0 and self.verticals == 0:
+            raise ValueError("horizontals and verticals are both 0, allowed is one fibre or more in all")
+        return self
+
+    @field_validator("sensed_mm")
+    @classmethod
+    def _on_the_pad(cls, sensed_mm: Sensed, info: ValidationInfo) -> Sensed:
+        layout = _stated_layout(info.data)
+        if isinstance(sensed_mm, tuple) and layout is not None:
+            for name, side, most in zip(("wide", "high"), sensed_mm, layout.size_mm, strict=True):
+                if side > most * (1 + 1e-9):
+                    width, height = layout.size_mm
+                    size = f"{width:g} mm wide and high" if width == height else f"{most:g} mm {name}"
+                    raise ValueError(f"the pad itself is {size}")
+        return sensed_mm
+
+    @field_validator("keep_out_mm")
+    @classmethod
+    def _proper_polygons(cls, keep_out_mm: tuple[Polygon, ...], info: ValidationInfo) -> tuple[Polygon, ...]:
+        import shapely  # takes a while, and few pads have keep-outs
+
+        layout = _stated_layout(info.data)
+        for number, corners in enumerate(keep_out_mm, 1):
+            if not 3 <= len(corners) <= 1000:
+                raise ValueError(f"polygon {number} has {len(corners)} corners, allowed are 3 to 1000")
+            polygon = shapely.Polygon(corners)
+            if not polygon.is_valid or polygon.area == 0:
+                raise ValueError(f"polygon {number} crosses or touches itself or has no area")
+            if layout is not None:
+                width, height = layout.size_mm
+                if not polygon.intersects(shapely.box(-width / 2, -height / 2, width / 2, height / 2)):
+                    raise ValueError(
+                        f"polygon {number} lies beside the pad, which is {width:g} by {height:g} mm about (0, 0)"
+                    )
+        return keep_out_mm
+
+
+def _stated_layout(stated: Mapping[str, Any]) -> Layout | None:
+    """Of the keys of `[pad]` that hold, None if one of them is missing for it does not."""
+    if not {"grid", "horizontals", "verticals", "pitch_mm"} <= stated.keys():
+        return None
+    counts = [stated["grid"] if stated[name] is None else stated[name] for name in ("horizontals", "verticals")]
+    return Layout.of((counts[0], counts[1]), stated["pitch_mm"]) if any(counts) else None
+
+
+PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
+PUBLISHED: Mapping[str, Settings] = {
+    "pad": PUBLISHED_PAD,
+    "contact": PUBLISHED_CONTACT,
+    "search": PUBLISHED_SEARCH,
+    "rules": RulesSettings(max_common_track_mm=None),
+}
+"""The world of the paper, by section, as far as it is another than the default."""
