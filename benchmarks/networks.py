@@ -11,7 +11,7 @@ from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import LEARN, VALIDATE, ColumnScale, Loss, Network, PressSets, first_weights
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT
 
 HIDDEN = 50
@@ -30,7 +30,7 @@ def trials() -> Iterator[harness.BenchTrial]:
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
             trial = PressSets.of(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
-            losses = lost_subsets(len(pad.knots), LOST, SETS)
+            losses = failure_subsets(len(pad.knots), LOST, SETS)
             judge = partial(_judge, trial, losses)
             yield harness.BenchTrial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)
             yield harness.BenchTrial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)

@@ -8,7 +8,7 @@ from typing import Any
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.networks import localisation_error
 from padforge.design.objectives.rules import check_rules
-from padforge.design.optimize.search import SearchResult, SearchRun, search
+from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
 
 KNOTS = (5, 20)
@@ -45,7 +45,7 @@ def trials() -> Iterator[BenchTrial]:
             for seed in SEEDS:
                 chosen = PUBLISHED_SEARCH.model_copy(update={**settings, "knots": knots, "seed": seed})
                 asked = PUBLISHED_PAD, PUBLISHED_CONTACT, chosen, rules
-                work = partial(search, *asked, run=SearchRun(executor=InThisThread()))
+                work = partial(search, *asked, run=SearchOptions(executor=InThisThread()))
                 yield BenchTrial(f"N={knots}", way, size, work, judge_pad, repetition=seed)
 
 

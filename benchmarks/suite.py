@@ -8,7 +8,7 @@ from typing import Any
 from padforge.benchmarks.comparison import SLOWER, Worsening, worsenings
 from padforge.benchmarks.harness import Bench, BenchListener, BenchRounds, TrialKey, measure_round
 from padforge.benchmarks.table import SUMMARY_FORMAT, summary_rows, write_bench, write_csv
-from padforge.design.common.files import refuse_unwritable, write_json
+from padforge.design.common.files import check_writable, write_json
 
 ROUNDS = 2, 5
 """Every trial is in the first two; the others are for those not settled."""
@@ -33,7 +33,7 @@ def run_benches(
     Raises:
         InputError: `out` cannot be written, told before anything is measured.
     """
-    refuse_unwritable(out)
+    check_writable(out)
     measured = {bench.name: BenchRounds() for bench in benches}
     documents: dict[str, dict[str, Any]] = {}
 

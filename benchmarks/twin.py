@@ -13,7 +13,7 @@ from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design import Morphology
 from padforge.design.contact import signals
 from padforge.design.settings import Contact, sensed_rectangle
-from padforge.design.twin import Frame, Twin, TwinChannel
+from padforge.design.twin import PlanTransform, Twin, TwinChannel
 from padforge.sense.localizer.response.response_model import RIDGE_PLACE, bumps
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recording import Recording
@@ -103,7 +103,7 @@ def printed_pad(
             for channel, fibre in enumerate(read)
         ]
         courses = tuple(line if fibre in read else None for fibre, line in enumerate(laid))
-        frame = Frame(True, float(turn), (float(shift[0]), float(shift[1])))
+        frame = PlanTransform(True, float(turn), (float(shift[0]), float(shift[1])))
         return Twin(
             plan, tuple(channels), frame, distance * unit_mm, weight, courses, noise, (width, height), presses=1
         )

@@ -7,14 +7,14 @@ from .contact import signals_sparse as signals_sparse
 from .indentation import Indenter as Indenter
 from .indentation import indented_signals as indented_signals
 from .morphology import Morphology as Morphology
-from .networks import LossError as LossError
+from .networks import FailureError as FailureError
 from .networks import localisation_error as localisation_error
 from .objectives.published import published_objective as published_objective
 from .objectives.rules import Violation as Violation
 from .objectives.rules import check_rules as check_rules
 from .objectives.score import score as score
+from .optimize.search import SearchOptions as SearchOptions
 from .optimize.search import SearchResult as SearchResult
-from .optimize.search import SearchRun as SearchRun
 from .optimize.search import search as search
 from .paths.curves import crossings as crossings
 from .paths.curves import flatten as flatten

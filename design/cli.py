@@ -58,7 +58,7 @@ def import_(
     [pad] of the settings says which fibres there are and where they end. Taken are curves in layers or groups whose
     names begin with fibre, horizontal or vertical, else all open ones; what is named pad is its border.
     """
-    from padforge.design.common.files import check_replaceable, provenance, staged
+    from padforge.design.common.files import atomic_files, check_replaceable, provenance
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import check_rules
     from padforge.design.paths.import_plan import import_plan
@@ -72,7 +72,7 @@ def import_(
     )
     made_by["settings"] = {"pad": size.model_dump(mode="json"), "tolerance_mm": tolerance_mm}
     folder = out or pad_folder(plan)
-    with staged(folder) as together:
+    with atomic_files(folder) as together:
         Morphology.of_layout(found.pad.knots, size.layout, made_by).save(together / "morphology.json")
         check_replaceable(folder / "morphology.json", together / "morphology.json", force=force)
     broken = check_rules(found.pad, rules, size)
@@ -115,26 +115,26 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     Knots are dragged, or chosen with Tab and moved with the arrow keys. Saving (Ctrl+S in the page) replaces no file
     that was there before but the one that --out names. Ctrl-C here ends it.
     """
-    from padforge.design.common.files import refuse_unwritable
+    from padforge.design.common.files import check_writable
     from padforge.design.common.server import LocalPage, page_text
     from padforge.design.common.validation import InputError
     from padforge.design.morphology import Morphology
     from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
     from .editor.edits import Answers
-    from .editor.session import Session
+    from .editor.session import EditSession
 
     out = out or _free(pad)
     if out.suffix.lower() != ".json":
         raise InputError(f"--out is {out}, allowed is a name that ends in .json")
-    refuse_unwritable(out.parent)
+    check_writable(out.parent)
     settings = load_spec(spec)
     layout = settings.section(PadSettings).layout if pad is None else Morphology.load(pad).layout
     size = settings.section(PadSettings, **layout.settings)
     judged = Answers(size, settings.section(RulesSettings), settings.section(Contact), settings.section(SearchSettings))
     text = page_text("padforge.design.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
     with ExitStack() as stack:
-        session = Session(judged, pad, out, lambda view: page.show(view), force)
+        session = EditSession(judged, pad, out, lambda view: page.show(view), force)
         page = LocalPage(port, text, {"/edit": session.edit, "/save": session.save})
         stack.enter_context(page)
         click.echo(
@@ -219,15 +219,15 @@ def design(
     """
     if context.invoked_subcommand is not None:
         return
-    from padforge.design.common.files import claimed
+    from padforge.design.common.files import locked_folder
     from padforge.design.common.parallel import cluster
-    from padforge.design.optimize.search import SearchRun
+    from padforge.design.optimize.search import SearchOptions
     from padforge.design.run import run_search, search_lines
     from padforge.design.twin import Twin
 
     overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
-    with claimed(out), cluster(scheduler) as executor:
-        how = SearchRun(resume=resume, time_budget=time_budget, executor=executor)
+    with locked_folder(out), cluster(scheduler) as executor:
+        how = SearchOptions(resume=resume, time_budget=time_budget, executor=executor)
         document, result = run_search(load_spec(spec), out, overrides, origin, how, twin, force=force)
     if twin is not None and (left := Twin.load(twin).left_out()):
         click.echo(f"{twin}: {left}", err=True)
@@ -344,13 +344,13 @@ def compare_command(making: "Making") -> click.Command:
 
         Every variant is designed into a folder of its own, with its mould; morphologies are taken as they are.
         """
-        from padforge.design.common.files import claimed
+        from padforge.design.common.files import locked_folder
         from padforge.design.compare import compare, comparison_lines, variants
-        from padforge.design.optimize.search import SearchRun
+        from padforge.design.optimize.search import SearchOptions
 
         pads = variants(sources, vary, load_spec)
-        with claimed(out):
-            document = compare(pads, out, SearchRun(time_budget=time_budget), seed, making)
+        with locked_folder(out):
+            document = compare(pads, out, SearchOptions(time_budget=time_budget), seed, making)
         show_result(document, [*comparison_lines(document), f"comparison -> {out / 'comparison.json'}"], as_json)
 
     return command

@@ -11,13 +11,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from padforge.design.common.files import provenance, write_json
-from padforge.design.common.plotting import CURVES, FAINT, INK, canvas, explain, head, save_figure, tidy
+from padforge.design.common.plotting import (
+    CURVES,
+    FAINT,
+    INK,
+    add_caption,
+    add_title,
+    new_figure,
+    save_figure,
+    style_axes,
+)
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.validation import InputError, short_repr
 from padforge.design.contact_comparison import beside_straight, contact_of, errors_by_contact
 from padforge.design.morphology import Morphology
-from padforge.design.optimize.search import SearchRun
+from padforge.design.optimize.search import SearchOptions
 from padforge.design.paths.curves import crossings, lengths
 from padforge.design.run import run_search
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -93,15 +102,15 @@ def _changes(text: str) -> list[tuple[str, str, Any]]:
     try:
         found = tomllib.loads(f"values = [{values}]")["values"]
     except ValueError as error:
-        raise InputError(f"--vary is {shown(text)}, its values are none of TOML ({error})") from error
+        raise InputError(f"--vary is {short_repr(text)}, its values are none of TOML ({error})") from error
     if not (equals and dot and name and found):
-        raise InputError(f"--vary is {shown(text)}, expected SECTION.KEY=VALUE,VALUE such as pad.grid=3,4")
+        raise InputError(f"--vary is {short_repr(text)}, expected SECTION.KEY=VALUE,VALUE such as pad.grid=3,4")
     if section not in (allowed := [model.section() for model in DESIGNED]):
-        raise InputError(f"--vary is {shown(text)}: no such section to vary, allowed are {', '.join(allowed)}")
+        raise InputError(f"--vary is {short_repr(text)}: no such section to vary, allowed are {', '.join(allowed)}")
     return [(section, name, tuple(value) if isinstance(value, list) else value) for value in found]
 
 
-def compare(pads: Sequence[Variant], out: Path, run: SearchRun, seed: int | None, making: Making) -> dict[str, Any]:
+def compare(pads: Sequence[Variant], out: Path, run: SearchOptions, seed: int | None, making: Making) -> dict[str, Any]:
     """Design every variant in a folder of its own in `out`, judge all alike, and write comparison.json and .png.
 
     A pad is judged by a small network on responses that scatter, by its own contact and sensed area, beside straight
@@ -182,7 +191,7 @@ def _errors(errors: Sequence[float], most: int) -> list[str]:
 
 def _figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
     """Errors by lost fibres, and what the first and the last of them cost in fibre."""
-    figure, _ = canvas(9.6, 4.2)
+    figure, _ = new_figure(9.6, 4.2)
     figure.clear()
     by_loss, by_length = figure.subplots(1, 2)
     for at, row in enumerate(rows):
@@ -194,15 +203,15 @@ def _figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
         by_length.plot([length], ends[:1], "o", color=colour)
         by_length.plot([length], ends[1:], "s", color=colour, markerfacecolor="none")
     for axes in (by_loss, by_length):
-        tidy(axes)
+        style_axes(axes)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         axes.set_ylim(bottom=0)
         axes.set_ylabel("mean error (mm)", color=INK)
     by_loss.set_xticks(np.arange(max(len(row["errors_mm"]) for row in rows)))
     by_loss.set_xlabel("lost fibres")
     by_length.set_xlabel("fibre to lay (m)")
-    explain(by_loss, "lines: as designed; dotted: straight fibres")
-    explain(by_length, "dot: all fibres; square: most lost")
+    add_caption(by_loss, "lines: as designed; dotted: straight fibres")
+    add_caption(by_length, "dot: all fibres; square: most lost")
     by_loss.legend(frameon=False, fontsize=8)
-    head(figure, "What a pad costs, and how well it locates")
+    add_title(figure, "What a pad costs, and how well it locates")
     return figure

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common import profiling
-from padforge.design.common.parallel import in_chunks
+from padforge.design.common.parallel import map_chunks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import MOST_VALUES, InputError, instance, reals, whole
+from padforge.design.common.validation import MAX_VALUES, InputError, check_array, check_int, check_type
 from padforge.design.kernels import geometry
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
@@ -82,8 +82,8 @@ def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Cont
 
 def require_room(values: int) -> None:
     """Refuse more signals than fit into memory."""
-    if values > MOST_VALUES:
-        raise InputError(f"these are {values} signals, allowed at once are {MOST_VALUES}; signals_sparse takes less")
+    if values > MAX_VALUES:
+        raise InputError(f"these are {values} signals, allowed at once are {MAX_VALUES}; signals_sparse takes less")
 
 
 def _summed(signals: Array, shape: tuple[int, ...]) -> Array:
@@ -101,8 +101,8 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     from scipy.sparse import csr_array
 
     contact = or_default("contact", contact, Contact)
-    travel, cross, ends, _ = fibre_axes(instance("pad", pad, Morphology))
-    places, strays = as_presses(presses)[0], geometry.family_strays(cross, ends)
+    travel, cross, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
+    places, strays = as_presses(presses)[0], geometry.max_offsets(cross, ends)
     shape = press_shape(contact, pad.unit_mm)
     starts = geometry.count_touched(strays[0], places, shape[1], ends)
     require_room(int(starts[-1]))
@@ -127,12 +127,12 @@ def _run_exact(
     out: Array,
 ) -> int:
     """`exact_signals` over the cores."""
-    slope, strays = population_slopes(travel, cross), geometry.family_strays(cross, ends)
+    slope, strays = population_slopes(travel, cross), geometry.max_offsets(cross, ends)
 
     def work(begin: int, end: int) -> int:
         return exact_signals(travel, cross, slope, strays, ends, places, *shape, begin, end, starts, fibre, out)
 
-    visited = sum(in_chunks(work, len(travel) * len(places), grain=2000))
+    visited = sum(map_chunks(work, len(travel) * len(places), grain=2000))
     if profiling.is_profiling():
         note_reach(travel, strays, ends, places, shape[1], visited)
     return visited
@@ -157,7 +157,7 @@ def fibre_axes(
     Raises:
         InputError: knots that are no (..., F, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
     """
-    knots = pad.knots if isinstance(pad, Morphology) else reals("knots", pad, FARTHEST)
+    knots = pad.knots if isinstance(pad, Morphology) else check_array("knots", pad, FARTHEST)
     layout = pad.layout if isinstance(pad, Morphology) else layout
     fibres = knots.shape[-3] if knots.ndim >= 3 else 0
     if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
@@ -230,13 +230,13 @@ def quantized_and_samples(
     def work(begin: int, end: int) -> int:
         return quantized_signals(travel, cross, ends.horizontals, places, shape, samples, begin, end, out)
 
-    looked_at = sum(in_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
+    looked_at = sum(map_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
     return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
 
 
 def as_samples(samples: int, fibres: int) -> int:
     """Points a fibre is sampled at, as far as they may be so many."""
-    return whole("samples", samples, 2, min(MOST_SAMPLES, MOST_VALUES // max(fibres, 1)))
+    return check_int("samples", samples, 2, min(MOST_SAMPLES, MAX_VALUES // max(fibres, 1)))
 
 
 def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
@@ -245,7 +245,7 @@ def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[
     Raises:
         InputError: presses that are no (Q, 2), or (Q, C, 2) where `several` are allowed at once, or not finite.
     """
-    places = reals("presses", presses, FARTHEST)
+    places = check_array("presses", presses, FARTHEST)
     if places.shape == (0,):
         places = places.reshape(0, 2)
     if places.ndim not in ((2, 3) if several else (2,)) or places.shape[-1] != 2:
@@ -253,7 +253,7 @@ def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[
     return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
 
 
-def boustrophedon(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
+def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
     """A serpentine of side x side presses, each moved by U(0, jitter) along both axes.
 
     Args:

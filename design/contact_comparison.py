@@ -10,12 +10,12 @@ import numpy as np
 from padforge.design.common.files import provenance, write_json
 from padforge.design.common.page import PageSection, paragraph, table
 from padforge.design.common.profiling import stage
-from padforge.design.common.validation import whole
+from padforge.design.common.validation import check_int
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import LossError, PressSets, fresh_presses, training_presses
+from padforge.design.networks import FailureError, PressSets, fresh_presses, training_presses
 from padforge.design.objectives.expected_error import straight_full_scale
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.paths.keep_outs import outside
 from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
@@ -37,7 +37,7 @@ class ContactErrors:
 
     contact: str
     pad: str
-    errors: tuple[LossError, ...]
+    errors: tuple[FailureError, ...]
 
 
 def contacts_in_question(believed: Contact) -> dict[str, Contact]:
@@ -68,9 +68,9 @@ def errors_by_contact(
         seed: of presses, scatter and networks.
         subsets: most sets of failed fibres of a size.
     """
-    seed = whole("seed", seed, 0, 2**64 - 1)
+    seed = check_int("seed", seed, 0, 2**64 - 1)
     fibres = size.layout.fibres
-    losses = [lost_subsets(fibres, lost, subsets) for lost in range(min(LOST, fibres - 1) + 1)]
+    losses = [failure_subsets(fibres, lost, subsets) for lost in range(min(LOST, fibres - 1) + 1)]
     return [
         ContactErrors(called, name, tuple(_sets(pad, contact, size, scatter, seed).loss_errors(losses, HIDDEN)))
         for called, contact in contacts.items()

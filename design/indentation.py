@@ -22,8 +22,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.parallel import in_chunks
-from padforge.design.common.validation import InputError, instance, real, reals, shown
+from padforge.design.common.parallel import map_chunks
+from padforge.design.common.validation import InputError, check_array, check_float, check_type, short_repr
 from padforge.design.contact import as_presses, fibre_axes, require_room
 from padforge.design.kernels.indentation import CONE, FLAT, SPHERE, lengthenings
 from padforge.design.kernels.pchip import population_slopes
@@ -59,9 +59,9 @@ class Indenter:
 
     def __post_init__(self) -> None:
         if not isinstance(self.shape, str) or self.shape not in get_args(Shape):
-            raise InputError(f"shape is {shown(self.shape)}, allowed is {', '.join(get_args(Shape))}")
-        object.__setattr__(self, "radius", real("radius", self.radius, 1e-6, 1e4))
-        object.__setattr__(self, "angle_deg", real("angle_deg", self.angle_deg, 0.01, 89.9))
+            raise InputError(f"shape is {short_repr(self.shape)}, allowed is {', '.join(get_args(Shape))}")
+        object.__setattr__(self, "radius", check_float("radius", self.radius, 1e-6, 1e4))
+        object.__setattr__(self, "angle_deg", check_float("angle_deg", self.angle_deg, 0.01, 89.9))
 
     def contact_radius(self, depths: ArrayLike) -> Array:
         """Radius of the contact, of the shape of `depths`; all in grid units."""
@@ -74,7 +74,7 @@ class Indenter:
 
     def deflection(self, r: ArrayLike, depth: float) -> Array:
         """How far down the surface goes at distances `r` from the axis, of the shape of `r`; all in grid units."""
-        r, depth = reals("r", r, FARTHEST), real("depth", depth, 0, FARTHEST)
+        r, depth = check_array("r", r, FARTHEST), check_float("depth", depth, 0, FARTHEST)
         a = float(self.contact_radius(depth))
         if a == 0:
             return np.zeros(r.shape)
@@ -98,8 +98,8 @@ class Indenter:
 
     def force_n(self, depths: ArrayLike, unit_mm: float, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> Array:
         """Force in newton, of the shape of `depths`, on a pad whose grid unit is `unit_mm`."""
-        unit_mm = real("unit_mm", unit_mm, 0.1, 1000)
-        reduced_modulus_kpa = real("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
+        unit_mm = check_float("unit_mm", unit_mm, 0.1, 1000)
+        reduced_modulus_kpa = check_float("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
         return self.force(depths) * unit_mm**2 * reduced_modulus_kpa * 1e-3  # kPa mm^2 = 1e-3 N
 
     @property
@@ -112,7 +112,7 @@ class Indenter:
         Raises:
             InputError: a depth that is not finite, below 0, or deeper than the sphere's radius.
         """
-        d = reals("depths", depths)
+        d = check_array("depths", depths)
         deepest = self.radius if self.shape == "sphere" else FARTHEST
         wrong = d[(d < 0) | (d > deepest)]
         if wrong.size:
@@ -138,13 +138,13 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
         InputError: presses or depths of the wrong shape, not finite, or deeper than the indenter allows.
     """
     places, _ = as_presses(presses)
-    deep = reals("depths", depths)
+    deep = check_array("depths", depths)
     if deep.shape not in ((), (len(places),)):
         raise InputError(f"depths have shape {deep.shape}, expected ({len(places)},), one for every press")
     deep = np.broadcast_to(deep, len(places))
-    a = np.where(deep < SHALLOWEST, 0, instance("indenter", indenter, Indenter).contact_radius(deep))
+    a = np.where(deep < SHALLOWEST, 0, check_type("indenter", indenter, Indenter).contact_radius(deep))
     steepness = _steepness(indenter, deep, a)
-    travel, cross, ends, _ = fibre_axes(instance("pad", pad, Morphology))
+    travel, cross, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
     require_room(len(places) * travel.shape[1])
     slope = population_slopes(travel, cross)[0]
     out = np.zeros((len(places), travel.shape[1]))
@@ -154,7 +154,7 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
         shape = _SHAPES[indenter.shape]
         lengthenings(travel[0], cross[0], slope, ends.horizontals, places, a, steepness, floor, shape, begin, end, out)
 
-    in_chunks(work, len(places), grain=50)
+    map_chunks(work, len(places), grain=50)
     return out
 
 

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.design.common.files import read_json, write_json
 from padforge.design.common.mat_files import load_mat
-from padforge.design.common.validation import InputError, instance, mapping, reals, shown, whole
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import InputError, check_array, check_int, check_mapping, check_type, short_repr
+from padforge.design.common.validation import check_path as as_path
 from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, Law, frames
 from padforge.design.kernels.published import quantized_signals
 from padforge.design.settings import MOST_FIBRES, Contact, Counts, Layout, Pitch
@@ -94,7 +94,7 @@ def of_parameters(parameters: ArrayLike) -> Array:
     Raises:
         InputError: a matrix of another shape, or not of finite numbers.
     """
-    para = reals("parameters", parameters)
+    para = check_array("parameters", parameters)
     if para.size == 0 or para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
         raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
     columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
@@ -143,10 +143,10 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
         return 0.0
     settings = content["K"]
     contact = Contact(radius=float(settings["object_size"].item()), sides=int(settings["str_shp"].item()))
-    places, expected = reals("loc_all", content["loc_all"][:presses], FARTHEST), content["sens_raw_all"][:presses]
+    places, expected = check_array("loc_all", content["loc_all"][:presses], FARTHEST), content["sens_raw_all"][:presses]
     if places.ndim != 2 or places.shape[1] != 2:
         raise InputError(f"loc_all has shape {content['loc_all'].shape}, expected (Q, 2)")
-    samples = whole("fineness", int(settings["fineness"].item()), 2, MOST_SAMPLES)
+    samples = check_int("fineness", int(settings["fineness"].item()), 2, MOST_SAMPLES)
     horizontals = len(knots) // 2
     travel, cross = axes(knots[None], horizontals)
     misfits = []
@@ -187,7 +187,7 @@ class Morphology:
     fibres: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        knots = reals("knots", self.knots)
+        knots = check_array("knots", self.knots)
         if knots.ndim != 3 or knots.shape[2] != 2 or knots.shape[0] < 1 or knots.shape[1] < 2:
             raise InputError(f"knots have shape {knots.shape}, expected (H + V, N + 2, 2)")
         if self.fibres is None and len(knots) % 2:
@@ -203,9 +203,9 @@ class Morphology:
         object.__setattr__(self, "fibres", layout.counts)
         object.__setattr__(self, "layout", layout)
         try:
-            json.dumps(dict(mapping("provenance", self.provenance)), allow_nan=False)
+            json.dumps(dict(check_mapping("provenance", self.provenance)), allow_nan=False)
         except (TypeError, ValueError, RecursionError) as error:
-            raise InputError(f"provenance is {shown(self.provenance)}, expected JSON ({error})") from error
+            raise InputError(f"provenance is {short_repr(self.provenance)}, expected JSON ({error})") from error
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Morphology):
@@ -243,7 +243,7 @@ class Morphology:
     @classmethod
     def of_layout(cls, knots: Array, layout: Layout, provenance: Mapping[str, Any] | None = None) -> "Morphology":
         """Of knots (H + V, N+2, 2) in grid units, whose ends lie as the layout says."""
-        instance("layout", layout, Layout)
+        check_type("layout", layout, Layout)
         return cls(knots, layout.pitch_mm, {} if provenance is None else provenance, layout.counts)
 
     @classmethod
@@ -253,7 +253,7 @@ class Morphology:
         """Knots drawn uniformly over the pad, as the published search starts from; fibres as `straight` takes them."""
         layout = Layout.of(fibres, pitch_mm)
         knots = _knot_count(layout, knots)
-        known = seed if isinstance(seed, np.random.Generator) else whole("seed", seed, 0, 2**64 - 1)
+        known = seed if isinstance(seed, np.random.Generator) else check_int("seed", seed, 0, 2**64 - 1)
         rng = np.random.default_rng(known)
         inner = rng.uniform(MARGIN, np.array(layout.extent) - MARGIN, (layout.fibres, knots, 2))
         return cls.of_layout(assemble(inner, layout), layout)
@@ -273,7 +273,7 @@ class Morphology:
         """
         if not self.layout.is_square:
             raise InputError(f"a pad of {self.layout} is no tile, expected M + M fibres of one pitch")
-        times = whole("times", times, 1, MOST_FIBRES // self.grid)
+        times = check_int("times", times, 1, MOST_FIBRES // self.grid)
         _knot_count(Layout.of(self.grid * times), times * (self.knots.shape[1] - 1) + 1)
         grid, size = self.grid, self.grid * times
         out = np.empty((2 * size, times * (self.knots.shape[1] - 1) + 3, 2))
@@ -317,7 +317,7 @@ class Morphology:
         Raises:
             InputError: something is missing, or breaks the rules of the class.
         """
-        mapping("document", document)
+        check_mapping("document", document)
         try:
             knots = np.array(document["knots"], dtype=np.float64)
             square = document.get("format", SQUARE_FORMAT) == SQUARE_FORMAT
@@ -362,7 +362,7 @@ class Morphology:
 
 def _as_places(name: str, values: ArrayLike) -> Array:
     """(..., 2) places, none of them too."""
-    places = reals(name, values, FARTHEST)
+    places = check_array(name, values, FARTHEST)
     if places.shape == (0,):
         return places.reshape(0, 2)
     if places.shape[-1:] != (2,):
@@ -372,13 +372,13 @@ def _as_places(name: str, values: ArrayLike) -> Array:
 
 def _knot_count(layout: Layout, knots: int) -> int:
     """Inner knots of a fibre, as far as there may be so many."""
-    return whole("knots", knots, 0, MOST_KNOTS // layout.fibres - 2)
+    return check_int("knots", knots, 0, MOST_KNOTS // layout.fibres - 2)
 
 
 def _fibres_of(document: Mapping[str, Any], count: int) -> tuple[int, int]:
     """(H, V) of a square pad of that many fibres."""
     if count % 2 or document.get("grid", count // 2) != count // 2:
-        raise InputError(f"grid is {shown(document.get('grid'))}, but there are {count} fibres")
+        raise InputError(f"grid is {short_repr(document.get('grid'))}, but there are {count} fibres")
     return count // 2, count // 2
 
 

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, instance, shown, whole
-from padforge.design.contact import boustrophedon, signals
+from padforge.design.common.validation import InputError, check_int, check_type, short_repr
+from padforge.design.contact import serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class _Rows:
 
 
 @dataclass
-class Fit(_Rows):
+class LmBatchState(_Rows):
     """Networks with the output weights that are best for their hidden ones.
 
     Attributes:
@@ -131,7 +131,7 @@ class _Batch(_Rows):
 
     number: Tensor
     steps: Tensor
-    fit: Fit
+    fit: LmBatchState
     x: Tensor
     right: Tensor
     check_x: Tensor
@@ -145,7 +145,7 @@ class _Batch(_Rows):
     def begun(cls, hidden: Tensor, learn: Examples, validate: Examples) -> Self:
         """Before the first step."""
         (x, right), (check_x, check_right) = ((with_ones(inputs), targets) for inputs, targets in (learn, validate))
-        fit = reassigned(Fit.of(hidden, x, right[:, 0]), x, right)
+        fit = reassigned(LmBatchState.of(hidden, x, right[:, 0]), x, right)
         least = squares(nearest(neurons_of(hidden, check_x) @ fit.output, check_right)[1])
         number = torch.arange(len(hidden), device=hidden.device)
         none = torch.zeros_like(number)
@@ -160,7 +160,7 @@ class _Batch(_Rows):
         """
         slope = pull_back(self.x, self.fit, self.fit.error)
         change = self._change(slope)
-        candidate = Fit.of(self.fit.hidden - change.view_as(self.fit.hidden), self.x, self.fit.targets)
+        candidate = LmBatchState.of(self.fit.hidden - change.view_as(self.fit.hidden), self.x, self.fit.targets)
         foreseen = (change * (self.damping[:, None] * change + slope)).sum(dim=1)
         ratio = (self.fit.squares - candidate.squares) / foreseen
         gained = (ratio > 0) & candidate.squares.isfinite()
@@ -214,14 +214,14 @@ def nearest(found: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     return right.take_along_dim(chosen, dim=1)[:, 0], errors.take_along_dim(chosen, dim=1)[:, 0]
 
 
-def reassigned(fit: Fit, x: Tensor, right: Tensor) -> Fit:
+def reassigned(fit: LmBatchState, x: Tensor, right: Tensor) -> LmBatchState:
     """The fit to those of the targets (S, A, Q, O) that are nearest to what `fit` finds: never a worse one."""
     if right.shape[1] == 1:
         return fit
-    return Fit.of(fit.hidden, x, nearest(fit.neurons @ fit.output, right)[0])
+    return LmBatchState.of(fit.hidden, x, nearest(fit.neurons @ fit.output, right)[0])
 
 
-def curvature(x: Tensor, fit: Fit) -> Tensor:
+def curvature(x: Tensor, fit: LmBatchState) -> Tensor:
     """J'R J (S, P, P), its lower triangle only, in the precision of x (S, Q, D+1).
 
     Output k responds to the weight of neuron i on input a by V_ki (1 - h_i^2) x_a: all but V_ki is common to the
@@ -245,7 +245,7 @@ def curvature(x: Tensor, fit: Fit) -> Tensor:
     return matrix
 
 
-def dual_curvature(x: Tensor, fit: Fit) -> Tensor:
+def dual_curvature(x: Tensor, fit: LmBatchState) -> Tensor:
     """R J J'R (S, Q O, Q O), in the precision of x (S, Q, D+1).
 
     Entry ((q, k), (r, l)) of J J' is (x_q . x_r) sum_i V_ki V_li b_qi b_ri with b = 1 - h^2.
@@ -266,12 +266,12 @@ def dual_curvature(x: Tensor, fit: Fit) -> Tensor:
     return matrix.view(networks, samples * many, samples * many)
 
 
-def pull_back(x: Tensor, fit: Fit, error: Tensor) -> Tensor:
+def pull_back(x: Tensor, fit: LmBatchState, error: Tensor) -> Tensor:
     """J'e (S, P) for errors (S, Q, O)."""
     return (x.mT @ ((error @ fit.output[:, :-1].mT) * bends(fit))).flatten(1)
 
 
-def bends(fit: Fit) -> Tensor:
+def bends(fit: LmBatchState) -> Tensor:
     """(S, Q, H) slopes of the neurons, 1 - h^2."""
     return 1 - fit.neurons[:, :, :-1].square()
 
@@ -466,7 +466,7 @@ BATCH = 14
 
 
 @dataclass(frozen=True)
-class LossError:
+class FailureError:
     """Localisation error with some fibres lost, in grid units, over the sets of fibres that may be lost.
 
     Attributes:
@@ -490,7 +490,7 @@ def localisation_error(
     presses: int = 1024,
     test: int = 2000,
     subsets: int | None = None,
-) -> list[LossError]:
+) -> list[FailureError]:
     """The error of the published localizer, trained afresh for every set of lost fibres (paper, evaluation).
 
     It is taken over presses that were never trained on; the paper's own figures are over all presses, those trained on
@@ -509,22 +509,22 @@ def localisation_error(
     Raises:
         InputError: `presses` is no square of a number from 2, there is nothing to test on, or too much to do.
     """
-    presses = whole("presses", presses, 4, MOST_PRESSES)
+    presses = check_int("presses", presses, 4, MOST_PRESSES)
     side = math.isqrt(presses)
     if side**2 != presses:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
-    test, hidden = whole("test", test, 1, MOST_PRESSES), whole("hidden", hidden, 1, 1000)
-    seed, contact = whole("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    fibres = len(instance("pad", pad, Morphology).knots)
+    test, hidden = check_int("test", test, 1, MOST_PRESSES), check_int("hidden", hidden, 1, 1000)
+    seed, contact = check_int("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact, PUBLISHED_CONTACT)
+    fibres = len(check_type("pad", pad, Morphology).knots)
     if not isinstance(lost, Sequence) or isinstance(lost, str):
-        raise InputError(f"lost is {shown(lost)}, expected numbers of lost fibres")
-    levels = [number for number in lost if whole("lost", number, 0, 2 * MOST_FIBRES) < fibres]
+        raise InputError(f"lost is {short_repr(lost)}, expected numbers of lost fibres")
+    levels = [number for number in lost if check_int("lost", number, 0, 2 * MOST_FIBRES) < fibres]
     sets = [math.comb(fibres, number) for number in levels]
     if subsets is not None:
-        sets = [min(all_of_them, whole("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]
+        sets = [min(all_of_them, check_int("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]
     if sum(sets) > MOST_NETWORKS:
         raise InputError(f"subsets is {subsets}: that takes {sum(sets)} networks, allowed are {MOST_NETWORKS}")
-    losses = [lost_subsets(fibres, number, most) for number, most in zip(levels, sets, strict=True)]
+    losses = [failure_subsets(fibres, number, most) for number, most in zip(levels, sets, strict=True)]
     return PressSets.of(pad, side, test, seed, lambda places: signals(pad, places, contact)).loss_errors(losses, hidden)
 
 
@@ -568,7 +568,7 @@ class PressSets:
         learned, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
         return cls(learned, answer(learned), fresh, answer(fresh), seed)
 
-    def loss_errors(self, losses: Sequence[Sequence[Loss]], hidden: int) -> list[LossError]:
+    def loss_errors(self, losses: Sequence[Sequence[Loss]], hidden: int) -> list[FailureError]:
         """Errors of networks of `hidden` neurons with fibres lost: for each number of them, over the sets given."""
 
         def means(batch: list[Loss]) -> Array:
@@ -580,7 +580,7 @@ class PressSets:
             found = dict(run_tasks((key, partial(means, batch)) for key, batch in parts.items()))
         by_level = [np.concatenate([found[key] for key in parts if key[0] == at]) for at in range(len(losses))]
         return [
-            LossError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
+            FailureError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
             for sets, level in zip(losses, by_level, strict=True)
         ]
 
@@ -609,7 +609,7 @@ class PressSets:
 def training_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
     """(side^2, 2) presses of a jittered serpentine over a rectangle, grid units."""
     jitter_seed = int(np.random.default_rng([0, seed]).integers(2**32))
-    return boustrophedon(rectangle, side, JITTER, jitter_seed)
+    return serpentine_presses(rectangle, side, JITTER, jitter_seed)
 
 
 def fresh_presses(rectangle: Rectangle, count: int, seed: int) -> Array:

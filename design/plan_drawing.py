@@ -8,7 +8,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import NDArray
 
 from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
-from padforge.design.common.validation import InputError, instance, reals, shown
+from padforge.design.common.validation import InputError, check_array, check_type, short_repr
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
 from padforge.design.paths.curves import crossings, flatten
@@ -24,10 +24,10 @@ def draw_plan(
     Same-family crossings are ringed, places of broken rules crossed out in red, keep-outs hatched, the contact drawn
     at the centre.
     """
-    pad, contact = instance("pad", pad, Morphology), instance("contact", contact, Contact)
+    pad, contact = check_type("pad", pad, Morphology), check_type("contact", contact, Contact)
     holes = _polygons(keep_out_mm)
     if not isinstance(violations, Sequence) or not all(isinstance(found, Violation) for found in violations):
-        raise InputError(f"violations is {shown(violations)}, expected what check_rules found")
+        raise InputError(f"violations is {short_repr(violations)}, expected what check_rules found")
     width, height = (side / 2 for side in pad.layout.size_mm)
     half, longer = max(width, height), 6.4 / max(width, height)
     figure = Figure(figsize=(max(longer * width, 4.8), max(longer * height, 2.4)), layout="constrained")
@@ -86,8 +86,8 @@ def _half_width(reach: Sequence[tuple[float, float]]) -> float:
 def _polygons(keep_out_mm: object) -> list[NDArray[np.float64]]:
     """Polygons (n, 2) in mm, of one corner or more."""
     if not isinstance(keep_out_mm, Sequence):
-        raise InputError(f"keep_out_mm is {shown(keep_out_mm)}, expected polygons as [pad] has them")
-    found = [reals("keep_out_mm", corners) for corners in keep_out_mm]
+        raise InputError(f"keep_out_mm is {short_repr(keep_out_mm)}, expected polygons as [pad] has them")
+    found = [check_array("keep_out_mm", corners) for corners in keep_out_mm]
     for corners in found:
         if corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
             raise InputError(f"keep_out_mm has a polygon of shape {corners.shape}, expected (n, 2)")

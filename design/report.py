@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import as_written, read_json, unchanged
-from padforge.design.common.page import PageSection, beside, figures, folded, heading, paragraph, table
+from padforge.design.common.files import read_json, reraise_as_input_error, unchanged
+from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
 _TERMS = {
@@ -43,7 +43,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     fibres = PageSection(
         "Fibres",
         [
-            beside(
+            columns(
                 [figures([(folder / "design.svg", plan)])],
                 [
                     heading("Errors by lost fibres"),
@@ -67,7 +67,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
             paragraph(f"Checked on the exact curves: {holds}."),
             table(["rule", "limit", "verdict", "setting"], list(_rules(settings["rules"], broken))),
             *([table(["broken rule", "fibres", "place (mm)", "measured", "limit"], _places(broken))] if broken else []),
-            folded("All terms of the objective", [table(["term", "value", "what it is"], list(_terms(terms)))]),
+            collapsible("All terms of the objective", [table(["term", "value", "what it is"], list(_terms(terms)))]),
         ],
         [
             (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
@@ -103,7 +103,7 @@ def stage_pages(
     for name, path, made_of in stages:
         if path.exists():
             document = read_json(path, f"padforge-{name}/1")
-            with as_written(path):
+            with reraise_as_input_error(path):
                 strange += _misfits(folder, name, document, recording)
                 sections += made_of(folder, document)
                 origins.append(provenance_row(folder, name, document))
@@ -153,7 +153,7 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     """Where all results came from, as rows of `origin` say."""
     head = ["stage", "command", "seed", "versions", "inputs (sha256)"]
     return PageSection(
-        "Provenance", [folded("Commands, seeds, versions and inputs of every stage", [table(head, rows)])]
+        "Provenance", [collapsible("Commands, seeds, versions and inputs of every stage", [table(head, rows)])]
     )
 
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.command_line import progress
 from padforge.design.common.files import (
-    as_written,
+    atomic_files,
     check_replaceable,
     provenance,
     read_json,
+    reraise_as_input_error,
     sha256,
-    staged,
     write_json,
 )
 from padforge.design.common.plotting import save_figure
@@ -22,7 +22,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.contact_comparison import contact_of
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation, check_rules
-from padforge.design.optimize.search import SearchResult, SearchRun, search
+from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
 from padforge.design.plan_drawing import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from padforge.design.common.settings import Spec
-    from padforge.design.optimize.search import SearchListener
+    from padforge.design.optimize.search import OnProgress
 
 SURE = 0.05
 """Share by which expected errors must differ to say which pad a trained network will locate better by."""
@@ -54,7 +54,7 @@ def run_search(
     out: Path,
     overrides: dict[str, Any],
     origin: str | None = None,
-    run: SearchRun | None = None,
+    run: SearchOptions | None = None,
     twin: Path | None = None,
     written: Callable[[SearchResult], None] = lambda result: None,
     remade: Collection[str] = (),
@@ -79,7 +79,7 @@ def run_search(
     pad, path = asked.pad, out / "morphology.json"
     check_replaceable(path, asked.made_by, remade, force)
     with progress() as bar:
-        run = replace(run or SearchRun(), report=_shown_on(bar), keep_in=out / "search")
+        run = replace(run or SearchOptions(), report=progress_callback(bar), keep_in=out / "search")
         wanted = pad, asked.contact, asked.settings, asked.rules
         if twin is None:
             result = search(*wanted, origin=asked.begin, run=run)
@@ -97,7 +97,7 @@ def run_search(
         "stopped": result.stopped,
         "provenance": asked.made_by,
     }
-    with stage("figures"), staged(out) as together:
+    with stage("figures"), atomic_files(out) as together:
         Morphology.of_layout(result.morphology.knots, pad.layout, asked.made_by).save(together / path.name)
         check_replaceable(path, together / path.name, remade, force)  # a search of the same settings may end elsewhere
         document["morphology_sha256"] = sha256(together / path.name)
@@ -143,7 +143,7 @@ def _request(spec: "Spec", overrides: dict[str, Any], origin: str | None = None,
     return _Request(pad, contact, settings, rules, begin, made_by)
 
 
-def found_before(out: Path) -> SearchResult | None:
+def load_result(out: Path) -> SearchResult | None:
     """What a search into `out` has found, or None where the morphology there is another one.
 
     Raises:
@@ -153,7 +153,7 @@ def found_before(out: Path) -> SearchResult | None:
     if not (path.exists() and (out / "morphology.json").exists()):
         return None
     document = read_json(path, "padforge-design/1")
-    with as_written(path):
+    with reraise_as_input_error(path):
         if document["morphology_sha256"] != sha256(out / "morphology.json"):
             return None
         terms, straight = (
@@ -221,7 +221,7 @@ def _located(result: SearchResult) -> list[str]:
     return lines
 
 
-def _shown_on(bar: "Progress") -> "SearchListener":
+def progress_callback(bar: "Progress") -> "OnProgress":
     tasks: dict[str, TaskID] = {}
     best: list[float] = []
 

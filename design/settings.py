@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from padforge.design.common.settings import Settings, as_python, as_tuple, none_as
-from padforge.design.common.validation import InputError, real, shown, whole
+from padforge.design.common.settings import Settings, as_tuple, null_as, to_builtins
+from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,9 +52,9 @@ class Layout:
 
     def __post_init__(self) -> None:
         for name in ("horizontals", "verticals"):
-            object.__setattr__(self, name, whole(name, getattr(self, name), 0, MOST_FIBRES))
+            object.__setattr__(self, name, check_int(name, getattr(self, name), 0, MOST_FIBRES))
         for name in ("pitch_x_mm", "pitch_y_mm"):
-            object.__setattr__(self, name, real(name.removesuffix("_mm"), getattr(self, name), 0.1, 1000))
+            object.__setattr__(self, name, check_float(name.removesuffix("_mm"), getattr(self, name), 0.1, 1000))
         if not self.fibres:
             raise InputError("a pad of 0 horizontals and 0 verticals has no fibre, allowed is 1 or more in all")
 
@@ -70,11 +70,11 @@ class Layout:
         if isinstance(fibres, tuple | list):
             horizontals, verticals = _two("fibres", fibres)
         else:
-            horizontals = verticals = whole("grid", fibres, 1, MOST_FIBRES)
+            horizontals = verticals = check_int("grid", fibres, 1, MOST_FIBRES)
         if isinstance(pitch_mm, tuple | list):
             along_x, along_y = _two("pitch_mm", pitch_mm)
         else:
-            along_x = along_y = real("pitch_mm", pitch_mm, 0.1, 1000)
+            along_x = along_y = check_float("pitch_mm", pitch_mm, 0.1, 1000)
         return cls(horizontals, verticals, along_x, along_y)
 
     @property
@@ -157,11 +157,11 @@ class Layout:
 
 def _two(name: str, values: Sequence[Any]) -> tuple[Any, Any]:
     if len(values) != 2:
-        raise InputError(f"{name} is {shown(values)}, expected one number or two")
+        raise InputError(f"{name} is {short_repr(values)}, expected one number or two")
     return values[0], values[1]
 
 
-Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *none_as("circle")]
+Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *null_as("circle")]
 
 
 MEASURED_REACH = (
@@ -217,7 +217,7 @@ class Contact(Settings):
     @classmethod
     def _of_one_kind(cls, given: object) -> object:
         """What is left out, by what is given: a shape as published, or a reach."""
-        given = as_python(given)  # `Settings` does so later, and an array says not whether it is empty
+        given = to_builtins(given)  # `Settings` does so later, and an array says not whether it is empty
         if not isinstance(given, Mapping):
             return given
         reach = given.get("reach", () if _SHAPE & given.keys() else MEASURED_REACH)
@@ -295,8 +295,8 @@ TRACK_WIDTH_MM = 0.4
 MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
 """Least limit on what two tracks have in common: two that cross straight and at a right angle have two widths."""
 
-MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *none_as("any")]
-MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *none_as("any")]
+MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
+MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
 
 
 class RulesSettings(Settings):
@@ -478,8 +478,8 @@ def _side_lengths(value: object) -> object:
     return as_tuple(value)
 
 
-BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *none_as("flat")]
-Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *none_as("grid")]
+BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
+Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
 

@@ -12,7 +12,7 @@ from padforge.design.common import profiling
 from padforge.design.contact import note_reach, press_shape
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
-from padforge.design.kernels.geometry import Ends, Law, family_strays
+from padforge.design.kernels.geometry import Ends, Law, max_offsets
 from padforge.design.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
 from padforge.design.settings import Contact
 
@@ -121,7 +121,7 @@ class ExactSignals(torch.autograd.Function):
     ) -> Tensor:
         """Signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        strays, none = family_strays(v[None], ends), np.empty(0, np.int64)
+        strays, none = max_offsets(v[None], ends), np.empty(0, np.int64)
         ctx.inputs = (t, v, d, strays[0], ends, presses, shape)
         out = np.zeros(len(presses) * len(t))
         begin, end = 0, len(presses)
@@ -159,7 +159,7 @@ class MeasuredSignals(torch.autograd.Function):
         out = np.empty((len(presses), len(t)))
         looked_at = element_signals(t, v, elements, presses, law.radius, law.profile, out)
         if profiling.is_profiling():
-            note_reach(t[None], family_strays(v[None], ends), ends, presses, extents, looked_at)
+            note_reach(t[None], max_offsets(v[None], ends), ends, presses, extents, looked_at)
         return torch.from_numpy(out.T)
 
     @staticmethod

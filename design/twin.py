@@ -12,8 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common.files import read_json, write_json
-from padforge.design.common.validation import InputError, instance, mapping, real, reals, shown, whole
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import (
+    InputError,
+    check_array,
+    check_float,
+    check_int,
+    check_mapping,
+    check_type,
+    short_repr,
+)
+from padforge.design.common.validation import check_path as as_path
 from padforge.design.contact import as_presses
 from padforge.design.kernels.geometry import profile_of, profile_weights
 from padforge.design.morphology import Array, Morphology
@@ -33,7 +41,7 @@ MOST_ELEMENTS = 2**23
 
 
 @dataclass(frozen=True)
-class Frame:
+class PlanTransform:
     """How a pad lay under the arm: a press at p mm was made at scale turn(mirror(p)) + shift of the plan.
 
     Attributes:
@@ -47,13 +55,13 @@ class Frame:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        instance("mirrored", self.mirrored, bool)
-        object.__setattr__(self, "turn_deg", real("turn_deg", self.turn_deg, -360, 360))
-        shift = reals("shift_mm", self.shift_mm, MOST_MM)
+        check_type("mirrored", self.mirrored, bool)
+        object.__setattr__(self, "turn_deg", check_float("turn_deg", self.turn_deg, -360, 360))
+        shift = check_array("shift_mm", self.shift_mm, MOST_MM)
         if shift.shape != (2,):
-            raise InputError(f"shift_mm is {shown(self.shift_mm)}, expected two numbers")
+            raise InputError(f"shift_mm is {short_repr(self.shift_mm)}, expected two numbers")
         object.__setattr__(self, "shift_mm", tuple(shift.tolist()))
-        object.__setattr__(self, "scale", real("scale", self.scale, 0.1, 10))
+        object.__setattr__(self, "scale", check_float("scale", self.scale, 0.1, 10))
 
     def to_plan(self, places_mm: Array) -> Array:
         """(Q, 2) mm as the arm counts to (Q, 2) mm on the plan, both from the middle."""
@@ -85,12 +93,12 @@ class TwinChannel:
     explained: float
 
     def __post_init__(self) -> None:
-        whole("channel", self.channel, 0, MOST_CHANNELS)
+        check_int("channel", self.channel, 0, MOST_CHANNELS)
         if self.fibre is not None:
-            whole("fibre", self.fibre, 0, MOST_CHANNELS)
+            check_int("fibre", self.fibre, 0, MOST_CHANNELS)
         for name, least in (("gain_v", -MOST_VOLTS), ("noise_v", 0.0)):
-            object.__setattr__(self, name, real(name, getattr(self, name), least, MOST_VOLTS))
-        object.__setattr__(self, "explained", real("explained", self.explained, -1e9, 1))
+            object.__setattr__(self, name, check_float(name, getattr(self, name), least, MOST_VOLTS))
+        object.__setattr__(self, "explained", check_float("explained", self.explained, -1e9, 1))
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,7 @@ class TwinScatter:
 
     def __post_init__(self) -> None:
         for name, most in (("share", 1), ("common", 0.99), ("floor", 1)):
-            object.__setattr__(self, name, real(name, getattr(self, name), 0, most))
+            object.__setattr__(self, name, check_float(name, getattr(self, name), 0, most))
 
 
 @dataclass(frozen=True)
@@ -133,7 +141,7 @@ class TwinReadings:
     def __post_init__(self) -> None:
         limits = (("noise_mv", 0, 1e3), ("drift_mv", 0, 1e3), ("hysteresis", 0, 0.99), ("hysteresis_s", 0.01, 1e4))
         for name, least, most in (*limits, ("looks", 1, MOST_LOOKS)):
-            object.__setattr__(self, name, real(name, getattr(self, name), least, most))
+            object.__setattr__(self, name, check_float(name, getattr(self, name), least, most))
 
 
 @dataclass(frozen=True)
@@ -159,7 +167,7 @@ class Twin:
 
     morphology: Morphology
     channels: tuple[TwinChannel, ...]
-    frame: Frame
+    frame: PlanTransform
     distance_mm: Array
     weight: Array
     laid_mm: tuple[Array | None, ...]
@@ -173,13 +181,13 @@ class Twin:
     scatter: TwinScatter = TwinScatter()
 
     def __post_init__(self) -> None:
-        fibres = len(instance("morphology", self.morphology, Morphology).knots)
+        fibres = len(check_type("morphology", self.morphology, Morphology).knots)
         _refuse_wiring([channel.fibre for channel in self.channels if channel.fibre is not None], fibres)
         for name in ("distance_mm", "weight", *(["angle_weight"] if self.angle_weight is not None else [])):
-            object.__setattr__(self, name, reals(name, getattr(self, name), MOST_MM))
+            object.__setattr__(self, name, check_array(name, getattr(self, name), MOST_MM))
             if getattr(self, name).shape != (len(self.distance_mm),):
                 raise InputError(f"{name} of reach must be a row of {len(self.distance_mm)} numbers, as distance_mm is")
-        laid = tuple(None if line is None else reals("laid_mm", line, MOST_MM) for line in self.laid_mm)
+        laid = tuple(None if line is None else check_array("laid_mm", line, MOST_MM) for line in self.laid_mm)
         if len(laid) != fibres or any(line is not None and line.shape[1:] != (2,) for line in laid):
             raise InputError(f"laid_mm must have a row of points or null for each of the {fibres} fibres")
         length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in laid if line is not None)
@@ -187,18 +195,18 @@ class Twin:
             raise InputError(f"laid_mm are {length:.3g} mm long in all, allowed are {most:.3g}")
         object.__setattr__(self, "laid_mm", laid)
         if self.sensitivity is not None:
-            found = tuple(None if row is None else reals("sensitivity", row, MOST_MM) for row in self.sensitivity)
+            found = tuple(None if row is None else check_array("sensitivity", row, MOST_MM) for row in self.sensitivity)
             pieces = [None if line is None else (len(line) - 1,) for line in laid]
             if [None if row is None else row.shape for row in found] != pieces:
                 raise InputError("sensitivity must have a number for each piece of each course in laid_mm")
             object.__setattr__(self, "sensitivity", found)
-        object.__setattr__(self, "noise", real("noise", self.noise, 1e-9, 10))
-        sensed = reals("sensed_mm", self.sensed_mm, MOST_MM)
+        object.__setattr__(self, "noise", check_float("noise", self.noise, 1e-9, 10))
+        sensed = check_array("sensed_mm", self.sensed_mm, MOST_MM)
         if sensed.shape != (2,) or sensed.min() <= 0:
-            raise InputError(f"sensed_mm is {shown(self.sensed_mm)}, expected width and height above 0")
+            raise InputError(f"sensed_mm is {short_repr(self.sensed_mm)}, expected width and height above 0")
         object.__setattr__(self, "sensed_mm", tuple(sensed.tolist()))
-        whole("presses", self.presses, 1, 2**53)
-        mapping("provenance", self.provenance)
+        check_int("presses", self.presses, 1, 2**53)
+        check_mapping("provenance", self.provenance)
         self.contact()
 
     def contact(self) -> Contact:
@@ -220,7 +228,7 @@ class Twin:
         It is their signal over the length of the fibre on the plan; 0 for a fibre that no channel reads. Summed over
         elements of at most LONGEST, within some 1e-4 of the integral.
         """
-        if (pressed_mm := reals("places_mm", places_mm, MOST_MM)).shape[1:] != (2,):
+        if (pressed_mm := check_array("places_mm", places_mm, MOST_MM)).shape[1:] != (2,):
             raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
         places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
         reach = self.contact().profile_points(self.morphology.unit_mm)
@@ -250,7 +258,7 @@ class Twin:
             return cls(
                 Morphology.of_document(document["morphology"]),
                 tuple(TwinChannel(**channel) for channel in document["channels"]),
-                Frame(**document["frame"]),
+                PlanTransform(**document["frame"]),
                 reach["distance_mm"],
                 reach["weight"],
                 tuple(document["laid_mm"]),

@@ -75,7 +75,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
 
     The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
     """
-    from padforge.design.common.files import claimed
+    from padforge.design.common.files import locked_folder
     from padforge.design.morphology import Morphology
 
     from .export import build as build_files
@@ -84,7 +84,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     settings = FabricationSettings.from_spec(load_spec(spec))
     pad = Morphology.load(morphology)
     folder = out or pad_folder(morphology)
-    with claimed(folder):
+    with locked_folder(folder):
         inputs = [path for path in (morphology, spec) if path]
         document = build_files(
             pad, folder, split_formats(formats), settings, inputs, warn=partial(click.echo, err=True)
@@ -121,7 +121,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     padforge fabricate check out/pad/mould.stl
     padforge fabricate check out/pad/morphology.json --picture found.png
     """
-    from padforge.design.common.files import atomic
+    from padforge.design.common.files import atomic_file
     from padforge.fabricate.checks.plan_checks import inspect_file
     from padforge.fabricate.report.pictures import draw_findings
 
@@ -129,7 +129,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
 
     vertices, triangles, findings = inspect_file(mesh_or_morphology, FabricationSettings.from_spec(load_spec(spec)))
     if picture is not None:
-        with atomic(picture) as temporary:
+        with atomic_file(picture) as temporary:
             draw_findings(vertices, triangles, findings, temporary)
     passed = all(finding.status != "fail" for finding in findings)
     documents = [finding.document() for finding in findings]

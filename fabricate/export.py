@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from padforge.design.common import profiling
 from padforge.design.common.files import (
+    atomic_files,
+    check_file,
     provenance,
     read_json,
-    require_file,
+    reraise_write_error,
     sha256,
-    staged,
     unchanged,
     write_json,
-    writing,
 )
-from padforge.design.common.validation import InputError, instance, path, shown
+from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.findings import Finding, verdict
 from padforge.fabricate.checks.mesh_checks import SOUND, sound
@@ -105,7 +105,7 @@ def build(
         InputError: an unknown format, an input that is no file, settings that contradict each other or refuse this
             pad, a mould that is no closed solid, or files that cannot be written; `out` is as it was then.
     """
-    out = path("out", out)
+    out = check_path("out", out)
     require_formats(formats)
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
     made_by = provenance("fabricate", inputs=_require_files(inputs), packages=packages)  # minutes later they may differ
@@ -141,15 +141,15 @@ def build(
 
 def require_formats(formats: Sequence[str]) -> None:
     """Raise InputError for a format that is none of `FORMATS`."""
-    for name in instance("formats", formats, Sequence):
+    for name in check_type("formats", formats, Sequence):
         if not isinstance(name, str) or name not in FORMATS:
-            raise InputError(f"formats: got {shown(name)}, allowed are {', '.join(FORMATS)}")
+            raise InputError(f"formats: got {short_repr(name)}, allowed are {', '.join(FORMATS)}")
 
 
 def _require_files(inputs: Sequence[Path]) -> list[Path]:
-    inputs = [path("inputs", given) for given in instance("inputs", inputs, Sequence)]
+    inputs = [check_path("inputs", given) for given in check_type("inputs", inputs, Sequence)]
     for given in inputs:
-        require_file(given)
+        check_file(given)
     return inputs
 
 
@@ -158,9 +158,9 @@ def _put_in_place(out: Path, writes: Sequence[Write], document: dict[str, Any], 
     names = {name for name, _ in writes}
     earlier = _earlier_files(out)
     gone = unchanged(out, earlier) - names
-    with staged(out, without=gone) as folder:
+    with atomic_files(out, without=gone) as folder:
         for name, write in writes:
-            with profiling.stage(f"write {name}"), writing(out / name):
+            with profiling.stage(f"write {name}"), reraise_write_error(out / name):
                 write(folder / name)
         document["sha256"] = {name: sha256(folder / name) for name, _ in writes}
         write_json(folder / "fabrication.json", document)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from padforge.design.common.settings import Settings, as_tuple, none_as
+from padforge.design.common.settings import Settings, as_tuple, null_as
 
 PUBLISHED = "published"
 
@@ -85,7 +85,7 @@ Material = TypeVar("Material", Silicone, Fibre)
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^|\x00-\x1f]*$")]
 """One line, and a cell of a table."""
 Positive = Annotated[float, Field(gt=0, le=1e6)]
-OfPreset = BeforeValidator(as_tuple), *none_as("preset")
+OfPreset = BeforeValidator(as_tuple), *null_as("preset")
 """A key that is "preset" where it is not set, None in the model."""
 
 

@@ -12,9 +12,9 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import require_file
+from padforge.design.common.files import check_file
 from padforge.design.common.validation import InputError
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import check_path as as_path
 from padforge.design.morphology import Array
 from padforge.fabricate.mould.prisms import COLOURS
 
@@ -96,7 +96,7 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     """
     import trimesh
 
-    path = require_file(as_path("path", path))
+    path = check_file(as_path("path", path))
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it says on top of raising
     try:
         if path.suffix.lower() == ".3mf":

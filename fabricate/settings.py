@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from padforge.design.common.settings import Settings, Spec, as_tuple, none_as
-from padforge.design.common.validation import InputError, instance
+from padforge.design.common.settings import Settings, Spec, as_tuple, null_as
+from padforge.design.common.validation import InputError, check_type
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
 from .materials import FibreSettings, SiliconeSettings
@@ -95,7 +95,7 @@ Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Pose = Annotated[
     tuple[Metres, Metres, Metres, Angle, Angle, Angle] | None,
     BeforeValidator(as_tuple),
-    *none_as("unknown"),
+    *null_as("unknown"),
 ]
 
 
@@ -189,12 +189,12 @@ class FabricationSettings:
 
     def __post_init__(self) -> None:
         for name, model in _SECTIONS.items():
-            instance(name, getattr(self, name), model)
+            check_type(name, getattr(self, name), model)
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """The sections of one `pad.toml`."""
-        return cls(*map(instance("spec", spec, Spec).section, _SECTIONS.values()))
+        return cls(*map(check_type("spec", spec, Spec).section, _SECTIONS.values()))
 
     @property
     def flare_mm(self) -> float:

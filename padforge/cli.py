@@ -109,12 +109,12 @@ def _run(
 
     Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
     """
-    from padforge.design.common.files import claimed
+    from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
     run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
     check_ahead(run)
-    with claimed(out):
+    with locked_folder(out):
         if (code := run_stages(run)) != INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")

@@ -4,7 +4,7 @@ from functools import cache
 from pathlib import Path
 
 from padforge.design.common.validation import Fault, InputError
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import check_path as as_path
 
 
 def write_report(folder: Path) -> Path:
@@ -14,7 +14,7 @@ def write_report(folder: Path) -> Path:
         InputError: no stage has left anything, or a file is damaged.
         Fault: there are files of another pad or recording among them, which the page tells first.
     """
-    from padforge.design.common.files import as_written, settle, write_text
+    from padforge.design.common.files import recover, reraise_as_input_error, write_text
     from padforge.design.common.page import PageSection, page
     from padforge.design.contact_comparison import contact_sections
     from padforge.design.report import design_sections, provenance_row, provenance_section, stage_pages
@@ -23,7 +23,7 @@ def write_report(folder: Path) -> Path:
     from padforge.sense.report.identification_results import identification_sections
 
     folder = as_path("folder", folder)
-    settle(folder)
+    recover(folder)
     stages = (
         ("design", folder / "design.json", design_sections),
         ("fabrication", folder / "fabrication.json", fabrication_sections),
@@ -36,7 +36,7 @@ def write_report(folder: Path) -> Path:
     sections, origins, strange = stage_pages(folder, stages, cache(lambda: sensed.recording_digest(folder)))
     studies: list[str] = []
     for path, document in sensed.find_studies(folder):
-        with as_written(path):
+        with reraise_as_input_error(path):
             studies += sensed.study_pieces(path, document)
             origins.append(provenance_row(folder, f"study {path.stem}", document))
     if not origins:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from padforge.design.common.command_line import INTERRUPTED
-from padforge.design.common.files import as_written, read_json, sha256, write_json
+from padforge.design.common.files import read_json, reraise_as_input_error, sha256, write_json
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class RunProgress:
         self._out, self._note = out, out / NAME
         self._stages: dict[str, dict[str, Any]] = {}
         if resume and self._note.exists():
-            with as_written(self._note):
+            with reraise_as_input_error(self._note):
                 self._stages = dict(read_json(self._note, FORMAT)["stages"])
 
     def begin(self) -> None:
@@ -87,7 +87,7 @@ class RunProgress:
         Args:
             made_of: settings and digests of inputs, as JSON has them.
         """
-        with as_written(self._note):
+        with reraise_as_input_error(self._note):
             before = self._stages.get(stage, {})
             same = before.get("made_of") == _digest(made_of)
             return same and dict(before["files"]) == self._digests(before["files"])
@@ -192,13 +192,13 @@ def _remade() -> set[str]:
 
 def _check_calibration(run: Run) -> None:
     """Refuse to replace a localizer that has learnt from other presses than simulated ones: no run makes it again."""
-    from padforge.design.common.files import as_written, read_json
+    from padforge.design.common.files import read_json, reraise_as_input_error
     from padforge.sense.localizer.localizer import FORMAT
 
     path = run.out / "localizer.json"
     if run.force or not path.exists():
         return
-    with as_written(path):
+    with reraise_as_input_error(path):
         kind = read_json(path, FORMAT)["provenance"].get("recording_kind")
     if kind != "simulated":
         raise InputError(
@@ -241,16 +241,16 @@ def run_stages(run: Run) -> int:
 
 def _designed(run: Run, progress: RunProgress, kept: list[str]) -> "SearchResult":
     from padforge.design.common.checkpoints import Checkpoints
-    from padforge.design.optimize.search import SearchRun
-    from padforge.design.run import found_before, run_search
+    from padforge.design.optimize.search import SearchOptions
+    from padforge.design.run import load_result, run_search
 
     made_of = run.made_of("design")
-    if progress.has("design", made_of) and (found := found_before(run.out)):
+    if progress.has("design", made_of) and (found := load_result(run.out)):
         kept.append("fibres")
         if not found.stopped:
             Checkpoints(run.out / "search", {}).clear()  # a kill came just before
         return found
-    how = SearchRun(resume=run.resume, time_budget=run.left_s(SEARCH_SHARE))
+    how = SearchOptions(resume=run.resume, time_budget=run.left_s(SEARCH_SHARE))
 
     def written(found: "SearchResult") -> None:
         if found.stopped != "interrupted":

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from padforge.design.common.settings import Settings, as_tuple, none_as
+from padforge.design.common.settings import Settings, as_tuple, null_as
 from padforge.design.common.validation import InputError
 from padforge.design.settings import Scatter
 
@@ -23,7 +23,7 @@ def _plan(value: str) -> str:
     return value
 
 
-Unknown, Unwatched = none_as("unknown"), none_as("unwatched")
+Unknown, Unwatched = null_as("unknown"), null_as("unwatched")
 Millimetres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Depth = Annotated[float, Field(gt=0, le=50)]

@@ -20,7 +20,7 @@ from importlib import import_module
 from itertools import count
 from pathlib import Path
 
-from padforge.design.common.files import read_json, settle, sha256
+from padforge.design.common.files import read_json, recover, sha256
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.recording import Recording
 from tools.kills import KILLED, forked, kill_at
@@ -123,7 +123,7 @@ def ended(child: int) -> int:
 
 def results(folder: Path) -> dict[str, str]:
     """Digests of the results in `pad`, by name, once whoever reads there has settled what was under way."""
-    settle(folder / "pad")
+    recover(folder / "pad")
     found = {}
     for path in (folder / "pad").iterdir() if (folder / "pad").is_dir() else ():
         if not path.name.startswith(".") and path.name not in _VOLATILE:

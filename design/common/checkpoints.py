@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import MOST_BYTES, atomic, clear_litter, read_bytes, read_json, write_json
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.files import MAX_BYTES, atomic_file, clear_litter, read_bytes, read_json, write_json
+from padforge.design.common.validation import InputError, short_repr
 
 FORMAT = "padforge-search/1"
 
@@ -53,7 +53,7 @@ class Checkpoints:
                 if before.get(section, {}).get(key) != value:
                     was = before.get(section, {}).get(key)
                     raise InputError(
-                        f"{self.folder}: begun with {section} {key} {shown(was)}, now {shown(value)}; "
+                        f"{self.folder}: begun with {section} {key} {short_repr(was)}, now {short_repr(value)}; "
                         "allowed to resume are the same settings"
                     )
         named = {path: _STATE.fullmatch(path.name) for path in sorted(self.folder.glob("start_*.npz"))}
@@ -63,7 +63,7 @@ class Checkpoints:
         """Put the state of a start in the place of its last one, atomically."""
         if not (self.folder / "search.json").exists():
             write_json(self.folder / "search.json", {"format": FORMAT, "settings": self.settings})
-        with atomic(self.folder / f"start_{start:04d}.npz") as temporary:
+        with atomic_file(self.folder / f"start_{start:04d}.npz") as temporary:
             np.savez(temporary, allow_pickle=False, **state, **{_SEAL: np.array(self._seal(start, state))})
 
     def clear(self) -> None:
@@ -90,8 +90,8 @@ class Checkpoints:
         content = io.BytesIO(read_bytes(path))
         try:
             with np.load(content, allow_pickle=False) as arrays:
-                if sum(entry.file_size for entry in arrays.zip.infolist()) > MOST_BYTES:
-                    raise ValueError(f"it unpacks to more than {MOST_BYTES} bytes")
+                if sum(entry.file_size for entry in arrays.zip.infolist()) > MAX_BYTES:
+                    raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
                 state = {name: arrays[name] for name in arrays.files}
             if str(state.pop(_SEAL, "")) != self._seal(start, state):
                 raise ValueError("it is not as it was written")

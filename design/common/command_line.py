@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.validation import Fault, InputError, what_to_install
+from padforge.design.common.validation import Fault, InputError, missing_extra
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -157,7 +157,7 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     except OSError as error:
         return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
     except ModuleNotFoundError as error:
-        message = what_to_install(error, extras.get("".join(sys.argv[1:2]), ",".join(dict.fromkeys(extras.values()))))
+        message = missing_extra(error, extras.get("".join(sys.argv[1:2]), ",".join(dict.fromkeys(extras.values()))))
         if message is None:
             raise
         return _fail(name, message, 2)

@@ -17,11 +17,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple
 
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.validation import InputError, short_repr
 
 
 @contextmanager
-def as_written(path: Path) -> Iterator[None]:
+def reraise_as_input_error(path: Path) -> Iterator[None]:
     """Blame a document that is not as padforge writes it on its file."""
     try:
         yield
@@ -32,7 +32,7 @@ def as_written(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def reraise_write_error(path: Path) -> Iterator[None]:
     """Turn what the system has against writing `path` into one line.
 
     Raises:
@@ -44,9 +44,9 @@ def writing(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def refuse_unwritable(folder: Path) -> None:
+def check_writable(folder: Path) -> None:
     """Raise InputError if files cannot be put into `folder`, or it is not there and cannot be made."""
-    with writing(folder):
+    with reraise_write_error(folder):
         there = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
         if not there.is_dir():
             raise InputError(f"{folder}: cannot be written, {there} is a file, expected a folder")
@@ -101,9 +101,9 @@ def _lock_far(handle: int) -> None:
 
 @contextmanager
 def held_folder(folder: Path, busy: str) -> Iterator[None]:
-    """`held`, of a folder that stays where it is: on Windows by a file in it, which goes with whoever made it."""
+    """`locked`, of a folder that stays where it is: on Windows by a file in it, which goes with whoever made it."""
     if LOCKS:
-        with held(folder, busy):
+        with locked(folder, busy):
             yield
         return
     try:
@@ -118,7 +118,7 @@ def held_folder(folder: Path, busy: str) -> Iterator[None]:
 
 
 @contextmanager
-def held(path: Path, busy: str) -> Iterator[None]:
+def locked(path: Path, busy: str) -> Iterator[None]:
     """Keep others off a file or folder to the end or the death of this run, as `lock` does.
 
     Raises:
@@ -128,7 +128,7 @@ def held(path: Path, busy: str) -> Iterator[None]:
     if not LOCKS:
         yield
         return
-    with writing(path):
+    with reraise_write_error(path):
         try:
             handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError as error:
@@ -180,7 +180,7 @@ def clear_litter(folder: Path, folders: str = _SET, files: str = UNFINISHED) -> 
     """Remove what killed runs of this user have left in a folder; never what a link leads to.
 
     Args:
-        folders, files: with what their names begin, see `scratch` and `unfinished_file`; 16 hex digits follow.
+        folders, files: with what their names begin, see `temporary_folder` and `temporary_file`; 16 hex digits follow.
     """
     if not LOCKS:
         return
@@ -212,7 +212,7 @@ def _remove(path: Path) -> None:
 
 
 @contextmanager
-def scratch(folder: Path, prefix: str = _SET) -> Iterator[Path]:
+def temporary_folder(folder: Path, prefix: str = _SET) -> Iterator[Path]:
     """Yield an empty folder in `folder` that goes at the end, with all that is still in it; left ones go first.
 
     Raises:
@@ -231,7 +231,7 @@ def scratch(folder: Path, prefix: str = _SET) -> Iterator[Path]:
 
 
 @contextmanager
-def unfinished_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> Iterator[Path]:
+def temporary_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> Iterator[Path]:
     """Yield an empty file in `folder` that is gone at the end, unless it has got another name; left ones go first.
 
     Raises:
@@ -281,7 +281,7 @@ class _Note(NamedTuple):
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Keep other runs off `folder` while results are made for it; one that was not there goes again if left empty.
 
     What a killed run has left there is put in place, or goes.
@@ -289,13 +289,13 @@ def claimed(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another run is at it, or it cannot be written.
     """
-    refuse_unwritable(folder)
+    check_writable(folder)
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
-    with writing(folder):
+    with reraise_write_error(folder):
         folder.mkdir(parents=True, exist_ok=True)
     try:
         with held_folder(folder, f"{folder}: another run is writing there; wait for its end, or choose another folder"):
-            settle(folder)
+            recover(folder)
             clear_litter(folder)
             yield
     finally:
@@ -305,7 +305,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def staged(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
+def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Yield an empty folder in `folder`; on success its files move to `folder`, on failure they vanish.
 
     Where they cannot all be moved, or an interrupt comes meanwhile, `folder` is put back as it was; after a kill
@@ -317,28 +317,28 @@ def staged(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     Raises:
         InputError: `folder` cannot be written.
     """
-    with writing(folder):
+    with reraise_write_error(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        settle(folder)
-        with scratch(folder) as stage:
+        recover(folder)
+        with temporary_folder(folder) as stage:
             yield stage
             _exchange(stage, folder, without)
 
 
-def settle(folder: Path) -> None:
+def recover(folder: Path) -> None:
     """Put in place what a killed run of this user was putting in place in a folder, so that its files belong together.
 
     Raises:
         InputError: they cannot be put in place, or are of another user or folder.
     """
     exchange = folder / EXCHANGE
-    with writing(folder), _exchange_in(folder) as note:
+    with reraise_write_error(folder), _exchange_in(folder) as note:
         if note is None:
             return
         if {path.lstat().st_uid for path in (exchange, exchange / _NOTE, exchange / _SEAL)} != {_user()}:
             raise InputError(f"{exchange}: left by a run of another user, who puts its files in place by another run")
         _put(exchange, folder, note)
-        with scratch(folder) as away:
+        with temporary_folder(folder) as away:
             exchange.rename(away / EXCHANGE)
 
 
@@ -369,7 +369,9 @@ def _exchange_in(folder: Path) -> Iterator[_Note | None]:
     while is_folder(exchange) and not _is_strange(exchange, folder):
         with ExitStack() as end:
             try:
-                end.enter_context(held(exchange, f"{folder}: another run is putting files in place; wait for its end"))
+                end.enter_context(
+                    locked(exchange, f"{folder}: another run is putting files in place; wait for its end")
+                )
             except BusyError:
                 if time.monotonic() > until:
                     raise
@@ -471,7 +473,7 @@ def _exchange(stage: Path, folder: Path, without: Collection[str]) -> None:
 def _commit(stage: Path, folder: Path) -> None:
     """Make the files of a stage the valid ones; others that are being put in place come first."""
     while stage.exists():
-        settle(folder)
+        recover(folder)
         try:
             stage.rename(folder / EXCHANGE)
         except OSError as error:
@@ -508,7 +510,7 @@ except ImportError:  # Windows
 
 
 @contextmanager
-def atomic(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it takes `path`'s place, on failure it vanishes.
 
     The temporary name keeps the suffix, because many writers choose their format by it. It is that of an empty file,
@@ -521,12 +523,12 @@ def atomic(path: Path) -> Iterator[Path]:
     if path.name.startswith(UNFINISHED):  # it is another one's, who puts it in place
         yield path
         return
-    with writing(path):
+    with reraise_write_error(path):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it is there and no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
-        settle(path.parent)  # or an older file would come over this one later
-        with unfinished_file(path.parent, path.suffix) as temporary:
+        recover(path.parent)  # or an older file would come over this one later
+        with temporary_file(path.parent, path.suffix) as temporary:
             yield temporary
             temporary.replace(path)
 
@@ -536,7 +538,7 @@ def write_text(path: Path, text: str) -> None:
 
     What UTF-8 has not, as in names of files, is written as \\udc80.
     """
-    with atomic(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
 
 
@@ -580,11 +582,11 @@ def to_disk(handle: int) -> None:
 
 _PACKAGES = ("padforge", "numpy", "scipy")
 
-MOST_BYTES = 2**28
+MAX_BYTES = 2**28
 """A file of more is none that padforge has written, but for recordings."""
 
 
-def require_file(path: Path, most: int = MOST_BYTES) -> Path:
+def check_file(path: Path, most: int = MAX_BYTES) -> Path:
     """Refuse what may never end, such as pipes and devices, and what is too large to be looked at.
 
     Returns:
@@ -607,13 +609,13 @@ def require_file(path: Path, most: int = MOST_BYTES) -> Path:
     return valid
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
     """The content of a file.
 
     Raises:
-        InputError: it cannot be read, or see `require_file`.
+        InputError: it cannot be read, or see `check_file`.
     """
-    valid = require_file(path, most)
+    valid = check_file(path, most)
     try:
         return valid.read_bytes()
     except OSError as error:
@@ -635,7 +637,7 @@ def read_json(path: Path, *kinds: str) -> dict[str, Any]:
         raise InputError(f"{path}: not a JSON file ({error})") from error
     found = document.get("format") if isinstance(document, dict) else None
     if found not in kinds:
-        raise InputError(f"{path}: format is {shown(found)}, expected {' or '.join(map(repr, kinds))}")
+        raise InputError(f"{path}: format is {short_repr(found)}, expected {' or '.join(map(repr, kinds))}")
     return document
 
 
@@ -648,7 +650,7 @@ def sha256(path: Path) -> str:
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
         return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
-    with require_file(path, sys.maxsize).open("rb") as file:
+    with check_file(path, sys.maxsize).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -657,7 +659,7 @@ def unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
 
     def same(name: str) -> bool:
         try:
-            require_file(folder / name)
+            check_file(folder / name)
             return Path(name).name == name and sha256(folder / name) == digests[name]
         except (InputError, OSError):
             return False

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import read_bytes, require_file
-from padforge.design.common.validation import MOST_VALUES, InputError
+from padforge.design.common.files import check_file, read_bytes
+from padforge.design.common.validation import MAX_VALUES, InputError
 
 MOST_FILE_BYTES = 2**33
 """Size of the largest file that is looked at."""
@@ -32,7 +32,7 @@ class Datasets:
 
     def __init__(self, file: Any) -> None:
         self._file = file
-        self._left = MOST_VALUES
+        self._left = MAX_VALUES
         self._names: list[str] | None = None
 
     @property
@@ -86,7 +86,7 @@ class Datasets:
         """
         dataset = self._plain(name)
         if dataset.size is None or dataset.size > self._left:
-            raise InputError(f"{name} holds {dataset.size} values, allowed are {MOST_VALUES} in all that is read")
+            raise InputError(f"{name} holds {dataset.size} values, allowed are {MAX_VALUES} in all that is read")
         if dataset.dtype.kind not in "fiub":
             raise InputError(f"{name} holds {dataset.dtype} values, expected an array of real numbers")
         stored = dataset.id.get_storage_size()
@@ -126,7 +126,7 @@ def plain_datasets(path: Path) -> Iterator[Datasets]:
     """
     import h5py
 
-    path = require_file(path, MOST_FILE_BYTES)
+    path = check_file(path, MOST_FILE_BYTES)
     try:
         with h5py.File(path, "r") as file:
             yield Datasets(file)
@@ -339,7 +339,7 @@ def load_mat(path: Path, needed: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _is_hdf5(path: Path) -> bool:
-    with require_file(path, MOST_FILE_BYTES).open("rb") as file:
+    with check_file(path, MOST_FILE_BYTES).open("rb") as file:
         start = file.read(_TEXT + len(_HDF5))
     return _HDF5 in (start[: len(_HDF5)], start[_TEXT:])
 

@@ -22,7 +22,7 @@ from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError
 
 
-def resource(package: str, name: str) -> str:
+def read_resource(package: str, name: str) -> str:
     """The text of a file that a package ships."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
@@ -69,13 +69,13 @@ def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
 
     Nothing is let in from elsewhere, and no script runs but those of the sections and of the page itself.
     """
-    scripts = [resource(_HERE, "page.js"), *(section.script for section in sections if section.script)]
+    scripts = [read_resource(_HERE, "page.js"), *(section.script for section in sections if section.script)]
     content = {
         "title": title,
         "lead": lead,
         "sections": sections,
         "key_figures": [figure for section in sections for figure in section.figures],
-        "style": resource(_HERE, "page.css"),
+        "style": read_resource(_HERE, "page.css"),
         "scripts": scripts,
         "digests": [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts],
     }
@@ -120,12 +120,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return _element("table", list(zip(header, kinds, strict=True)), body)
 
 
-def beside(*columns: Sequence[str]) -> str:
+def columns(*columns: Sequence[str]) -> str:
     """Pieces in columns, below each other where there is no room."""
     return _element("beside", columns)
 
 
-def folded(summary: str, body: Sequence[str]) -> str:
+def collapsible(summary: str, body: Sequence[str]) -> str:
     """Pieces that are seen once `summary` is clicked, and on paper."""
     return _element("folded", summary, body)
 
@@ -140,7 +140,7 @@ def figures(pictures: Sequence[tuple[Path, str]]) -> str:
     return _element("figures", found) if found else ""
 
 
-def html_pieces(text: str) -> Iterator[str]:
+def render_markdown(text: str) -> Iterator[str]:
     """HTML of Markdown: paragraphs, lists, tables, headings, **bold** and `code`; its title is left out.
 
     What is no such mark is text, HTML too.

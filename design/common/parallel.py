@@ -128,7 +128,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
             raise Fault(f"the cluster at {address} {what}; {advice}") from error
 
 
-def in_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:
+def map_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:
     """Results of work(begin, end) over chunks that make up 0..count, in order, one thread a core.
 
     Args:
@@ -171,7 +171,7 @@ def one_torch_thread() -> Iterator[None]:
                 torch.set_num_threads(_OneThread.before)
 
 
-def forget_outdated(package: Path) -> None:
+def clear_stale_kernels(package: Path) -> None:
     """Delete the compiled kernels of a package, with the rooms in it, if its sources are not those of the last call.
 
     Does nothing where the folder cannot be written: what is compiled then is not kept in it either.

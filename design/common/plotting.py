@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.files import atomic
+from padforge.design.common.files import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,7 +25,7 @@ def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
-    with atomic(path) as temporary:
+    with atomic_file(path) as temporary:
         if path.suffix.lower() == ".svg":
             with mpl.rc_context({"svg.hashsalt": "padforge"}):
                 figure.savefig(temporary, metadata={"Date": None})
@@ -38,17 +38,17 @@ def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
         few.save(temporary, format="PNG", optimize=True)
 
 
-def canvas(width_in: float, height_in: float) -> "tuple[Figure, Any]":
+def new_figure(width_in: float, height_in: float) -> "tuple[Figure, Any]":
     """A figure in the house's style, and its axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     axes = figure.subplots()
-    tidy(axes)
+    style_axes(axes)
     return figure, axes
 
 
-def tidy(axes: Any) -> None:
+def style_axes(axes: Any) -> None:
     """Put axes in the house's style."""
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -58,7 +58,7 @@ def tidy(axes: Any) -> None:
     axes.yaxis.label.set_color(INK)
 
 
-def head(figure: "Figure", text: str) -> None:
+def add_title(figure: "Figure", text: str) -> None:
     """Say over a whole figure what it shows."""
     figure.suptitle(text, x=0.01, ha="left", color=INK, fontsize=11)
 
@@ -75,6 +75,6 @@ def draw_confusions(axes: Any, counts: Sequence[Sequence[int]]) -> None:
     axes.spines[:].set_visible(False)
 
 
-def explain(axes: Any, text: str) -> None:
+def add_caption(axes: Any, text: str) -> None:
     """Say under the title what the marks are."""
     axes.text(0, 1.015, text, transform=axes.transAxes, color=INK, fontsize=8.5)

@@ -23,7 +23,7 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any, Self, TypeVar
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-from padforge.design.common.page import resource
+from padforge.design.common.page import read_resource
 from padforge.design.common.validation import InputError
 
 HOST = "127.0.0.1"
@@ -108,7 +108,7 @@ def _cut(connections: Iterable[socket.socket]) -> None:
 Server = TypeVar("Server", bound=socketserver.BaseServer)
 
 
-def refuse_open(host: str, token: str) -> None:
+def check_exposure(host: str, token: str) -> None:
     """Raise InputError where other machines could listen and no token, or one that can be guessed, keeps them out."""
     if token and not (LEAST_TOKEN <= len(token) <= MOST_TOKEN and token.isascii() and token.isprintable()):
         raise InputError(
@@ -121,7 +121,7 @@ def refuse_open(host: str, token: str) -> None:
         )
 
 
-def listening(begin: Callable[[], Server], host: str, port: int, option: str) -> Server:
+def bind_server(begin: Callable[[], Server], host: str, port: int, option: str) -> Server:
     """The server that `begin` makes.
 
     Raises:
@@ -153,7 +153,7 @@ _SWALLOWED = 2**20
 TEMPLATES = "padforge.design.common.templates"
 _SHARED = ("local_page.css", "local_page.js")
 
-Hear = Callable[[bytes], Mapping[str, Any] | None]
+Handler = Callable[[bytes], Mapping[str, Any] | None]
 """Takes what the page posts to an address; answers with JSON, or nothing. What it cannot use is an InputError."""
 
 
@@ -168,7 +168,7 @@ class LocalPage:
         self,
         port: int,
         page: str,
-        heard: Mapping[str, Hear] | None = None,
+        heard: Mapping[str, Handler] | None = None,
         longest: int = 4096,
         *,
         host: str = HOST,
@@ -180,13 +180,16 @@ class LocalPage:
             page: HTML with one <script> and one <style>, as `page_text` gives it.
             heard: what takes what the page posts, by address; called from several threads at once.
             longest: most bytes that are taken at once.
-            host: address to listen on. token: what must be known to be answered, as `refuse_open` has it; "" for none.
+            host: address to listen on.
+            token: what must be known to be answered, as `check_exposure` has it; "" for none.
 
         Raises:
             InputError: the port is taken, or not for this user, or others could listen without a token.
         """
-        refuse_open(host, token)
-        self._server = listening(lambda: _Server((host, port), token, page, heard or {}, longest), host, port, "--port")
+        check_exposure(host, token)
+        self._server = bind_server(
+            lambda: _Server((host, port), token, page, heard or {}, longest), host, port, "--port"
+        )
         known = f"?{urlencode({'token': token})}" if token else ""
         self.url = f"http://{host}:{self._server.server_address[1]}/{known}"
         self._thread = threading.Thread(
@@ -216,12 +219,12 @@ def page_text(package: str, name: str, *parts: str) -> str:
 
     A part stands in the page as a line `/* its name */` or, where it has several, once for each.
     """
-    text = resource(package, name)
+    text = read_resource(package, name)
     for owner, part in (
         *((TEMPLATES, shared) for shared in _SHARED),
         *((package, part) for part in parts),
     ):
-        text = text.replace(f"/* {part} */\n", resource(owner, part))
+        text = text.replace(f"/* {part} */\n", read_resource(owner, part))
     return text
 
 
@@ -272,7 +275,7 @@ class News:
 
 class _Server(ConnectionServer):
     def __init__(
-        self, address: tuple[str, int], token: str, page: str, heard: Mapping[str, Hear], longest: int
+        self, address: tuple[str, int], token: str, page: str, heard: Mapping[str, Handler], longest: int
     ) -> None:
         self.news = News()
         self.token, self.heard, self.longest = token, heard, longest
@@ -322,7 +325,7 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._answer(hear, body)
 
-    def _answer(self, hear: Hear, body: bytes) -> None:
+    def _answer(self, hear: Handler, body: bytes) -> None:
         try:
             answer = hear(body)
         except InputError as error:

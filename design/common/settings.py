@@ -10,12 +10,12 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
 from padforge.design.common.files import read_bytes
-from padforge.design.common.validation import InputError, instance, mapping, shown
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import InputError, check_mapping, check_type, short_repr
+from padforge.design.common.validation import check_path as as_path
 
-MOST_BYTES = 2**18
+MAX_BYTES = 2**18
 """Longer settings are none that anybody wrote, and would take long to be refused."""
-MOST_DOTS = 200
+MAX_DOTS = 200
 """In a line: keys of very many parts take the reader of TOML time that grows with their square."""
 MAX_DEPTH = 6
 """Of lists and tables in a table; no setting has more, and a list may hold itself."""
@@ -40,7 +40,7 @@ class Settings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _without_numpy(cls, given: object) -> object:
-        return as_python(given)
+        return to_builtins(given)
 
     @classmethod
     def section(cls) -> str:
@@ -53,7 +53,7 @@ class Settings(BaseModel):
 AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
-def as_python(value: Any, depth: int = MAX_DEPTH) -> object:
+def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
     """Return a value with Python's numbers and lists in place of NumPy's scalars and arrays.
 
     Args:
@@ -68,10 +68,10 @@ def as_python(value: Any, depth: int = MAX_DEPTH) -> object:
         # an axis of length 0 counts as 1: lists would be made for the others all the same
         return value if math.prod(max(length, 1) for length in value.shape) > MAX_ITEMS else value.tolist()
     if depth and isinstance(value, list | tuple):
-        items = [as_python(item, depth - 1) for item in value]
+        items = [to_builtins(item, depth - 1) for item in value]
         return items if isinstance(value, list) else tuple(items)
     if depth and isinstance(value, Mapping):
-        return {key: as_python(item, depth - 1) for key, item in value.items()}
+        return {key: to_builtins(item, depth - 1) for key, item in value.items()}
     return value
 
 
@@ -80,7 +80,7 @@ def as_tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
-def none_as(word: str) -> tuple[BeforeValidator, PlainSerializer]:
+def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer]:
     """For `Annotated[... | None, *none_as("unknown")]`: a key that is this word where the model holds None."""
 
     def read(value: object) -> object:
@@ -103,20 +103,20 @@ class Spec:
         source: str = "built-in defaults",
         sections: Collection[str] | None = None,
     ) -> None:
-        mapping("tables", tables)
+        check_mapping("tables", tables)
         try:
-            allowed = tables if sections is None else [*instance("sections", sections, Collection)]
+            allowed = tables if sections is None else [*check_type("sections", sections, Collection)]
         except TypeError as error:  # an array of no dimension is a collection of nothing that could be gone through
-            raise InputError(f"sections are {shown(sections)}, expected names") from error
+            raise InputError(f"sections are {short_repr(sections)}, expected names") from error
         if not all(isinstance(name, str) for name in allowed):
-            raise InputError(f"sections are {shown(sections)}, expected names")
+            raise InputError(f"sections are {short_repr(sections)}, expected names")
         unknown = [name for name in tables if name not in allowed]
         if unknown:
             raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(allowed)}")
         for name, table in tables.items():
             if not isinstance(table, Mapping):
-                raise InputError(f"{source}: {name} is {shown(table)}, expected a section [{name}]")
-            mapping(f"{source}: [{name}]", table)
+                raise InputError(f"{source}: {name} is {short_repr(table)}, expected a section [{name}]")
+            check_mapping(f"{source}: [{name}]", table)
         self.source = source
         self._tables = tables
 
@@ -130,9 +130,9 @@ class Spec:
         if path is None:
             return cls({})
         path = as_path("path", path)
-        content = read_bytes(path, MOST_BYTES)
-        if any(line.count(b".") > MOST_DOTS for line in content.splitlines()):
-            raise InputError(f"{path}: not a settings file (a line has more than {MOST_DOTS} dots)")
+        content = read_bytes(path, MAX_BYTES)
+        if any(line.count(b".") > MAX_DOTS for line in content.splitlines()):
+            raise InputError(f"{path}: not a settings file (a line has more than {MAX_DOTS} dots)")
         try:
             tables = tomllib.loads(content.decode("utf-8-sig"))
         except (ValueError, RecursionError) as error:  # tables within tables without end
@@ -146,7 +146,7 @@ class Spec:
             InputError: an unknown key or a value out of range, naming the key, the value and what is allowed.
         """
         given = {key: value for key, value in overrides.items() if value is not None}
-        return validated(model, {**self.given(model), **given}, f"{self.source}: [{model.section()}]")
+        return validate(model, {**self.given(model), **given}, f"{self.source}: [{model.section()}]")
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
         """These settings, with the values in `tables`, by section, in place of their own."""
@@ -157,7 +157,7 @@ class Spec:
     def given(self, model: type[Settings]) -> Mapping[str, Any]:
         """What the file states of the section `model` stands for, as it stands there."""
         if not (isinstance(model, type) and issubclass(model, Settings)):
-            raise InputError(f"model is {shown(model)}, expected a section such as Pad")
+            raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
         return self._tables.get(model.section(), {})
 
 
@@ -165,10 +165,10 @@ def or_default(
     name: str, value: AnySettings | None, model: type[AnySettings], default: AnySettings | None = None
 ) -> AnySettings:
     """The argument `name` of a public function: a section, or for None `default`, the section's own if that is None."""
-    return (default or model()) if value is None else instance(name, value, model)
+    return (default or model()) if value is None else check_type(name, value, model)
 
 
-def validated(model: type[AnySettings], values: Mapping[str, Any], where: str) -> AnySettings:
+def validate(model: type[AnySettings], values: Mapping[str, Any], where: str) -> AnySettings:
     """`model(**values)`, with pydantic's findings as one InputError line that begins with `where`."""
     try:
         return model.model_validate(dict(values))
@@ -187,7 +187,7 @@ def _finding(error: ValidationError, model: type[Settings], where: str) -> Input
             return InputError(f"{where} {first['loc'][0]}: no such key, it is {moved} now")
         allowed = f", allowed are {', '.join(model.model_fields)}" if len(first["loc"]) == 1 else ""
         return InputError(f"{where} {'.'.join(map(str, first['loc']))}: no such key{allowed}")
-    return InputError(f"{where} {key}: got {shown(first['input'])}, {first['msg'].lower()}")
+    return InputError(f"{where} {key}: got {short_repr(first['input'])}, {first['msg'].lower()}")
 
 
 def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:

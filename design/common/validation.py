@@ -36,7 +36,7 @@ class Fault(Exception):  # noqa: N818  of things outside the program, not an err
     exit_code = 1
 
 
-def what_to_install(error: ModuleNotFoundError, wanted: str = "") -> str | None:
+def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
     """What makes up for a library that is missing, on one line; None if no extra of padforge brings it.
 
     What extras bring is read from what is installed of padforge itself, so that it is said in one place.
@@ -66,15 +66,15 @@ _LIBRARIES = {
 }
 """Libraries by the module they bring, where the names differ."""
 
-MOST_VALUES = 2**28
+MAX_VALUES = 2**28
 """Most numbers an array may hold that a public function is given or makes: 2 GiB of them."""
-LONGEST_PATH = 4096
+MAX_PATH = 4096
 """Most characters of a path: no system takes more."""
 
 Kind = TypeVar("Kind")
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """A value of any type and size in a few words on one line."""
     try:
         return " ".join(shortened(value).split())
@@ -82,32 +82,32 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__}"
 
 
-def instance(name: str, value: object, kind: type[Kind]) -> Kind:
+def check_type(name: str, value: object, kind: type[Kind]) -> Kind:
     """`value`, which must be a `kind`."""
     if not isinstance(value, kind):
-        raise InputError(f"{name} is {shown(value)}, expected a {kind.__name__}")
+        raise InputError(f"{name} is {short_repr(value)}, expected a {kind.__name__}")
     return value
 
 
-def whole(name: str, value: object, least: int, most: int) -> int:
+def check_int(name: str, value: object, least: int, most: int) -> int:
     """A whole number within `least`..`most`, as an int."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) <= most:
-        raise InputError(f"{name} is {shown(value)}, allowed is a whole number from {least} to {most}")
+        raise InputError(f"{name} is {short_repr(value)}, allowed is a whole number from {least} to {most}")
     return int(value)
 
 
-def real(name: str, value: object, least: float, most: float) -> float:
+def check_float(name: str, value: object, least: float, most: float) -> float:
     """A number within `least`..`most`, as a float."""
     number = math.nan
     if isinstance(value, Real) and not isinstance(value, bool):
         with suppress(OverflowError):
             number = float(value)
     if not least <= number <= most:
-        raise InputError(f"{name} is {shown(value)}, allowed is {least:g} to {most:g}")
+        raise InputError(f"{name} is {short_repr(value)}, allowed is {least:g} to {most:g}")
     return number
 
 
-def reals(name: str, values: "ArrayLike", most: float = math.inf) -> "NDArray[np.float64]":
+def check_array(name: str, values: "ArrayLike", most: float = math.inf) -> "NDArray[np.float64]":
     """Finite numbers of any shape, none beyond -most..most, as an array of float64.
 
     Raises:
@@ -118,11 +118,11 @@ def reals(name: str, values: "ArrayLike", most: float = math.inf) -> "NDArray[np
     try:
         found = np.asarray(values)
     except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
-        raise InputError(f"{name} are {shown(values)}, expected numbers in rows of one length") from error
+        raise InputError(f"{name} are {short_repr(values)}, expected numbers in rows of one length") from error
     if found.dtype.kind not in "fiu" and found.size:
         raise InputError(f"{name} are {found.dtype} values, expected real numbers")
-    if found.size > MOST_VALUES:
-        raise InputError(f"{name} are {found.size} numbers, allowed are {MOST_VALUES}")
+    if found.size > MAX_VALUES:
+        raise InputError(f"{name} are {found.size} numbers, allowed are {MAX_VALUES}")
     with np.errstate(over="ignore"):  # of longer floats, which become infinity
         numbers = found.astype(np.float64)
     if not np.isfinite(numbers).all():
@@ -132,16 +132,16 @@ def reals(name: str, values: "ArrayLike", most: float = math.inf) -> "NDArray[np
     return numbers
 
 
-def path(name: str, value: object) -> Path:
+def check_path(name: str, value: object) -> Path:
     """A path, given as one or as text."""
     text = os.fspath(value) if isinstance(value, str | Path) else ""
-    if not text or "\0" in text or len(text) > LONGEST_PATH:
-        raise InputError(f"{name} is {shown(value)}, expected a path")
+    if not text or "\0" in text or len(text) > MAX_PATH:
+        raise InputError(f"{name} is {short_repr(value)}, expected a path")
     return Path(text)
 
 
-def mapping(name: str, value: object) -> Mapping[str, Any]:
+def check_mapping(name: str, value: object) -> Mapping[str, Any]:
     """A table of text keys, such as JSON's objects are."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
-        raise InputError(f"{name} is {shown(value)}, expected a table")
+        raise InputError(f"{name} is {short_repr(value)}, expected a table")
     return value

@@ -10,7 +10,7 @@ from threading import Lock
 from typing import Any
 
 from padforge.design.common.files import check_replaceable, find_dependents, provenance
-from padforge.design.common.validation import InputError, real, shown, whole
+from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 from padforge.design.editor.edits import Answers, Courses, moved, straight_courses, with_knot, without_knot
 from padforge.design.morphology import FARTHEST, Morphology
 from padforge.design.paths.fitting import without_spares
@@ -19,7 +19,7 @@ MOST_STEPS = 1000
 """That are remembered."""
 
 
-class History:
+class EditHistory:
     """The courses as they are, and as they were before.
 
     Attributes:
@@ -69,7 +69,7 @@ class History:
 _LONGEST_GESTURE = 40
 
 
-class Session:
+class EditSession:
     """A pad being drawn; several threads may ask at once.
 
     Attributes:
@@ -101,7 +101,7 @@ class Session:
         self._made_by["settings"] = {"pad": answers.size.model_dump(mode="json")}
         check_replaceable(out, self._made_by, force=force)
         begin = straight_courses(layout) if source is None else without_spares(Morphology.load(source).knots, layout)
-        self._history = History(tuple(begin))
+        self._history = EditHistory(tuple(begin))
         self._lock, self._number, self._name = Lock(), 0, secrets.token_hex(8)
         self._told = "" if source is None else f"as {source} has it"
         self._view: dict[str, Any] = {"ready": False, "title": self._title, "ended": ""}
@@ -133,7 +133,9 @@ class Session:
                     fibre, knot = self._knot(asked)
                     at, gesture = (fibre, knot), asked.get("gesture", "")
                     if not isinstance(gesture, str) or len(gesture) > _LONGEST_GESTURE:
-                        raise InputError(f"gesture is {shown(gesture)}, expected up to {_LONGEST_GESTURE} characters")
+                        raise InputError(
+                            f"gesture is {short_repr(gesture)}, expected up to {_LONGEST_GESTURE} characters"
+                        )
                     place = self._place(asked)
                     history.do(moved(history.now, self._answers.size.layout, fibre, knot, place), gesture)
                 case "add":
@@ -151,7 +153,7 @@ class Session:
                 case "redo":
                     history.redo()
                 case other:
-                    raise InputError(f"do is {shown(other)}, allowed are move, add, remove, undo and redo")
+                    raise InputError(f"do is {short_repr(other)}, allowed are move, add, remove, undo and redo")
             return self._changed(at)
 
     def save(self, body: bytes) -> Mapping[str, Any]:
@@ -209,19 +211,19 @@ class Session:
         return self._view
 
     def _fibre(self, asked: Mapping[str, Any]) -> int:
-        return whole("fibre", asked.get("fibre"), 1, len(self._history.now)) - 1
+        return check_int("fibre", asked.get("fibre"), 1, len(self._history.now)) - 1
 
     def _knot(self, asked: Mapping[str, Any]) -> tuple[int, int]:
         fibre = self._fibre(asked)
         inner = len(self._history.now[fibre]) - 2
         if not inner:
             raise InputError(f"fibre {fibre + 1} has no knot but its ends")
-        return fibre, whole("knot", asked.get("knot"), 1, inner)
+        return fibre, check_int("knot", asked.get("knot"), 1, inner)
 
     def _place(self, asked: Mapping[str, Any]) -> list[float]:
         """Where something is asked for, grid units."""
         layout = self._answers.size.layout
-        place_mm = (real(name, asked.get(name), -FARTHEST, FARTHEST) for name in ("x_mm", "y_mm"))
+        place_mm = (check_float(name, asked.get(name), -FARTHEST, FARTHEST) for name in ("x_mm", "y_mm"))
         return [at / layout.unit_mm + extent / 2 for at, extent in zip(place_mm, layout.extent, strict=True)]
 
 
@@ -237,5 +239,5 @@ def _document(body: bytes) -> Mapping[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError("what was posted is no JSON") from error
     if not isinstance(document, dict):
-        raise InputError(f"{shown(document)} was posted, expected an object")
+        raise InputError(f"{short_repr(document)} was posted, expected an object")
     return document

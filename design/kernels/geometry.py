@@ -112,7 +112,7 @@ def in_frame(shape: Any, family: int) -> Any:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def family_strays(cross: Any, ends: Any) -> Any:
+def max_offsets(cross: Any, ends: Any) -> Any:
     """(P, 2) how far the fibres of each family stray from their own level, from knots' cross (P, F, n)."""
     population, fibres, _ = cross.shape
     out = np.zeros((population, 2))

@@ -10,7 +10,7 @@ from padforge.design.kernels.ambiguity import ambiguity_by_place
 from padforge.design.kernels.measured_signals import element_signals, fibre_elements, spacing_of
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import loss_shares, lost_subsets
+from padforge.design.objectives.fibre_loss import failure_subsets, loss_shares
 from padforge.design.objectives.score import MOST_LOSSES
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact
@@ -30,7 +30,7 @@ def ambiguity_map(
     largest = found.max(axis=0)
     full_scale = largest[largest > 0].mean() if largest.any() else 1.0
     fibres, most = found.shape[1], min(len(loss_shares(lost)), found.shape[1]) - 1
-    losses = [lost_subsets(fibres, k, MOST_LOSSES) for k in range(most + 1)]
+    losses = [failure_subsets(fibres, k, MOST_LOSSES) for k in range(most + 1)]
     padded = [(*loss, *(fibres,) * (most - len(loss))) for level in losses for loss in level]
     ends = np.cumsum([len(level) for level in losses])
     scaled = np.ascontiguousarray(found / (2 * noise * full_scale))

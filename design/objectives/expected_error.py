@@ -37,7 +37,7 @@ from torch import Tensor
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import lattice, relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import loss_masks, loss_shares
+from padforge.design.objectives.fibre_loss import failure_masks, loss_shares
 from padforge.design.paths.keep_outs import outside
 from padforge.design.settings import (
     Contact,
@@ -74,7 +74,7 @@ FULL_SCALE_SIDE = 24
 """Presses along a side by which the full scale of straight fibres is known."""
 
 
-class Presses(NamedTuple):
+class PressWindow(NamedTuple):
     """Presses of a window of the pad.
 
     Attributes:
@@ -110,7 +110,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(loss_shares(search.lost)), fibres))
     windows = judged_windows(size.sensed)
-    masks = [loss_masks(fibres, k, max(MAX_SETS * LATTICES // len(windows), MIN_SETS)) for k in levels]
+    masks = [failure_masks(fibres, k, max(MAX_SETS * LATTICES // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
     errors: list[list[float]] = []
     for window in windows:
@@ -184,7 +184,7 @@ def drawn_window(rectangle: Rectangle, rng: np.random.Generator) -> Rectangle:
     return tuple(corner.tolist()), tuple((corner + size).tolist())
 
 
-def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> Presses:
+def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> PressWindow:
     """Return presses on a lattice over a window that is shifted by up to a cell, and those over the rest of the pad."""
     low, high = np.array(window)
     cells = np.stack(np.meshgrid(*2 * [np.arange(side, dtype=float)]), axis=-1).reshape(-1, 2)
@@ -198,7 +198,7 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
         if len(far) > MAX_FAR:
             far = far[rng.choice(len(far), MAX_FAR, replace=False)]
         far = far[((far < low - BESIDE) | (far > high + BESIDE)).any(axis=1) & outside(far, size)]
-    return Presses(positions, (high - low) / side, outside(positions, size), far)
+    return PressWindow(positions, (high - low) / side, outside(positions, size), far)
 
 
 def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
@@ -259,7 +259,7 @@ def expected_error(
     return BY_NOISE * bound + BY_LEARNING * left_out
 
 
-def over_losses(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
+def aggregate_failures(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
     """Return the geometric mean of errors over numbers of failed fibres: a gain of a tenth counts alike at each.
 
     Args:

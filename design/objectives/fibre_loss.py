@@ -10,7 +10,7 @@ from padforge.design.morphology import Array
 DRAWS = 2  # random losses of each size a step of the search looks at
 
 
-def lost_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...]]:
+def failure_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...]]:
     """All sets of `lost` of the fibres, by index; of more than `most`, as many different ones, always the same."""
     if math.comb(fibres, lost) <= most:
         return list(itertools.combinations(range(fibres), lost))
@@ -21,9 +21,9 @@ def lost_subsets(fibres: int, lost: int, most: int = 256) -> list[tuple[int, ...
     return sorted(drawn)
 
 
-def loss_masks(fibres: int, lost: int, most: int) -> Array:
-    """`lost_subsets` as masks (L, F): 1 for a fibre that works, 0 for a lost one."""
-    losses = lost_subsets(fibres, lost, most)
+def failure_masks(fibres: int, lost: int, most: int) -> Array:
+    """`failure_subsets` as masks (L, F): 1 for a fibre that works, 0 for a lost one."""
+    losses = failure_subsets(fibres, lost, most)
     kept = np.ones((len(losses), fibres))
     for row, loss in enumerate(losses):
         kept[row, list(loss)] = 0
@@ -36,7 +36,7 @@ def loss_shares(lost: int | tuple[float, ...]) -> tuple[float, ...]:
     return tuple(weight / sum(weights) for weight in weights)
 
 
-def draw_losses(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> tuple[Array, Array]:
+def sample_failures(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> tuple[Array, Array]:
     """Masks (L, F) of fibres that still work, and their weights (L,): DRAWS random losses of each size above 0.
 
     Sizes of weight 0, and those that would leave no fibre, are left out.

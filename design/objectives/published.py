@@ -6,16 +6,16 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.parallel import in_chunks
+from padforge.design.common.parallel import map_chunks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, instance, reals, whole
+from padforge.design.common.validation import InputError, check_array, check_int, check_type
 from padforge.design.contact import (
     as_presses,
     as_samples,
-    boustrophedon,
     fibre_axes,
     grid_unit_mm,
     press_shape,
+    serpentine_presses,
     signals,
 )
 from padforge.design.kernels import published as kernels
@@ -174,7 +174,7 @@ class PublishedTerms:
 @lru_cache(maxsize=16)
 def published_presses(fibres: Counts | Layout, side: int = SIDE) -> NDArray[np.float64]:
     """The (side^2, 2) presses the published search samples: a serpentine over 1..M, jittered by U(0, 2/49)."""
-    places = boustrophedon(between_fibres(Layout.of(fibres)), side, jitter=2 / 49)
+    places = serpentine_presses(between_fibres(Layout.of(fibres)), side, jitter=2 / 49)
     places.setflags(write=False)
     return places
 
@@ -200,7 +200,7 @@ def published_terms(
     """
     alpha, beta, gamma = _weights(weights)
     travel, cross, ends, _ = fibre_axes(pads, layout)
-    samples, levels = as_samples(samples, travel.shape[1]), whole("levels", levels, 1, MOST_LEVELS)
+    samples, levels = as_samples(samples, travel.shape[1]), check_int("levels", levels, 1, MOST_LEVELS)
     if presses is None:
         layout = pads.layout if isinstance(pads, Morphology) else layout
         places = published_presses(layout or ends.horizontals).copy()  # not read-only: kernels would be compiled anew
@@ -213,7 +213,7 @@ def published_terms(
     def work(begin: int, end: int) -> None:
         terms_kernel(travel, cross, ends.horizontals, places, shape, samples, levels, begin, end, found)
 
-    in_chunks(work, len(travel), grain=8)
+    map_chunks(work, len(travel), grain=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
 
 
@@ -225,13 +225,13 @@ def published_objective(
     weights: tuple[float, float, float] = WEIGHTS,
 ) -> float:
     """Formula (5) for one pad: alpha / (1 + entropy) + beta Z + gamma C; arguments as in `published_terms`."""
-    return published_terms(instance("pad", pad, Morphology), contact, presses, samples, weights)[0].objective
+    return published_terms(check_type("pad", pad, Morphology), contact, presses, samples, weights)[0].objective
 
 
 def _weights(weights: tuple[float, float, float]) -> list[float]:
     if weights is WEIGHTS:
         return [*weights]
-    found = reals("weights", weights, 1e12)
+    found = check_array("weights", weights, 1e12)
     if found.shape != (3,):
         raise InputError(f"weights have shape {found.shape}, expected three numbers: alpha, beta, gamma")
     return found.tolist()

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import instance
+from padforge.design.common.validation import check_type
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.bends import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, traced_curve
 from padforge.design.paths.curves import (
@@ -88,7 +88,7 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
     Distances are right to twice the 1e-3 mm to which curves are flattened, those of a fibre to itself to 2e-4 g if that
     is more; bend radii below R to 0.5 %; what two tracks have in common to 0.01 mm.
     """
-    pad, rules = instance("pad", pad, Morphology), instance("rules", rules, RulesSettings)
+    pad, rules = check_type("pad", pad, Morphology), check_type("rules", rules, RulesSettings)
     lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.unit_mm)]
     size = or_default("size", size, PadSettings).of(pad.layout)
     return [

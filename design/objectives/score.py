@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, instance
-from padforge.design.contact import boustrophedon, lattice, relative_stretch, signals, signals_quantized
+from padforge.design.common.validation import InputError, check_type
+from padforge.design.contact import lattice, relative_stretch, serpentine_presses, signals, signals_quantized
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import loss_masks, loss_shares
+from padforge.design.objectives.fibre_loss import failure_masks, loss_shares
 from padforge.design.objectives.published import (
     idle_share,
     information,
@@ -81,7 +81,7 @@ def ambiguities(
     fibres = len(pad.knots)
     spread = []
     for k in range(min(len(loss_shares(lost)), fibres)):
-        kept = torch.tensor(loss_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)[:, touched]
+        kept = torch.tensor(failure_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)[:, touched]
         equal = torch.full((len(kept),), 1 / len(kept))
         spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
     return spread
@@ -131,7 +131,7 @@ def score(
     from .penalties import PER_SPAN
 
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
-    size = or_default("size", size, PadSettings).of(instance("pad", pad, Morphology).layout)
+    size = or_default("size", size, PadSettings).of(check_type("pad", pad, Morphology).layout)
     asked = SearchSettings(lost=lost, noise=noise)
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:
@@ -147,7 +147,7 @@ def sharpness_of(pad: Morphology, contact: Contact, size: PadSettings) -> float:
 
 
 def _serpentine(size: PadSettings) -> Array:
-    return boustrophedon(size.sensed, 32, 5 / 49)
+    return serpentine_presses(size.sensed, 32, 5 / 49)
 
 
 def all_terms(

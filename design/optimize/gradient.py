@@ -15,19 +15,19 @@ import torch
 from torch import Tensor
 
 from padforge.design.common.checkpoints import State
-from padforge.design.contact import boustrophedon
+from padforge.design.contact import serpentine_presses
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble, axes, kernel_ends
 from padforge.design.objectives.expected_error import (
     SEARCHED,
+    aggregate_failures,
     confusable,
     drawn_window,
     expected_error,
     kernel_weights,
-    over_losses,
     straight_full_scale,
     window_presses,
 )
-from padforge.design.objectives.fibre_loss import draw_losses, loss_shares
+from padforge.design.objectives.fibre_loss import loss_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.score import sharpness
 from padforge.design.optimize.problem import SearchProblem
@@ -323,7 +323,7 @@ class GradientSearch:
         while not presses.free.any():  # it lies in a keep-out
             presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
         shares = loss_shares(search.lost)
-        masks, _ = draw_losses(pad.layout.fibres, shares, self.rng)
+        masks, _ = sample_failures(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
         masks, scatter = masks.float(), search.response_scatter.scaled(louder)
         weights = kernel_weights(pad.layout).float().to(search.device)
@@ -348,9 +348,9 @@ class GradientSearch:
                     near, far = (weights[:, None] * responses(each) for each in (presses.positions, presses.far))
                     positions = presses.joined(confusable(near, far, masks))
             given = responses(positions.numpy()), positions.to(search.device), step, free, masks, scatter
-            total = total + over_losses(expected_error(*given, weights), masks, shares)
+            total = total + aggregate_failures(expected_error(*given, weights), masks, shares)
             if search.sharpness > 0:
-                in_order = signals_at(boustrophedon(pad.sensed, SEARCHED))
+                in_order = signals_at(serpentine_presses(pad.sensed, SEARCHED))
                 total = total + search.sharpness * sharpness(in_order.float().to(search.device))
         return total.cpu() / len(self.problem.contacts)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from padforge.design.common.validation import MOST_VALUES, InputError, instance
+from padforge.design.common.validation import MAX_VALUES, InputError, check_type
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.fibre_loss import loss_shares
 from padforge.design.objectives.rules import Violation, check_rules
@@ -101,7 +101,7 @@ class SearchProblem:
         }
 
 
-def posed(
+def build_problem(
     pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None
 ) -> SearchProblem:
     """The problem that settings pose.
@@ -126,15 +126,15 @@ def posed(
     if settings.method == "genetic":
         # Offspring are compared with all pads of the generation, and all their knots are held several times over.
         room = settings.population * max(settings.population, 2 * fibres * settings.knots)
-        if room > MOST_VALUES // 4:
+        if room > MAX_VALUES // 4:
             raise InputError(
                 f"population is {settings.population}: that takes {room} numbers for {fibres} fibres of "
-                f"{settings.knots} knots, allowed are {MOST_VALUES // 4}"
+                f"{settings.knots} knots, allowed are {MAX_VALUES // 4}"
             )
     if not any(loss_shares(settings.lost)[:fibres]):
         raise InputError(f"lost is {settings.lost}, allowed is what leaves some of the {fibres} fibres")
     if origin is not None:
-        instance("origin", origin, Morphology)
+        check_type("origin", origin, Morphology)
         knots = origin.knots.shape[1] - 2
         if origin.layout.counts != pad.layout.counts or origin.layout.spacing != pad.layout.spacing:
             raise InputError(f"the morphology to start from has {origin.layout}, allowed is the pad's, {pad.layout}")

@@ -20,14 +20,14 @@ from padforge.design.common import profiling
 from padforge.design.common.checkpoints import Checkpoints, State
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, instance, real, shown
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import InputError, check_float, check_type, short_repr
+from padforge.design.common.validation import check_path as as_path
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.expected_error import error_terms, expected_errors
 from padforge.design.objectives.fibre_loss import loss_shares
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms, sharpness_of
-from padforge.design.optimize.problem import SearchProblem, Stop, posed, stopped_by_interrupt
+from padforge.design.optimize.problem import SearchProblem, Stop, build_problem, stopped_by_interrupt
 from padforge.design.paths.keep_outs import straight_course
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -80,7 +80,7 @@ def _open(problem: SearchProblem, start: int, state: State | None) -> "GradientS
     return GradientSearch(problem, start, state)
 
 
-SearchListener = Callable[[str, int, int, float], None]
+OnProgress = Callable[[str, int, int, float], None]
 """Hears of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
 
 MOST_SECONDS = 1e9
@@ -88,7 +88,7 @@ MOST_SECONDS = 1e9
 
 
 @dataclass(frozen=True)
-class SearchRun:
+class SearchOptions:
     """How a search is run: nothing of what it finds depends on it, unless it is cut short.
 
     Attributes:
@@ -99,7 +99,7 @@ class SearchRun:
         executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None.
     """
 
-    report: SearchListener = lambda run, done, total, objective: None
+    report: OnProgress = lambda run, done, total, objective: None
     keep_in: Path | None = None
     resume: bool = False
     time_budget: float | None = None
@@ -107,14 +107,14 @@ class SearchRun:
 
     def __post_init__(self) -> None:
         if not callable(self.report):
-            raise InputError(f"report is {shown(self.report)}, expected a function")
+            raise InputError(f"report is {short_repr(self.report)}, expected a function")
         if self.keep_in is not None:
             object.__setattr__(self, "keep_in", as_path("keep_in", self.keep_in))
-        instance("resume", self.resume, bool)
+        check_type("resume", self.resume, bool)
         if self.time_budget is not None:
-            object.__setattr__(self, "time_budget", real("time_budget", self.time_budget, 0, MOST_SECONDS))
+            object.__setattr__(self, "time_budget", check_float("time_budget", self.time_budget, 0, MOST_SECONDS))
         if self.executor is not None:
-            instance("executor", self.executor, Executor)
+            check_type("executor", self.executor, Executor)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def search(
     rules: RulesSettings | None = None,
     *,
     origin: Morphology | None = None,
-    run: SearchRun | None = None,
+    run: SearchOptions | None = None,
 ) -> SearchResult:
     """Find the fibres of a pad by the method `settings` names; None stands for the defaults of `pad.toml`.
 
@@ -171,8 +171,8 @@ def search(
     begin = time.perf_counter()
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
     contact = or_default("contact", contact, Contact, settings.usual_contact)
-    problem = posed(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
-    run = SearchRun() if run is None else instance("run", run, SearchRun)
+    problem = build_problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
+    run = SearchOptions() if run is None else check_type("run", run, SearchOptions)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
     states = checkpoints.begin(run.resume) if checkpoints else {}
     stop = Stop(begin, run.time_budget)
@@ -209,7 +209,7 @@ def score_result(
         found_by: where it is from.
         pad, contact, settings, rules: as `search` takes them.
     """
-    problem = posed(pad, contact, settings, rules, None)
+    problem = build_problem(pad, contact, settings, rules, None)
     straight = _Candidate("straight fibres", _straight(problem, Stop(time.perf_counter(), None)), problem)
     return _scored(_Candidate(found_by, morphology, problem), straight, problem)
 
@@ -221,7 +221,7 @@ def _scored(best: "_Candidate", straight: "_Candidate", problem: SearchProblem) 
 
 
 def _advance(
-    problem: SearchProblem, states: dict[int, State], stop: Stop, run: SearchRun, checkpoints: Checkpoints | None
+    problem: SearchProblem, states: dict[int, State], stop: Stop, run: SearchOptions, checkpoints: Checkpoints | None
 ) -> None:
     """Advance every start, slice by slice, until all are done or it is time to stop; `states` holds where they are."""
 

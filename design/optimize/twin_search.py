@@ -16,8 +16,8 @@ from padforge.design.common.validation import InputError
 from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
-from padforge.design.optimize.problem import posed
-from padforge.design.optimize.search import SearchListener, SearchResult, SearchRun, score_result, search
+from padforge.design.optimize.problem import build_problem
+from padforge.design.optimize.search import OnProgress, SearchOptions, SearchResult, score_result, search
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
 from padforge.design.twin import Twin
 
@@ -85,7 +85,7 @@ def search_for_twin(
     usual: SearchSettings,
     *,
     origin: Morphology | None = None,
-    run: SearchRun | None = None,
+    run: SearchOptions | None = None,
 ) -> SearchResult:
     """Find the fibres of a pad for a contact and a scatter that were measured.
 
@@ -105,7 +105,7 @@ def search_for_twin(
         Its `found_by` is "twin", "from usual", "usual" or "straight fibres". A search that is stopped ends with the
         best so far of what was begun.
     """
-    run = run or SearchRun()
+    run = run or SearchOptions()
     plain = search(pad, None, usual, rules, run=_part(run, "usual"))
     if plain.stopped == "interrupted":
         return plain
@@ -119,7 +119,7 @@ def search_for_twin(
         "from usual": further.morphology,
     }
     if rules.enforce:  # one that cannot be built is no use, unless none can
-        problem = posed(pad, contact, settings, rules, None)
+        problem = build_problem(pad, contact, settings, rules, None)
         pads = {name: each for name, each in pads.items() if not problem.broken(each)} or {"twin": afresh.morphology}
     with stage("judge"):
         found = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
@@ -153,12 +153,12 @@ def state_folders(keep_in: Path) -> dict[str, Path]:
     return {name: keep_in.with_name(f"{keep_in.name}-{name}".replace(" ", "-")) for name in SHARES}
 
 
-def _part(run: SearchRun, name: str) -> SearchRun:
+def _part(run: SearchOptions, name: str) -> SearchOptions:
     """How one of the searches runs."""
     keep_in = None if run.keep_in is None else state_folders(run.keep_in)[name]
     budget = None if run.time_budget is None else SHARES[name] * run.time_budget
     return replace(run, keep_in=keep_in, time_budget=budget, report=_named(run.report, name))
 
 
-def _named(report: SearchListener, name: str) -> Callable[[str, int, int, float], None]:
+def _named(report: OnProgress, name: str) -> Callable[[str, int, int, float], None]:
     return lambda start, done, total, objective: report(f"{name}, {start}", done, total, objective)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.validation import InputError, instance, real
+from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.design.kernels.geometry import near_intervals
 from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Morphology, assemble
@@ -69,8 +69,8 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     Raises:
         InputError: a tolerance out of range, or so small that there would be more than MOST_POINTS.
     """
-    tolerance = real("tolerance", tolerance, 1e-12, 1e6)
-    curves = beziers(instance("pad", pad, Morphology))
+    tolerance = check_float("tolerance", tolerance, 1e-12, 1e6)
+    curves = beziers(check_type("pad", pad, Morphology))
     second = np.linalg.norm(np.diff(curves, 2, axis=2), axis=3).max(axis=2)
     counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
     if counts.sum() > MOST_POINTS:
@@ -107,7 +107,7 @@ def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> 
     Fibres that touch or run on each other count at the middle of what they share. Without `across` only fibres of
     one family are looked at.
     """
-    instance("across", across, bool)
+    check_type("across", across, bool)
     import shapely  # takes a while, and lengths are asked for without it
 
     lines = np.array([shapely.LineString(points) for points in flatten(pad, tolerance)])

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
-from padforge.design.common.files import read_bytes, require_file
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.files import check_file, read_bytes
+from padforge.design.common.validation import InputError, short_repr
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import cubic
 
@@ -35,7 +35,7 @@ _TOGETHER = 1e-6
 
 
 @dataclass(frozen=True)
-class Stroke:
+class DrawnCurve:
     """One piece of a drawing.
 
     Attributes:
@@ -52,7 +52,7 @@ class Stroke:
 
 
 @dataclass
-class Drawing:
+class DrawnPlan:
     """A drawing as it is read.
 
     Attributes:
@@ -61,7 +61,7 @@ class Drawing:
 
     unit_mm: float = 1.0
     note: str = ""
-    strokes: list[Stroke] = field(default_factory=list)
+    strokes: list[DrawnCurve] = field(default_factory=list)
     parts: int = 0
     points: int = 0
 
@@ -89,7 +89,7 @@ class Drawing:
         points = points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
         if len(points) > 1:
             closed = closed or bool((points[0] == points[-1]).all())
-            self.strokes.append(Stroke(name, points, tuple(filter(None, groups)), closed))
+            self.strokes.append(DrawnCurve(name, points, tuple(filter(None, groups)), closed))
 
     @property
     def border(self) -> Array | None:
@@ -98,7 +98,7 @@ class Drawing:
         return np.array([np.vstack(found).min(axis=0), np.vstack(found).max(axis=0)]) if found else None
 
     @property
-    def fibres(self) -> list[Stroke]:
+    def fibres(self) -> list[DrawnCurve]:
         """The curves that are fibres, pieces that end where another begins put together.
 
         They are what is named so (fibre, horizontal, vertical), or where nothing is all that is open.
@@ -151,7 +151,7 @@ class Pen:
         self._points = []
 
 
-def _joined(strokes: list[Stroke]) -> Iterator[Stroke]:
+def _joined(strokes: list[DrawnCurve]) -> Iterator[DrawnCurve]:
     """Strokes, those put together whose ends are one point."""
     if not strokes:
         return
@@ -175,7 +175,7 @@ def _joined(strokes: list[Stroke]) -> Iterator[Stroke]:
         if end // 2 not in left:
             continue
         pieces: list[Array] = []
-        names: list[Stroke] = []
+        names: list[DrawnCurve] = []
         at: int | None = end
         while at is not None:
             stroke = strokes[at // 2]
@@ -184,7 +184,7 @@ def _joined(strokes: list[Stroke]) -> Iterator[Stroke]:
             pieces.append(stroke.points if at % 2 == 0 else stroke.points[::-1])
             at = partners.get(at ^ 1)
         name = names[0].name if len(names) == 1 else f"{names[0].name} to {names[-1].name}"
-        yield Stroke(name, np.vstack(pieces), names[0].groups)
+        yield DrawnCurve(name, np.vstack(pieces), names[0].groups)
     if left:
         raise InputError(
             f"{strokes[min(left)].name}: part of a ring, or drawn twice, expected curves from border to border"
@@ -211,7 +211,7 @@ _LINK = "{http://www.w3.org/1999/xlink}href"
 _DEEPEST_USE = 8
 
 
-def read_svg(path: Path) -> Drawing:
+def read_svg(path: Path) -> DrawnPlan:
     """The curves of an SVG, y upwards. A unit without a name is a pixel of 1/96 inch.
 
     Raises:
@@ -230,7 +230,7 @@ def read_svg(path: Path) -> Drawing:
     etree.strip_tags(root, etree.Entity)  # what an external DTD may declare, which is not looked at
     if _kind(root) != "svg":
         raise InputError(f"{path}: the root is <{_kind(root)}>, expected <svg>")
-    drawing = Drawing()
+    drawing = DrawnPlan()
     flip = np.diag([1.0, -1.0, 1.0])
     reader = _Reader(drawing, {each.get("id"): each for each in root.iter() if each.get("id")})
     with np.errstate(all="ignore"):  # what becomes of too large numbers is refused where it is added
@@ -242,7 +242,7 @@ def read_svg(path: Path) -> Drawing:
 class _Reader:
     """What it takes to go through a file."""
 
-    def __init__(self, drawing: Drawing, ids: Mapping[str, Any]) -> None:
+    def __init__(self, drawing: DrawnPlan, ids: Mapping[str, Any]) -> None:
         self._drawing, self._ids = drawing, ids
 
     def shapes(self, root: Any, matrix: Array) -> Iterator[tuple[Any, Array, tuple[str, ...]]]:
@@ -342,7 +342,7 @@ def _length(element: Any, side: str, name: str) -> float:
     text = element.get(side, "0")
     found = _LENGTH.fullmatch(text)
     if not found or found[2].lower() not in _UNITS_MM:
-        raise InputError(f"{name}: {side} is {shown(text)}, expected a length")
+        raise InputError(f"{name}: {side} is {short_repr(text)}, expected a length")
     return float(found[1]) * (_UNITS_MM[found[2].lower()] / _UNITS_MM[""] if found[2] else 1)
 
 
@@ -359,7 +359,9 @@ def _viewport(element: Any, nested: bool = False) -> Array:
     if len(box) != 4:
         return unit @ origin
     if not (box[2] > 0 and box[3] > 0):
-        raise InputError(f"{name}: viewBox is {shown(element.get('viewBox'))}, expected x, y, width, height above 0")
+        raise InputError(
+            f"{name}: viewBox is {short_repr(element.get('viewBox'))}, expected x, y, width, height above 0"
+        )
     sides = [element.get(side, "100%") for side in ("width", "height")]
     shown_as = [
         inner if text.strip().endswith("%") else _length(element, side, name)
@@ -380,10 +382,10 @@ def _transform(element: Any, name: str) -> Array:
     while at < len(text):
         found = _TRANSFORM.match(text, at)
         if not found:
-            raise InputError(f"{name}: transform is {shown(text)}, expected such as translate(1 2)")
+            raise InputError(f"{name}: transform is {short_repr(text)}, expected such as translate(1 2)")
         values = [float(each) for each in _NUMBER.findall(found[2])]
         if not all(map(math.isfinite, values)):
-            raise InputError(f"{name}: transform is {shown(text)}, expected finite numbers")
+            raise InputError(f"{name}: transform is {short_repr(text)}, expected finite numbers")
         matrix, at = matrix @ _step(found[1], values, name), found.end()
     return matrix
 
@@ -404,7 +406,7 @@ def _step(kind: str, values: list[float], name: str) -> Array:
             skew = np.eye(3)
             skew[(0, 1) if kind == "skewX" else (1, 0)] = math.tan(math.radians(degrees))
             return skew
-    raise InputError(f"{name}: transform {shown(kind)} of {len(values)} numbers, which there is not")
+    raise InputError(f"{name}: transform {short_repr(kind)} of {len(values)} numbers, which there is not")
 
 
 # pyright: reportPrivateImportUsage=false
@@ -415,7 +417,7 @@ _KINDS = ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE")
 _MOST_DEGREE = 9
 
 
-def read_dxf(path: Path) -> Drawing:
+def read_dxf(path: Path) -> DrawnPlan:
     """The curves of a DXF; blocks, hatches and writing are left out. Its unit is that of $INSUNITS, mm without.
 
     Raises:
@@ -425,7 +427,7 @@ def read_dxf(path: Path) -> Drawing:
     from ezdxf import path as paths
     from ezdxf import units
 
-    path = require_file(path, MOST_BYTES)
+    path = check_file(path, MOST_BYTES)
     try:
         document = ezdxf.readfile(path)
         unit, millimetre = document.units, units.InsertUnits.Millimeters
@@ -434,13 +436,13 @@ def read_dxf(path: Path) -> Drawing:
         raise
     except Exception as error:  # ezdxf raises whatever a torn file leads it to
         raise InputError(f"{path}: not a DXF file that can be read ({reason(error)})") from error
-    drawing = Drawing(note="" if unit else "the file says no unit: mm")
+    drawing = DrawnPlan(note="" if unit else "the file says no unit: mm")
     drawing.unit_mm = unit_mm
     for number, entity in enumerate(document.modelspace(), 1):
         drawing.looked_at()
         if entity.dxftype() not in _KINDS:
             continue
-        name = f"{entity.dxftype()} {number} of layer {shown(entity.dxf.layer)}"
+        name = f"{entity.dxftype()} {number} of layer {short_repr(entity.dxf.layer)}"
         try:
             _require_bounded(entity)
             pen = Pen()

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from padforge.design.common.validation import InputError, real
+from padforge.design.common.validation import InputError, check_float
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import flatten
-from padforge.design.paths.drawing_files import Drawing, Stroke, read_dxf, read_svg
+from padforge.design.paths.drawing_files import DrawnCurve, DrawnPlan, read_dxf, read_svg
 from padforge.design.paths.fitting import fitted_knots, with_spares
 from padforge.design.settings import Layout
 
@@ -82,7 +82,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
     Raises:
         InputError: a file that is no such drawing; curve and place are named.
     """
-    tolerance_mm = real("tolerance_mm", tolerance_mm, 1e-3, 10)
+    tolerance_mm = check_float("tolerance_mm", tolerance_mm, 1e-3, 10)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: ends in {path.suffix or 'nothing'}, allowed are {' and '.join(READERS)}")
@@ -116,7 +116,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
     return ImportedPlan(pad, tuple(told), placed + (f"; {drawing.note}" if drawing.note else ""))
 
 
-def _placed(drawing: Drawing, strokes: Sequence[Stroke], layout: Layout) -> tuple[list[_Course], str]:
+def _placed(drawing: DrawnPlan, strokes: Sequence[DrawnCurve], layout: Layout) -> tuple[list[_Course], str]:
     """The curves on the pad, and where the drawing was taken to lie."""
     size = np.array(layout.size_mm)
     border = drawing.border
@@ -153,7 +153,7 @@ def _placed(drawing: Drawing, strokes: Sequence[Stroke], layout: Layout) -> tupl
     return courses, said
 
 
-def _courses(strokes: Sequence[Stroke], lines: Sequence[Array], layout: Layout) -> list[_Course]:
+def _courses(strokes: Sequence[DrawnCurve], lines: Sequence[Array], layout: Layout) -> list[_Course]:
     courses = []
     for stroke, line in zip(strokes, lines, strict=True):
         tried, errors = [], []

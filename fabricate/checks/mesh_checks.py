@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.validation import instance, real, whole
+from padforge.design.common.validation import check_float, check_int, check_type
 from padforge.fabricate.mesh_files import read_mesh
 from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
@@ -51,10 +51,10 @@ def inspect_mesh(
         The findings of `sound`, then bed; and, if that is a solid that can be cut, wall_thickness, floor_thickness,
         overhang, undercut; and what a plan knows, ridge_width, silicone_wall and tight.
     """
-    instance("printer", printer, PrinterSettings)
-    min_silicone_mm = real("min_silicone_mm", min_silicone_mm, 0, 10)
+    check_type("printer", printer, PrinterSettings)
+    min_silicone_mm = check_float("min_silicone_mm", min_silicone_mm, 0, 10)
     surface = Surface.joined(vertices, triangles)
-    genus = None if genus is None else whole("genus", genus, 0, 10**6)
+    genus = None if genus is None else check_int("genus", genus, 0, 10**6)
     findings = [*_sound(surface, genus), _bed(surface, printer)]
     if any(finding.name in ("manifold", "volume") and finding.status == "fail" for finding in findings):
         return findings
@@ -72,7 +72,7 @@ def inspect_mesh(
 
 def sound(vertices: ArrayLike, triangles: ArrayLike, genus: int | None = None) -> list[Finding]:
     """The checks of `SOUND` alone, which take a fraction of the time of all; arguments as for `inspect_mesh`."""
-    genus = None if genus is None else whole("genus", genus, 0, 10**6)
+    genus = None if genus is None else check_int("genus", genus, 0, 10**6)
     return _sound(Surface.joined(vertices, triangles), genus)
 
 

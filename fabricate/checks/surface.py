@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.validation import InputError, reals
+from padforge.design.common.validation import InputError, check_array
 from padforge.fabricate.mesh_files import LARGEST_MM, Array, Numbers
 
 from .findings import Place, as_places
@@ -37,7 +37,7 @@ class Surface:
         Raises:
             InputError: vertices beyond LARGEST_MM, or numbers of ones that are not there.
         """
-        places = reals("vertices", vertices, LARGEST_MM) + 0.0  # turns -0 into 0
+        places = check_array("vertices", vertices, LARGEST_MM) + 0.0  # turns -0 into 0
         if places.ndim != 2 or places.shape[1] != 3:
             raise InputError(f"vertices have shape {places.shape}, expected (n, 3)")
         order = np.lexsort(places.T)
@@ -137,7 +137,7 @@ class Surface:
 
 def _numbers(triangles: ArrayLike, vertices: int) -> Numbers:
     """Triangles as (m, 3) numbers of so many vertices."""
-    found = reals("triangles", triangles)
+    found = check_array("triangles", triangles)
     if found.ndim != 2 or found.shape[1] != 3:
         raise InputError(f"triangles have shape {found.shape}, expected (m, 3)")
     if found.size and not (found.min() >= 0 and found.max() < vertices and (found == np.trunc(found)).all()):

@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.validation import InputError, instance
+from padforge.design.common.validation import InputError, check_type
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.bends import traced_curve
 from padforge.design.paths.curves import Crossing, beziers, common_stretches, crossings, flatten, lengths, slope_beziers
@@ -75,8 +75,8 @@ class Plan:
     used: "Plan | None" = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        instance("pad", self.pad, Morphology)
-        instance("settings", self.settings, FabricationSettings).require_consistent(self.pad.layout)
+        check_type("pad", self.pad, Morphology)
+        check_type("settings", self.settings, FabricationSettings).require_consistent(self.pad.layout)
         if self.settings.pad.keep_out_mm and self.used is None:
             keep_outs(self.settings.pad.of(self.pad.layout))
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.page import resource
+from padforge.design.common.page import read_resource
 from padforge.fabricate.mesh_files import read_mesh
 
 from .fibre_layers import COLOURS, FAMILIES
@@ -112,7 +112,7 @@ def view(mesh: Packed, document: Mapping[str, Any]) -> str:
 
 def script() -> str:
     """JavaScript that draws the view of a page and turns it."""
-    return resource("padforge.fabricate.report", "mould_view.js")
+    return read_resource("padforge.fabricate.report", "mould_view.js")
 
 
 def _packed(vertices: NDArray[np.floating], triangles: NDArray[np.integer], tolerance_mm: float) -> Packed:

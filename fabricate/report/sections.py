@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from padforge.design.common.files import unchanged
-from padforge.design.common.page import PageSection, figures, folded, heading, html_pieces, paragraph, table
+from padforge.design.common.page import PageSection, collapsible, figures, heading, paragraph, render_markdown, table
 from padforge.design.common.validation import InputError
 
 from .laying import orientation
@@ -49,7 +49,7 @@ def _mould(folder: Path, shown: Collection[str], document: Mapping[str, Any]) ->
             heading("Printability"),
             paragraph(f"{len(passed)} of {len(findings)} checks pass."),
             *([_checks(remarks)] if remarks else []),
-            *([folded("Checks that pass", [_checks(passed)])] if passed else []),
+            *([collapsible("Checks that pass", [_checks(passed)])] if passed else []),
         ],
         [
             (f"{len(passed)} / {len(findings)}", "mould checks pass"),
@@ -78,7 +78,7 @@ def _bench(folder: Path, shown: Collection[str], document: Mapping[str, Any]) ->
     guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section has in full
     before, _, after = guide.partition(orientation.LINK)
     drawing = [figures([(folder / orientation.FILE, orientation.CAPTION)])] if orientation.FILE in shown else []
-    return PageSection("Making the pad", [*html_pieces(before), *drawing, *html_pieces(after)])
+    return PageSection("Making the pad", [*render_markdown(before), *drawing, *render_markdown(after)])
 
 
 def _checks(findings: Sequence[Mapping[str, Any]]) -> str:

@@ -26,7 +26,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
     if it did not, places are found as before. The old model is written over only where --out says so.
     """
-    from padforge.design.common.files import check_replaceable, refuse_unwritable, staged, write_json
+    from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.health.model_folder import health_files, health_in
     from padforge.sense.localizer.calibration import recalibration
     from padforge.sense.localizer.localizer import Localizer
@@ -35,11 +35,11 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     target = out or common.pad_folder(recording)
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
-    refuse_unwritable(target)
+    check_writable(target)
     old, health, opened = Localizer.load(model), health_in(model), open_recording(recording)
     with reported("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
-    with staged(target, without=health_files()) as folder:
+    with atomic_files(target, without=health_files()) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"
         check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *health_files()], force)
@@ -80,7 +80,7 @@ def fibre_loss(
     kept when it is broken off, and the same command goes on from them.
     """
     from padforge.design.common.checkpoints import Checkpoints
-    from padforge.design.common.files import refuse_unwritable, staged, write_json
+    from padforge.design.common.files import atomic_files, check_writable, write_json
     from padforge.sense.localizer.calibration.fibre_loss_study import fibre_loss_lines, fibre_loss_study
     from padforge.sense.localizer.localizer import Localizer
     from padforge.sense.recordings.import_export import open_recording
@@ -91,7 +91,7 @@ def fibre_loss(
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
     target = out or common.pad_folder(recording)
     unfinished = target / "unfinished"
-    refuse_unwritable(target)
+    check_writable(target)
     localizer = Localizer.load(model) if model else None
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with reported("networks") as report:
@@ -105,7 +105,7 @@ def fibre_loss(
             keep_in=unfinished,
             progress=report,
         )
-    with staged(target) as folder:
+    with atomic_files(target) as folder:
         write_json(folder / "fibre_loss.json", document)
         draw_fibre_loss(document, folder / "fibre_loss.png")
     if retrain:
@@ -127,18 +127,18 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 
     Writes learning_curve.json and learning_curve.png.
     """
-    from padforge.design.common.files import refuse_unwritable, staged, write_json
+    from padforge.design.common.files import atomic_files, check_writable, write_json
     from padforge.sense.localizer.calibration import learning_curve as study
     from padforge.sense.recordings.import_export import open_recording
     from padforge.sense.report.learning_curve_figure import draw_learning_curve
     from padforge.sense.settings import LocalizerSettings
 
     target = out or common.pad_folder(recording)
-    refuse_unwritable(target)
+    check_writable(target)
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with reported("training") as report:
         document = study.learning_curve(opened, options, progress=report)
-    with staged(target) as folder:
+    with atomic_files(target) as folder:
         write_json(folder / "learning_curve.json", document)
         draw_learning_curve(document, folder / "learning_curve.png")
     common.show_result(document, study.learning_curve_lines(document), as_json)

@@ -48,12 +48,12 @@ def calibrate(
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
     error_map.png and error_by_loss.png.
     """
-    from padforge.design.common.files import claimed
+    from padforge.design.common.files import locked_folder
     from padforge.sense.report.calibration_results import calibration_lines
 
     overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     folder = out or common.pad_folder(recording)
-    with claimed(folder):
+    with locked_folder(folder):
         document = run_calibration(
             common.load_spec(spec), read_recording(recording), folder, overrides, time_budget, force
         )

@@ -26,13 +26,13 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     Writes twin.json, for padforge design --twin and padforge sense record --rig simulated --twin; identification.json,
     twin_plan.png and twin_responses.png.
     """
-    from padforge.design.common.files import claimed
+    from padforge.design.common.files import locked_folder
     from padforge.design.morphology import Morphology
     from padforge.sense.report.identification_results import identification_lines, identify_into
 
     folder = out or common.pad_folder(recording)
     pad = Morphology.load(morphology)
-    with claimed(folder), common.progress() as bar:
+    with locked_folder(folder), common.progress() as bar:
         task = bar.add_task("identify", total=None, note="")
 
         def report(what: str, done: int, of: int) -> None:

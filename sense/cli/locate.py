@@ -120,7 +120,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     learnt from tell how far off it is, beside the model and, where that looks at the release, one that does not,
     trained for this. [localizer] says for how long they learn.
     """
-    from padforge.design.common.files import refuse_unwritable, sha256
+    from padforge.design.common.files import check_writable, sha256
     from padforge.sense.localizer.localizer import Localizer
 
     path, recording = files[-1], files[0] if len(files) == 2 else None
@@ -132,7 +132,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
         raise InputError(f"{path}: cannot be written, there is no folder {path.parent}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: cannot be written, it is there and no file")
-    refuse_unwritable(path.parent)
+    check_writable(path.parent)
     localizer, digest = Localizer.load(model), sha256(model / "localizer.json")
     if path.suffix == ".onnx":
         from padforge.sense.live.deployment.onnx_file import export_onnx, onnx_line

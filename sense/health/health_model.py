@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from padforge.design.common.files import read_json
-from padforge.design.common.settings import validated
+from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array, Indices, as_numbers, stream_of
 from padforge.sense.recordings.recording import rate_of
@@ -89,7 +89,7 @@ class HealthModel:
                 not belong together.
         """
         files = files_of(folder, name)
-        document = validated(HealthDocument, read_json(files.document, FORMAT), f"{files.document}:")
+        document = validate(HealthDocument, read_json(files.document, FORMAT), f"{files.document}:")
         dead = sorted(set(document.dead))
         if dead != document.dead or len(dead) >= document.fibres or not set(dead) < set(range(document.fibres)):
             raise InputError(f"{files.document}: dead is {document.dead}, expected some of {document.fibres} fibres")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread, run_tasks
-from padforge.design.common.validation import InputError, instance, mapping, real, shown, whole
+from padforge.design.common.validation import InputError, check_float, check_int, check_mapping, check_type, short_repr
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask, as_numbers
 from padforge.sense.recordings.recording import Recording, rate_of
 
@@ -42,12 +42,12 @@ def learn_health(
         as_detected,  # compiled, which takes a moment to load
     )
 
-    learnt = np.ones(len(instance("recording", recording, Recording).presses_mm), dtype=bool)
+    learnt = np.ones(len(check_type("recording", recording, Recording).presses_mm), dtype=bool)
     away = as_numbers(held_back, np.int64, "held_back")
     if away.ndim != 1 or not ((away >= 0) & (away < len(learnt))).all():
-        raise InputError(f"held_back is {shown(held_back)}, allowed are presses from 0 to {len(learnt) - 1}")
+        raise InputError(f"held_back is {short_repr(held_back)}, allowed are presses from 0 to {len(learnt) - 1}")
     learnt[away] = False
-    seed = whole("the seed of provenance", mapping("provenance", provenance).get("seed"), 0, 2**64 - 1)
+    seed = check_int("the seed of provenance", check_mapping("provenance", provenance).get("seed"), 0, 2**64 - 1)
     readings, times_s = recording.readings, recording.times_s
     commanded = recording.begun, recording.lifted
     edges = {COMMANDED: commanded, DETECTED: as_detected(readings, times_s, *commanded)}
@@ -87,9 +87,9 @@ def fit_health_model(
         InputError: shapes, indices or the rate of false alarms out of range, fewer than 300 presses that are
             whole, or no living fibre.
     """
-    if not (false_alarms := real("false alarms a press", false_alarms, 0.0, MAX_FALSE_ALARMS)) > 0:
+    if not (false_alarms := check_float("false alarms a press", false_alarms, 0.0, MAX_FALSE_ALARMS)) > 0:
         raise InputError(f"false alarms a press are {false_alarms}, allowed is above 0 to {MAX_FALSE_ALARMS}")
-    instance("rng", rng, np.random.Generator)
+    check_type("rng", rng, np.random.Generator)
     readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
     dead = dead_fibres(readings)
     traces = _whole_traces(readings, begun, lifted, dead)

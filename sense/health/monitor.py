@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, instance, whole
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.sense.recordings.processing.limits import (
     MAX_VOLTS,
     Array,
@@ -96,7 +96,7 @@ class Monitor:
     """
 
     def __init__(self, model: HealthModel) -> None:
-        self.model = instance("model", model, HealthModel)
+        self.model = check_type("model", model, HealthModel)
         self.presses = 0
         fibres = len(model.living)
         self._lost = np.zeros(fibres, dtype=bool)
@@ -129,8 +129,8 @@ class Monitor:
         if readings.ndim != 2 or readings.shape[1] != self.model.fibres:
             raise InputError(f"readings have shape {readings.shape}, expected (R, {self.model.fibres})")
         refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
-        begun = whole("begun", begun, 1, len(readings) - 1)
-        lifted = whole("lifted", lifted, begun + 1, len(readings))
+        begun = check_int("begun", begun, 1, len(readings) - 1)
+        lifted = check_int("lifted", lifted, begun + 1, len(readings))
         traces = press_trace(readings[:, self.model.living], begun, lifted, 0, len(readings))
         level, settled = self._history.level, self._history.seen >= SETTLED
         inputs, targets = self.model.shapes.scaled(*self.model.shapes.advance(traces, self._history))
@@ -277,7 +277,7 @@ def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices,
         InputError: other fibres or another rate than health was learnt from, or presses out of order.
     """
     readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
-    instance("model", model, HealthModel).refuse_other(readings, times_s)
+    check_type("model", model, HealthModel).refuse_other(readings, times_s)
     monitor = Monitor(model)
     readings, lows, highs = press_ranges(readings, begun, lifted)
     findings: list[FibreFault] = []

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from padforge.design.common.files import read_bytes, staged
-from padforge.design.common.validation import InputError, instance, shown
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.files import atomic_files, read_bytes
+from padforge.design.common.validation import InputError, check_type, short_repr
+from padforge.design.common.validation import check_path as as_path
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -50,7 +50,7 @@ class ModelFiles(NamedTuple):
             text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         except (TypeError, ValueError) as error:
             raise InputError(f"{self.document}: {what} cannot be written as JSON ({error})") from error
-        with staged(self.document.parent) as stage:
+        with atomic_files(self.document.parent) as stage:
             (stage / self.weights.name).write_bytes(content)
             (stage / self.document.name).write_text(text, encoding="utf-8")
 
@@ -77,8 +77,8 @@ def files_of(folder: str | Path, name: str) -> ModelFiles:
         InputError: `folder` is no path, or `name` no plain name.
     """
     folder = as_path("folder", folder)
-    if not re.fullmatch(r"\w{1,100}", instance("name", name, str)):
-        raise InputError(f"name is {shown(name)}, expected letters, digits and underscores")
+    if not re.fullmatch(r"\w{1,100}", check_type("name", name, str)):
+        raise InputError(f"name is {short_repr(name)}, expected letters, digits and underscores")
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, instance, real, shown, whole
+from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.monitor import FibreFault, Monitor
 from padforge.sense.health.trained_model import refuse_other_pad
@@ -102,11 +102,14 @@ class Live:
         Raises:
             InputError: there is none, or one was learnt from other fibres, or at another rate.
         """
-        fibres, rate_hz = whole("fibres", fibres, 1, MAX_FIBRES), real("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
+        fibres, rate_hz = (
+            check_int("fibres", fibres, 1, MAX_FIBRES),
+            check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ),
+        )
         if not isinstance(localizers, Sequence) or not localizers:
-            raise InputError(f"localizers are {shown(localizers)}, expected at least one")
+            raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
         self._monitor = None if health is None else Monitor(health)
-        models = [instance("localizers", each, Localizer) for each in localizers]
+        models = [check_type("localizers", each, Localizer) for each in localizers]
         for model in models:
             refuse_other_pad(model, "the localizer", fibres, rate_hz)
         if health is not None:

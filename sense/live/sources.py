@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from padforge.design.common.files import read_json
-from padforge.design.common.settings import validated
-from padforge.design.common.validation import InputError, real
+from padforge.design.common.settings import validate
+from padforge.design.common.validation import InputError, check_float
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recorder import FORMAT, START
@@ -68,7 +68,7 @@ def connected(converter: Converter, rate_hz: float) -> Source:
 
 def replayed(recording: Recording, speed: float) -> Source:
     """The readings of a recording, `speed` times as fast as they were taken; InputError for a speed that is none."""
-    speed = real("speed", speed, 1e-9, np.inf)
+    speed = check_float("speed", speed, 1e-9, np.inf)
     due_s = (recording.times_s - recording.times_s[0]) / speed
 
     def blocks() -> Iterator[Block]:
@@ -129,7 +129,7 @@ def simulated(model: Path) -> "SimulatedConverter":
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
     return SimulatedConverter(
         pad,
-        validated(RigSettings, rig, f"{path}: rig"),
-        validated(Contact, contact, f"{path}: contact"),
-        size=validated(PadSettings, {**pad.layout.settings, **size}, f"{path}: pad"),
+        validate(RigSettings, rig, f"{path}: rig"),
+        validate(Contact, contact, f"{path}: contact"),
+        size=validate(PadSettings, {**pad.layout.settings, **size}, f"{path}: pad"),
     )

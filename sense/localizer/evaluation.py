@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, instance, shown, whole
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.common.validation import InputError, check_int, check_type, short_repr
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 
@@ -39,13 +39,13 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
         InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
             or was seen in its recalibration.
     """
-    instance("localizer", localizer, Localizer)
-    instance("recording", recording, Recording)
+    check_type("localizer", localizer, Localizer)
+    check_type("recording", recording, Recording)
     presses = len(recording.presses_mm)
     try:
         levels = tuple(levels)
     except TypeError as error:
-        raise InputError(f"lost is {shown(levels)}, expected numbers of lost fibres") from error
+        raise InputError(f"lost is {short_repr(levels)}, expected numbers of lost fibres") from error
     if not levels:
         raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
     digest = recording.digest
@@ -125,8 +125,8 @@ def errors_by_loss(
     """
     rows, by_subset = [], []
     for level in levels:
-        level = whole("lost", level, 0, fibres - 1)
-        subsets = lost_subsets(fibres, level)
+        level = check_int("lost", level, 0, fibres - 1)
+        subsets = failure_subsets(fibres, level)
         found = [locate(subset) for subset in subsets]
         rows.append(error_row(level, found, places_mm, measures))
         by_subset += [

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common.files import read_json
-from padforge.design.common.validation import InputError, instance, shown
+from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.sense.health.trained_model import files_of, refuse_other_pad
 from padforge.sense.recordings.processing.limits import Array, Floats, Mask
 from padforge.sense.recordings.recording import Recording
@@ -126,7 +126,7 @@ class Localizer:
         Raises:
             InputError: the recording has other fibres or another rate than the one that was learnt from.
         """
-        instance("recording", recording, Recording)
+        check_type("recording", recording, Recording)
         refuse_other_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         return press_inputs(recording.readings, recording.begun, recording.lifted, self.features)
 
@@ -138,7 +138,7 @@ class Localizer:
         Raises:
             InputError: a lost fibre that is not there, or none left, or a published localizer that is to do without.
         """
-        instance("presses", presses, Scaled)
+        check_type("presses", presses, Scaled)
         alive: Mask = np.logical_and(presses.alive, self._alive(lost))
         if self.method == "published" and np.size(lost):
             raise InputError("fibres are lost: a published localizer knows none, train one of method masked")
@@ -174,10 +174,10 @@ class Localizer:
         try:
             fibres = np.asarray(lost).ravel().tolist()
         except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
-            raise InputError(f"lost fibres are {shown(lost)}, expected their indices") from error
+            raise InputError(f"lost fibres are {short_repr(lost)}, expected their indices") from error
         for fibre in fibres:
             if type(fibre) is not int or not 0 <= fibre < self.fibres:
-                raise InputError(f"lost fibre at index {shown(fibre)}: none, allowed are 0 to {self.fibres - 1}")
+                raise InputError(f"lost fibre at index {short_repr(fibre)}: none, allowed are 0 to {self.fibres - 1}")
             alive[fibre] = False
         if not alive.any():
             raise InputError(f"all {self.fibres} fibres are lost, at least one must be left")

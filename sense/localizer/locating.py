@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.files import write_text, writing
-from padforge.design.common.validation import InputError, instance, shown
+from padforge.design.common.files import reraise_write_error, write_text
+from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.recordings.recording import Recording
 
@@ -30,7 +30,7 @@ def write_places(found: Found, path: str | Path) -> None:
     table = np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm, *more])
     names = (*COLUMNS, *(name for measure in found.measures for name in MEASURED[measure]))
     lines = [",".join([str(press), *(f"{value:.4f}" for value in row)]) for press, row in enumerate(table.tolist())]
-    with writing(Path(path)):
+    with reraise_write_error(Path(path)):
         write_text(Path(path), "\n".join([",".join(names), *lines]) + "\n")
 
 
@@ -45,12 +45,12 @@ def locate(
     Raises:
         InputError: as `Localizer.inputs` and `Localizer.locate`, or findings of a pad with more fibres.
     """
-    presses = instance("localizer", localizer, Localizer).inputs(recording)
+    presses = check_type("localizer", localizer, Localizer).inputs(recording)
     alive = presses.alive.copy()
     if not isinstance(findings, Sequence):
-        raise InputError(f"findings are {shown(findings)}, expected a sequence of them")
+        raise InputError(f"findings are {short_repr(findings)}, expected a sequence of them")
     for finding in findings:
-        fibres = list(instance("findings", finding, FibreFault).fibres)
+        fibres = list(check_type("findings", finding, FibreFault).fibres)
         if max(fibres, default=0) >= localizer.fibres:
             raise InputError(f"findings name fibre {max(fibres) + 1}, allowed are 1 to {localizer.fibres}")
         alive[finding.since :, fibres] = False

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from padforge.design.common.mat_files import load_mat
 from padforge.design.common.validation import InputError
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing.limits import Array
 
 from .block_file import read_blocks
@@ -100,7 +100,7 @@ def export_file(
         states: of the arm, by `STATE_COLUMNS`; they become a part of an .mcap.
 
     Raises:
-        InputError: a name with another end, findings for what cannot hold them, or `path` cannot be written.
+        InputError: a name with another end, findings for what cannot hold them, or `check_path` cannot be written.
     """
     end = path.suffix.lower()
     if kind == _LEROBOT:

@@ -20,17 +20,17 @@ from numpy.typing import ArrayLike
 
 from padforge.design.common.files import (
     UNFINISHED,
+    check_writable,
     lock,
     open_in_place,
     read_json,
-    refuse_unwritable,
+    reraise_write_error,
     sync,
     to_disk,
     write_json,
-    writing,
 )
-from padforge.design.common.validation import InputError, mapping, shown, whole
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import InputError, check_int, check_mapping, short_repr
+from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
 from .block_file import BlockWriter, read_blocks, write_at
@@ -55,15 +55,18 @@ class Recorder:
         last_s: time of the last reading or state, s; -inf where there is none.
 
     Raises:
-        InputError: `path` is in the way, see `refuse_begun`, or cannot be written, or too few or many fibres.
+        InputError: `check_path` is in the way, see `refuse_begun`, or cannot be written, or too few or many fibres.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
-        fibres, path = whole("fibres", fibres, 1, MAX_FIBRES), as_path("path", path)
-        told = {"source": dict(mapping("source", source)), "provenance": dict(mapping("provenance", provenance))}
+        fibres, path = check_int("fibres", fibres, 1, MAX_FIBRES), as_path("path", path)
+        told = {
+            "source": dict(check_mapping("source", source)),
+            "provenance": dict(check_mapping("provenance", provenance)),
+        }
         refuse_begun(path)
         document = {"format": FORMAT, "fibres": fibres, **told}
-        with writing(path):
+        with reraise_write_error(path):
             path.mkdir(parents=True, exist_ok=True)
             there = {file.name for file in path.iterdir()}
             self._journal: BinaryIO = _claimed(path)
@@ -100,7 +103,7 @@ class Recorder:
         """
         fibres = fibres_of(path := as_path("path", path))
         self = cls.__new__(cls)
-        with writing(path):
+        with reraise_write_error(path):
             for name in (JOURNAL, READINGS) if unborn(path) else ():  # broken off before the first reading
                 (path / name).touch()
             self._journal = open_in_place(path / JOURNAL)
@@ -171,9 +174,9 @@ class Recorder:
         """
         place = as_numbers(place_mm, np.float64, "place")
         if place.shape != (2,) or not (np.isnan(place).all() or (np.abs(place) <= MAX_MM).all()):
-            raise InputError(f"place is {shown(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
-        number = self._press if press is None else whole("press", press, 0, MAX_INDEX)
-        reading = whole("reading", reading, 0, MAX_INDEX)
+            raise InputError(f"place is {short_repr(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
+        number = self._press if press is None else check_int("press", press, 0, MAX_INDEX)
+        reading = check_int("reading", reading, 0, MAX_INDEX)
         x, y = (None if np.isnan(value) else value for value in place.tolist())
         self._note({"event": "begun", "press": number, "reading": reading, "x_mm": x, "y_mm": y, **more})
         self._press, self._down = number, True
@@ -186,7 +189,7 @@ class Recorder:
         """
         if not self._down:
             raise InputError(f"press {self._press} was not begun, so it cannot be finished")
-        reading = whole("reading", reading, 0, MAX_INDEX)
+        reading = check_int("reading", reading, 0, MAX_INDEX)
         self._note({"event": "done", "press": self._press, "reading": reading, **more})
         self.done.add(self._press)
         self._press, self._down = self._press + 1, False
@@ -202,7 +205,7 @@ class Recorder:
         try:
             self._lines.append(json.dumps(event, allow_nan=False) + "\n")
         except (TypeError, ValueError, RecursionError) as error:
-            raise InputError(f"press {event['press']}: {shown(event)}, expected what JSON can hold") from error
+            raise InputError(f"press {event['press']}: {short_repr(event)}, expected what JSON can hold") from error
 
     def sync(self) -> None:
         """Put all so far on the disk: the readings and states first, then what the journal says of them."""
@@ -246,7 +249,8 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _claimed(path: Path) -> BinaryIO:
-    """The journal of a recording that is to be born in `path`, kept from others; of several that come, one gets it."""
+    """The journal of a recording that is to be born in `check_path`, kept from others; of several that come, one gets
+    it."""
     journal = _opened(path / JOURNAL)
     try:
         lock(journal, busy(path))
@@ -284,14 +288,14 @@ def fibres_of(path: Path) -> int:
 
 def refuse_begun(path: Path) -> None:
     """As `refuse_existing`, but for a recording that was broken off while it was being born: one can begin there."""
-    refuse_unwritable(path)
+    check_writable(path)
     if path.exists() and ((path / START).exists() or not unborn(path)):
         refuse_existing(path)
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise InputError if `path` is anything but absent or an empty directory, or cannot be written."""
-    refuse_unwritable(path)
+    """Raise InputError if `check_path` is anything but absent or an empty directory, or cannot be written."""
+    check_writable(path)
     if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
 

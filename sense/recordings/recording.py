@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import held, read_json, scratch, sync, writing
-from padforge.design.common.validation import InputError, instance, shown
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.files import locked, read_json, reraise_write_error, sync, temporary_folder
+from padforge.design.common.validation import InputError, check_type, short_repr
+from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing import limits
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
@@ -176,15 +176,16 @@ class Recording:
             replacing: whether a simulated recording that is there gives way, see `refuse_replacing`.
 
         Raises:
-            InputError: `path` exists and is not an empty directory (no other recording is written over, not even one
+            InputError: `check_path` exists and is not an empty directory (no other recording is written over, not even
+            one
                 that appeared meanwhile), or cannot be written.
         """
-        refuse = refuse_replacing if instance("replacing", replacing, bool) else refuse_existing
+        refuse = refuse_replacing if check_type("replacing", replacing, bool) else refuse_existing
         refuse(path := as_path("path", path))
         path = path.resolve()
-        with writing(path):
+        with reraise_write_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with scratch(path.parent) as folder:
+            with temporary_folder(path.parent) as folder:
                 self._write(folder / path.name, provenance)
                 if replacing:
                     refuse(path)
@@ -204,7 +205,7 @@ class Recording:
 
 
 def _put(unfinished: Path, path: Path) -> None:
-    """Rename a run directory to `path`, unless another came there first."""
+    """Rename a run directory to `check_path`, unless another came there first."""
     try:
         if path.exists():
             path.rmdir()
@@ -216,7 +217,7 @@ def _put(unfinished: Path, path: Path) -> None:
 
 
 def refuse_replacing(path: Path) -> None:
-    """Raise InputError if `path` holds anything but a simulated recording, which the same seed gives again.
+    """Raise InputError if `check_path` holds anything but a simulated recording, which the same seed gives again.
 
     It is never a link, and nobody may be recording into it.
     """
@@ -237,17 +238,19 @@ def refuse_replacing(path: Path) -> None:
         if kind != "simulated":
             raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; {other}")
     if (path / JOURNAL).exists():
-        with held(path / JOURNAL, busy(path)):
+        with locked(path / JOURNAL, busy(path)):
             pass
 
 
 def _validate(recording: Recording) -> None:
     if not isinstance(recording.source, Mapping):
-        raise InputError(f"source is {shown(recording.source)}, expected a mapping")
+        raise InputError(f"source is {short_repr(recording.source)}, expected a mapping")
     try:
         json.dumps(dict(recording.source), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"source is {shown(dict(recording.source))}, expected what JSON can hold ({error})") from error
+        raise InputError(
+            f"source is {short_repr(dict(recording.source))}, expected what JSON can hold ({error})"
+        ) from error
     readings, presses = recording.readings, recording.presses_mm
     if readings.ndim != 2 or not 1 <= readings.shape[1] <= limits.MAX_FIBRES or len(readings) < 2:
         raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {limits.MAX_FIBRES}")

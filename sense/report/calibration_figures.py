@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from padforge.design.common.plotting import ALARM, INK, canvas, explain, save_figure
+from padforge.design.common.plotting import ALARM, INK, add_caption, new_figure, save_figure
 
 from .fibre_loss_figure import label_losses
 
@@ -17,7 +17,7 @@ def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
     test = document["test"]
     pressed, found = np.array(test["pressed_mm"]), np.array(test["found_mm"])
     errors = np.hypot(*(found - pressed).T)
-    figure, axes = canvas(6.4, 5.6)
+    figure, axes = new_figure(6.4, 5.6)
     lines = list(np.stack([pressed, found], axis=1))
     axes.add_collection(LineCollection(lines, colors=INK, linewidths=0.6, alpha=0.55))
     dots = axes.scatter(
@@ -34,14 +34,14 @@ def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
         color=INK,
         fontsize=11,
     )
-    explain(axes, "dot: place pressed; line: to the place found")
+    add_caption(axes, "dot: place pressed; line: to the place found")
     save_figure(figure, path)
 
 
 def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
     """Draw the error against the number of lost fibres: `error_by_loss.png` of a calibration document."""
     rows = document["errors"]
-    figure, axes = canvas(6.0, 4.4)
+    figure, axes = new_figure(6.0, 4.4)
     for at, row in enumerate(rows):
         means = [s["mean_mm"] for s in document["by_subset"] if len(s["lost"]) == row["lost"]]
         # Spread sideways in order of the error, so that no two dots of a level hide each other.

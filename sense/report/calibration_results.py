@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import check_replaceable, refuse_unwritable, staged, write_json
+from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
 from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
 from padforge.sense.health.learning import learn_health
@@ -43,7 +43,7 @@ def calibrate_into(
     Raises:
         InputError: as `calibrate`, `out` cannot be written, or others were made from the localizer in it.
     """
-    refuse_unwritable(out)
+    check_writable(out)
     path, known = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
     check_replaceable(path, known, FILES, force)
     localizer, document = calibrate(recording, options, time_budget=time_budget, progress=progress)
@@ -56,7 +56,9 @@ def calibrate_into(
         except InputError as error:
             health = {}
             warn(f"no watch is kept on the fibres' health: {error}")
-    with staged(out, without=health_files() - health_files(health)) as folder:  # it must not speak for another model
+    with atomic_files(
+        out, without=health_files() - health_files(health)
+    ) as folder:  # it must not speak for another model
         localizer.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings may be told by the result alone
         for name, model in health.items():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, explain, save_figure, tidy
+from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
 
 _WIDTH = 0.36
 
@@ -20,7 +20,7 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
     figure = Figure(figsize=(max(6.4, 1.9 * columns), 4.4 + 1.9 * len(ways)), layout="constrained")
     grid = figure.add_gridspec(1 + len(ways), columns, height_ratios=[4.4] + [1.9] * len(ways))
     axes = figure.add_subplot(grid[0, :])
-    tidy(axes)
+    style_axes(axes)
     for place, (way, colour) in enumerate(zip(ways, (VERTICAL, HORIZONTAL), strict=False)):
         sideways = _WIDTH * (place - (len(ways) - 1) / 2)
         for at, row in enumerate(ways[way]["errors"]):
@@ -49,7 +49,7 @@ def label_losses(axes: Any, rows: Sequence[Mapping[str, Any]], title: str) -> No
     axes.set_ylabel("mean error (mm)")
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_title(f"{title} presses never trained on\n", loc="left", color=INK, fontsize=11)
-    explain(axes, "bar: mean over the sets of lost fibres; dot: one set")
+    add_caption(axes, "bar: mean over the sets of lost fibres; dot: one set")
 
 
 def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, head, save_figure, tidy
+from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, add_title, save_figure, style_axes
 from padforge.design.paths.curves import flatten
 from padforge.sense.twin.identified_pad import Identification
 
@@ -29,7 +29,7 @@ def draw_responses(found: Identification, path: Path) -> None:
         for column, values in enumerate((measured, told, measured - told)):
             each = axes[row, column]
             dots = each.scatter(x, y, c=values, s=9, cmap="RdBu_r", vmin=-most, vmax=most, linewidths=0)
-            tidy(each)
+            style_axes(each)
             each.set_aspect("equal")
         figure.colorbar(dots, ax=list(axes[row]), label="mV", shrink=0.85).outline.set_visible(False)  # type: ignore[operator]
         axes[row, 0].set_ylabel(f"channel {found.live[row] + 1}, fibre {pad.fibres[row] + 1}\ny (mm)", color=INK)
@@ -38,7 +38,7 @@ def draw_responses(found: Identification, path: Path) -> None:
         first = axes[0, column].get_title("left")
         axes[0, column].set_title(f"{name}, {first}" if first else name, fontsize=9, color=INK, loc="left")
         axes[-1, column].set_xlabel("x (mm)")
-    head(figure, f"What {len(presses)} presses held out show, and what the twin says")
+    add_title(figure, f"What {len(presses)} presses held out show, and what the twin says")
     save_figure(figure, path)
 
 
@@ -72,6 +72,6 @@ def draw_laid_plan(found: Identification, path: Path) -> None:
     aside.set(xlabel="along the fibre (%)", ylabel="beside its plan, to the left (mm)", xlim=(0, 104))
     aside.axhline(0, color=FAINT, linewidth=0.8)
     for axes in (plan, aside):
-        tidy(axes)
-    head(figure, "Grey: the plan; coloured: as laid; dots: presses, on the plan")
+        style_axes(axes)
+    add_title(figure, "Grey: the plan; coloured: as laid; dots: presses, on the plan")
     save_figure(figure, path)

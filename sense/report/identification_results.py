@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common.files import check_replaceable, provenance, refuse_unwritable, staged, write_json
+from padforge.design.common.files import atomic_files, check_replaceable, check_writable, provenance, write_json
 from padforge.design.common.page import PageSection, figures, paragraph, table
 from padforge.design.common.profiling import stage
 from padforge.sense.recordings.processing.limits import Array, Mask
@@ -46,14 +46,14 @@ def identify_into(
     """
     from padforge.sense.twin.identification import identify  # here, so that a report that only tells of it does without
 
-    refuse_unwritable(out)
+    check_writable(out)
     origin = provenance(COMMAND, seed, inputs or [])  # minutes later they may differ from what was read
     check_replaceable(out / TWIN, origin, force=force)
     with stage("identify"):
         found = identify(recording, pad, seed, report)
     twin = found.twin(origin)
     document = identification_document(found, twin) | {"rig_mirrored": recording.mirrored, "provenance": origin}
-    with staged(out) as folder, stage("figures"):
+    with atomic_files(out) as folder, stage("figures"):
         from .identification_figures import draw_laid_plan, draw_responses
 
         twin.save(folder / TWIN)

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.plotting import ALARM, FAINT, INK, canvas, explain, save_figure
+from padforge.design.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
 from padforge.sense.localizer.calibration.learning_curve import power_law
 
 
 def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
     """Draw the error against the number of presses learnt from, the fit, and what twice as many would bring."""
-    figure, axes = canvas(6.4, 4.4)
+    figure, axes = new_figure(6.4, 4.4)
     presses = np.array([point["presses"] for point in document["points"]], dtype=float)
     means = [point["mean_mm"] for point in document["points"]]
     ahead, fit = document["forecast"], document["fit"]
@@ -33,5 +33,5 @@ def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
     axes.set_title(
         f"Error by number of presses, on the same {document['test_presses']}\n", loc="left", color=INK, fontsize=11
     )
-    explain(axes, "bars: two standard errors; expected: 80 % of resamplings")
+    add_caption(axes, "bars: two standard errors; expected: 80 % of resamplings")
     save_figure(figure, path)

@@ -8,7 +8,7 @@ from statistics import median
 from typing import Any
 
 from padforge.design.common.files import read_bytes
-from padforge.design.common.page import PageSection, beside, figures, folded, heading, paragraph, table
+from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.press_journal import read_journal
 from padforge.sense.recordings.processing.limits import MAX_FIBRES
@@ -221,10 +221,10 @@ def _losses(errors: Errors) -> Iterator[str]:
     head = ["fibre", *("alone (mm)" if count == 1 else f"with {_count(count - 1)} more" for count in counts)]
     rows = [[fibre + 1, *(_mean(errors, fibre, count) for count in counts)] for fibre in range(fibres)]
     listed = [table(head, rows), paragraph("Mean error over the sets of lost fibres that a fibre is in.")]
-    yield beside(*([chart] if chart else []), listed)
+    yield columns(*([chart] if chart else []), listed)
     hardest = sorted(errors.items(), key=lambda each: -each[1])[:_HARDEST]
     rows = [[_names(lost), f"{error:.2f}"] for lost, error in hardest if lost]
-    yield folded("The sets that hurt most", [table(["lost", "mean (mm)"], rows)])
+    yield collapsible("The sets that hurt most", [table(["lost", "mean (mm)"], rows)])
 
 
 def _mean(errors: Errors, fibre: int, count: int) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import provenance, scratch
+from padforge.design.common.files import provenance, temporary_folder
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
@@ -162,7 +162,7 @@ def record(
             interrupts.check()
         if rig.max_force_n is None:
             say('[rig] max_force_n is "unwatched": no force stops the arm')
-        with scratch(Path(tempfile.gettempdir()), _DRY) if dry else nullcontext(setup.out) as folder:
+        with temporary_folder(Path(tempfile.gettempdir()), _DRY) if dry else nullcontext(setup.out) as folder:
             with recorder_of(setup, rig, plan, folder, resume, devices) as recorder:
                 report(len(recorder.done), len(plan))
                 Session(arm, converter, recorder, rig, dry=dry).run(plan, report, steer)

@@ -51,12 +51,12 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             as_json: bool,
             **options: Any,
         ) -> None:
-            from padforge.design.common.files import refuse_unwritable
+            from padforge.design.common.files import check_writable
             from padforge.design.common.parallel import cluster
 
             from .study import run, study_lines
 
-            refuse_unwritable(out)
+            check_writable(out)
             with common.progress() as bar:
                 task = bar.add_task(name, total=None, note="pads")
                 made = make(names, seed=seed or 0, **options)

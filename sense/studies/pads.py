@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from padforge.design.common.settings import validated
+from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 
@@ -83,7 +83,7 @@ def _found(grid: int, method: Literal["descent", "genetic"], knots: int | None, 
 
     pad = PUBLISHED_PAD.model_copy(update={"grid": grid})
     asked = {"starts": 1, "seed": seed, "method": method} | ({} if knots is None else {"knots": knots})
-    settings = validated(SearchSettings, PUBLISHED_SEARCH.model_dump() | asked, f"{method} search")
+    settings = validate(SearchSettings, PUBLISHED_SEARCH.model_dump() | asked, f"{method} search")
     return search(pad, PUBLISHED_CONTACT, settings).morphology
 
 

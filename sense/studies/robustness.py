@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.checkpoints import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, tidy
+from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.common.validation import InputError
 from padforge.design.contact import lattice, signals, signals_quantized
 from padforge.design.morphology import Morphology
 from padforge.design.networks import Loss, PressSets, batches
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from padforge.sense.recordings.processing.limits import Array
 
@@ -61,7 +61,7 @@ def robustness_study(
         (label, part)
         for label, pad in pads.items()
         for level in range(min(lost, pad.layout.fibres - 1) + 1)
-        for part in batches(lost_subsets(pad.layout.fibres, level, MOST_SETS))
+        for part in batches(failure_subsets(pad.layout.fibres, level, MOST_SETS))
     ]
     tasks = [
         Task(
@@ -211,7 +211,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False, fontsize=8)
     axes.set_title("bar: mean over the sets; line: their spread; dash: the worst set", loc="left", fontsize=8.5)
-    tidy(axes)
+    style_axes(axes)
     highest = float(np.quantile([each["errors"] for each in document["maps"]], 0.99))
     for place, label in enumerate(labels):
         for column, each in enumerate(each for each in document["maps"] if each["pad"] == label):

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.checkpoints import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, tidy
+from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
@@ -235,7 +235,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.xaxis.minorticks_off()
         axes.set(xlabel="grid", ylabel=name)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
-        tidy(axes)
+        style_axes(axes)
     panels = lower.subplots(len(labels), len(grids), squeeze=False)
     highest = float(np.quantile([each["errors"] for each in document["maps"]], 0.98))
     for each in document["maps"]:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.checkpoints import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, tidy
+from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import PressSets, fit_many
@@ -151,7 +151,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     )
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    tidy(axes)
+    style_axes(axes)
     names = [f"{radius:g}/{shape}" for shape, radius in product(sides, radii)]
     for number, label in enumerate(labels):
         axes = figure.add_subplot(grid[1, number], aspect="equal")
@@ -165,5 +165,5 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.set_xlabel("pressed with K/D", fontsize=8)
         axes.set_ylabel("trained with K/D" if number == 0 else "", fontsize=8)
         axes.set_title(label, loc="left", fontsize=9, color=INK)
-        tidy(axes)
+        style_axes(axes)
     return figure

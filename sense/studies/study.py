@@ -95,17 +95,17 @@ def run(
         InputError: tasks to go on from that belong to other settings, a folder that cannot be written, or in which the
             same study is at work.
     """
-    from padforge.design.common.files import refuse_unwritable, staged
+    from padforge.design.common.files import atomic_files, check_writable
     from padforge.design.common.plotting import save_figure
 
-    refuse_unwritable(out)
+    check_writable(out)
     # What is kept goes by the number of a task, so the tasks and their order count as much as the settings.
     order = hashlib.sha256("\n".join(task.name for task in study.tasks).encode()).hexdigest()[:16]
     with _alone(out, study.name):
         kept = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
         findings = study.conclude(_done(study.tasks, kept, (executor, jobs), resume, progress))
         document = _document(study, findings)
-        with staged(out) as folder:
+        with atomic_files(out) as folder:
             save_figure(study.draw(document), folder / f"{study.name}.png")
             write_text(folder / f"{study.name}.csv", _csv(findings.rows))
             write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))

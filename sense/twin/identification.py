@@ -7,7 +7,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from padforge.design import Morphology
-from padforge.design.common.validation import InputError, instance, whole
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.settings import sensed_rectangle
 from padforge.design.twin import MOST_LOOKS, TwinReadings
 from padforge.sense.recordings.processing.limits import Array, Indices
@@ -67,10 +67,10 @@ def identify(
         InputError: too few presses of known places, all in one part of the pad, no channel that answers, more that do
             than there are fibres, or none that answers like this pad.
     """
-    instance("recording", recording, Recording)
-    instance("pad", pad, Morphology)
+    check_type("recording", recording, Recording)
+    check_type("pad", pad, Morphology)
     recording = of_one_depth(recording)
-    rng = np.random.default_rng(whole("seed", seed, 0, 2**32 - 1))
+    rng = np.random.default_rng(check_int("seed", seed, 0, 2**32 - 1))
     places = recording.presses_mm[recording.known]
     _refuse_places(places, pad)
     report("responses", 0, 1)

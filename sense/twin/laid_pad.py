@@ -14,7 +14,7 @@ import numpy as np
 from padforge.design import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
-from padforge.design.twin import Frame
+from padforge.design.twin import PlanTransform
 from padforge.sense.recordings.processing.limits import Array, Indices
 
 from .kernels.response import along_fibre, channel_response
@@ -101,7 +101,7 @@ class LaidPad:
     values: Array
 
     @classmethod
-    def on_plan(cls, plan: Plan, fibres: tuple[int, ...], frame: Frame, width: float) -> "LaidPad":
+    def on_plan(cls, plan: Plan, fibres: tuple[int, ...], frame: PlanTransform, width: float) -> "LaidPad":
         """A pad that lies as planned, with a Gaussian reach of standard deviation `width` and gains of 1."""
         step = NARROW * width
         distance = np.linspace(0, (SPLINES + 1) * step, 100)
@@ -113,10 +113,10 @@ class LaidPad:
         return cls(plan, fibres, frame.mirrored, step, values)
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> PlanTransform:
         """How it lay."""
         turn, x, y, scale = self.values[:4].tolist()
-        return Frame(self.mirrored, (float(np.degrees(turn)) + 180) % 360 - 180, (x, y), scale)
+        return PlanTransform(self.mirrored, (float(np.degrees(turn)) + 180) % 360 - 180, (x, y), scale)
 
     @property
     def end(self) -> float:

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
 
-from padforge.design.twin import Frame
+from padforge.design.twin import PlanTransform
 from padforge.sense.recordings.processing.limits import Array, Mask
 
 from .laid_pad import Plan
@@ -42,7 +42,7 @@ class Wiring:
         match: mean squared correlation, 0 to 1.
     """
 
-    frame: Frame
+    frame: PlanTransform
     width: float
     fibres: tuple[int, ...]
     match: float
@@ -63,7 +63,7 @@ class Matcher:
         self._there = self._presses.there
         self._volts = _centred(self._presses.volts, self._there)
 
-    def __call__(self, frame: Frame, width: float) -> Wiring:
+    def __call__(self, frame: PlanTransform, width: float) -> Wiring:
         """The best wiring for a frame."""
         places = self._plan.to_grid(frame.to_plan(self._presses.places_mm))
         points = self._course.reshape(-1, 2)
@@ -113,7 +113,7 @@ def wirings(
     middle = presses.places_mm.min(axis=0) / 2 + presses.places_mm.max(axis=0) / 2
     tried = []
     for mirrored, quarter, x, y in product((False, True), range(4), SHIFTS, SHIFTS):
-        lying = Frame(mirrored, 90.0 * quarter)
+        lying = PlanTransform(mirrored, 90.0 * quarter)
         shift = np.array([x, y]) * plan.unit_mm - _off_middle(middle, lying, plan)
         tried.append(matcher(replace(lying, shift_mm=tuple(shift.tolist())), WIDTH))
     tried.sort(key=lambda wiring: -wiring.match)
@@ -126,7 +126,7 @@ def wirings(
     return sorted(best.values(), key=lambda wiring: -wiring.match)
 
 
-def _off_middle(middle: Array, lying: Frame, plan: Plan) -> Array:
+def _off_middle(middle: Array, lying: PlanTransform, plan: Plan) -> Array:
     """The middle of what was pressed, as a shift that is undone where it lies far off the pad's own middle."""
     turned = lying.turned(middle[None])[0]
     return turned if np.abs(turned).max() > plan.unit_mm else np.zeros(2)
@@ -139,7 +139,9 @@ def _moved(matcher: Matcher, wiring: Wiring, unit_mm: float) -> Wiring:
     def at(change: Array) -> Wiring:
         turn, x, y, scale, width = (change * unit).tolist()
         shift = start.shift_mm[0] + x, start.shift_mm[1] + y
-        frame = Frame(start.mirrored, start.turn_deg + float(np.degrees(turn)), shift, max(start.scale + scale, 0.5))
+        frame = PlanTransform(
+            start.mirrored, start.turn_deg + float(np.degrees(turn)), shift, max(start.scale + scale, 0.5)
+        )
         return matcher(frame, wiring.width * float(np.exp(width)))
 
     def cost(change: Array) -> float:

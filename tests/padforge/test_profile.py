@@ -11,7 +11,7 @@ import pytest
 
 from padforge.design import Morphology, signals, signals_sparse
 from padforge.design.common import profiling
-from padforge.design.optimize.search import SearchRun, search
+from padforge.design.optimize.search import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
 from padforge.sense import RigSettings, calibrate, simulate
@@ -118,10 +118,10 @@ def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
     monkeypatch.setattr("padforge.design.common.checkpoints.Checkpoints.clear", lambda self: None)
     with profiling.profiled() as profile:
-        first = search(*asked, run=SearchRun(keep_in=tmp_path / "search"))
+        first = search(*asked, run=SearchOptions(keep_in=tmp_path / "search"))
     assert profile.counts["starts"] == [2, 2]
     heard = []
-    resumed = SearchRun(lambda *step: heard.append(step), keep_in=tmp_path / "search", resume=True)
+    resumed = SearchOptions(lambda *step: heard.append(step), keep_in=tmp_path / "search", resume=True)
     with profiling.profiled() as profile:
         again = search(*asked, run=resumed)
     assert not heard

@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge import design, fabricate, sense
 from padforge.design import InputError
-from padforge.design.common.validation import Fault, shown
+from padforge.design.common.validation import Fault, short_repr
 from padforge.report import write_report
 from padforge.sense.health.health_model import DETECTED
 
@@ -190,7 +190,7 @@ def drawn(rng: Rng) -> tuple[Callable[[], None], str]:
             given[key] = spoiled(rng, value)
         else:
             given[key] = pick(rng, ODD) if rng.random() < 0.7 else pick(rng, list(suits.values()))
-    told = f"{name}({', '.join(f'{key}={shown(value)}' for key, value in given.items())})"
+    told = f"{name}({', '.join(f'{key}={short_repr(value)}' for key, value in given.items())})"
 
     def call() -> None:
         with warnings.catch_warnings():

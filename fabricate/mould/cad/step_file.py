@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from padforge.design.common.files import scratch
+from padforge.design.common.files import temporary_folder
 
 if TYPE_CHECKING:
     from build123d import Compound
@@ -48,7 +48,7 @@ def write_step(path: Path, shape: "Compound") -> None:
     """
     from build123d import export_step
 
-    with scratch(path.parent) as folder:
+    with temporary_folder(path.parent) as folder:
         whole = folder / "whole.step"
         try:
             written = export_step(shape, whole, write_pcurves=False, timestamp=_EPOCH)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import onnxruntime
 
-from padforge.design.common.files import atomic
+from padforge.design.common.files import atomic_file
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.health.trained_model import refuse_other_pad
 from padforge.sense.localizer.features import DOWN, bridged, press_inputs
@@ -87,7 +87,7 @@ def export_onnx(localizer: Localizer, digest: str, path: Path, recording: Record
             f"{path}: not written, onnxruntime finds places {places:.2g} mm off those of the localizer, "
             f"allowed are {MOST_OFF_MM:g} mm"
         )
-    with atomic(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(content)
     return Exported(len(content), len(tried.begun), lost, places, radii)
 

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
-from padforge.design.common.server import END_S, POLL_S, ConnectionServer, listening, refuse_open
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.server import END_S, POLL_S, ConnectionServer, bind_server, check_exposure
+from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
 from .messages import Message
@@ -54,8 +54,8 @@ class Lines:
         Raises:
             InputError: the port is taken, or not for this user, or others could listen without a token.
         """
-        refuse_open(host, token)
-        self._server = listening(lambda: _LineServer((host, port), token), host, port, "--tcp")
+        check_exposure(host, token)
+        self._server = bind_server(lambda: _LineServer((host, port), token), host, port, "--tcp")
         self.address: tuple[str, int] = self._server.server_address[:2]  # type: ignore[assignment]
         self._number = 0
 
@@ -201,7 +201,7 @@ class Lsl:
             InputError: a name that is no text.
         """
         if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes of a command line that are no text
-            raise InputError(f"the name of a stream is {shown(name)}, expected text")
+            raise InputError(f"the name of a stream is {short_repr(name)}, expected text")
         volts = {f"fibre {fibre}": "V" for fibre in range(1, fibres + 1)}
         self._readings = _outlet(f"{name} readings", volts, rate_hz)
         self._touches = _outlet(f"{name} touches", PLACE, 0.0)

@@ -11,9 +11,9 @@ import numpy as np
 
 from padforge.design.common.files import provenance
 from padforge.design.common.profiling import stage
-from padforge.design.common.settings import or_default, validated
-from padforge.design.common.validation import InputError, instance, real
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.common.settings import or_default, validate
+from padforge.design.common.validation import InputError, check_float, check_type
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.localizer.evaluation import conformal, evaluate, held_back
 from padforge.sense.localizer.features import PHASES, press_inputs
@@ -69,11 +69,11 @@ def calibrate(
         InputError: an option out of range, a time budget for the published method, too few presses to hold a share
             back, or a training that diverged.
     """
-    instance("recording", recording, Recording)
+    check_type("recording", recording, Recording)
     options = or_default("options", options, settings.LocalizerSettings)
     given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
-    options = validated(settings.LocalizerSettings, {**options.model_dump(), **given}, "[localizer]")
-    time_budget = None if time_budget is None else real("time_budget", time_budget, 0, MOST_SECONDS)
+    options = validate(settings.LocalizerSettings, {**options.model_dump(), **given}, "[localizer]")
+    time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MOST_SECONDS)
     if options.method == "published":
         if time_budget is not None:
             raise InputError("time_budget is given: method published trains until it gains no more, expected masked")
@@ -166,7 +166,7 @@ def proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int)
     """
     targets = localizer.normalization.targets(places_mm)
     ratios = []
-    for lost in (lost for level in range(levels) for lost in lost_subsets(localizer.fibres, level, PROVEN)):
+    for lost in (lost for level in range(levels) for lost in failure_subsets(localizer.fibres, level, PROVEN)):
         alive = presses.alive & ~np.isin(np.arange(localizer.fibres), lost)
         outputs = learnt(localizer.weights, presses.inputs, alive, "masked", localizer.observer, localizer.corrector)
         found, logs = np.split(outputs, 2, axis=2)
@@ -254,7 +254,7 @@ def radii(
 ) -> Array:
     """(levels, 3 + T) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
     plain = replace(localizer, factors=np.ones((1, localizer.factors.shape[1])))
-    by_level = (lost_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
+    by_level = (failure_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
     found = ([plain.locate(presses, subset) for subset in subsets] for subsets in by_level)
     return np.clip([conformal(each, places_mm, measures) for each in found], 1e-6, 1e6)
 

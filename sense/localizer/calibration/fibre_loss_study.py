@@ -17,8 +17,8 @@ from padforge.design.common.checkpoints import Checkpoints, State
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, instance, path, shown, whole
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.common.validation import InputError, check_int, check_path, check_type, short_repr
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.localizer.evaluation import by_place, errors_by_loss
 from padforge.sense.localizer.localizer import Found, Localizer
@@ -67,14 +67,14 @@ def fibre_loss_study(
             recalibration or that does not suit the localizer, a localizer that knows no lost fibres, or networks in
             `keep_in` of other settings.
     """
-    instance("retrain", retrain, bool)
+    check_type("retrain", retrain, bool)
     if localizer is None and not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
-    instance("recording", recording, Recording)
+    check_type("recording", recording, Recording)
     if localizer is not None:
-        instance("localizer", localizer, Localizer)
-    keep_in = None if keep_in is None else path("keep_in", keep_in)
-    options, lost = or_default("options", options, settings.LocalizerSettings), whole("lost", lost, 0, MAX_FIBRES)
+        check_type("localizer", localizer, Localizer)
+    keep_in = None if keep_in is None else check_path("keep_in", keep_in)
+    options, lost = or_default("options", options, settings.LocalizerSettings), check_int("lost", lost, 0, MAX_FIBRES)
     chosen = _chosen(failed, recording.fibres)
     training, test = split_unseen(recording, localizer, options)
     levels = range(min(lost, recording.fibres - 1) + 1)
@@ -100,8 +100,8 @@ def fibre_loss_study(
 
 def _chosen(failed: Sequence[int], fibres: int) -> list[Lost]:
     """The set of fibres that is mapped beside the worst ones, if there is one."""
-    numbers = instance("failed", failed, Sequence)
-    subset = tuple(sorted({whole("failed fibre", fibre, 0, fibres - 1) for fibre in numbers}))
+    numbers = check_type("failed", failed, Sequence)
+    subset = tuple(sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in numbers}))
     if len(subset) == fibres:
         raise InputError(f"failed are all {fibres} fibres, at least one must be left")
     return [subset] if subset else []
@@ -133,7 +133,7 @@ def _retrained(
     progress: Callable[[int, int], None],
 ) -> dict[Lost, Found]:
     """What the network of each set of lost fibres finds for the test presses; finished ones are not made again."""
-    subsets = [subset for level in levels for subset in lost_subsets(recording.fibres, level)]
+    subsets = [subset for level in levels for subset in failure_subsets(recording.fibres, level)]
     subsets += [subset for subset in chosen if subset not in subsets]
     about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
     kept = Checkpoints(keep_in, {"fibre-loss": about}) if keep_in else None
@@ -172,7 +172,7 @@ def _found_of(state: State, presses: int) -> Found:
     shapes = {"places_mm": (presses, 2), "sd_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
     arrays = {name: (array.shape, array.dtype.kind) for name, array in state.items()}
     if arrays != {name: (shape, "f") for name, shape in shapes.items()}:
-        raise InputError(f"unfinished networks hold {shown(arrays)}, expected {shapes}; remove them to start anew")
+        raise InputError(f"unfinished networks hold {short_repr(arrays)}, expected {shapes}; remove them to start anew")
     if not all(np.isfinite(array).all() for array in state.values()):
         raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
     return Found(state["places_mm"], state["sd_mm"], state["r50_mm"], state["r90_mm"])

@@ -14,7 +14,7 @@ import numpy as np
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, instance
+from padforge.design.common.validation import InputError, check_type
 from padforge.sense import settings
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recordings.processing.limits import Array, Indices
@@ -55,7 +55,7 @@ def learning_curve(
     Raises:
         InputError: too few presses for a curve.
     """
-    instance("recording", recording, Recording)
+    check_type("recording", recording, Recording)
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.known)

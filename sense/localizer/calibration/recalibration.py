@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.files import provenance
-from padforge.design.common.validation import InputError, instance, whole
-from padforge.design.objectives.fibre_loss import lost_subsets
+from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.localizer.evaluation import conformal, distances, error_row
 from padforge.sense.localizer.features import Inputs
 from padforge.sense.localizer.localizer import Found, Localizer, joined
@@ -66,16 +66,16 @@ def recalibrate(
     Raises:
         InputError: too few presses of known place, or a recording that does not suit the localizer.
     """
-    instance("localizer", localizer, Localizer)
-    known = np.flatnonzero(instance("recording", recording, Recording).known)
-    seed = whole("seed", seed, 0, 2**32 - 1)
+    check_type("localizer", localizer, Localizer)
+    known = np.flatnonzero(check_type("recording", recording, Recording).known)
+    seed = check_int("seed", seed, 0, 2**32 - 1)
     if len(known) < LEAST_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known place, expected at least {LEAST_PRESSES}")
     rows = np.random.default_rng(seed).permutation(known)
     raw, places_mm = localizer.raw_inputs(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in localizer.normalization.measures}
     levels = range(len(localizer.factors))
-    subsets = [subset for level in levels for subset in lost_subsets(localizer.fibres, level, SUBSETS)]
+    subsets = [subset for level in levels for subset in failure_subsets(localizer.fibres, level, SUBSETS)]
     validation = CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
     before = validation.found([localizer] * FOLDS)
     now, after, changes = _changed(localizer, validation, before, seed, progress)

@@ -17,7 +17,7 @@ from reprlib import repr as shortened
 
 import numpy as np
 
-from padforge.design.common.files import atomic, writing
+from padforge.design.common.files import atomic_file, reraise_write_error
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
 from padforge.sense.recordings.recording import Recording
@@ -96,7 +96,11 @@ def export_csv(recording: Recording, path: str | Path) -> None:
         place: list[float | str] = ["?", "?"] if isnan(press[0]) else press[:2]
         cells = [*place, *("" if isnan(value) else value for value in press[2:])]
         places[begun:lifted] = [cells] * int(lifted - begun)
-    with writing(path), atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with (
+        reraise_write_error(path),
+        atomic_file(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(header)
         for time, volts, place in zip(recording.times_s.tolist(), recording.readings.tolist(), places, strict=True):

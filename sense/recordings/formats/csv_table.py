@@ -15,8 +15,8 @@ from typing import TextIO
 
 import numpy as np
 
-from padforge.design.common.files import require_file
-from padforge.design.common.validation import MOST_VALUES, InputError
+from padforge.design.common.files import check_file
+from padforge.design.common.validation import MAX_VALUES, InputError
 from padforge.sense.recordings.processing.limits import MAX_BYTES, Array
 
 UNKNOWN = -1.7e308
@@ -39,7 +39,7 @@ class CsvTable:
     """
 
     def __init__(self, path: Path, gaps: bool = False) -> None:
-        self.path, self._gaps = require_file(path, MAX_BYTES), gaps
+        self.path, self._gaps = check_file(path, MAX_BYTES), gaps
         with _reading(self.path) as file:
             self._skipped, header = _header(file)
             self._separator = _separator(header)
@@ -65,8 +65,8 @@ class CsvTable:
                 part = self._at_once(text, numbers, unknown)
                 parts.append(self._line_by_line(first, text, numbers, unknown) if part is None else part)
                 size += parts[-1].size
-                if size > MOST_VALUES:
-                    raise InputError(f"{self.path}: holds more than {MOST_VALUES} values, allowed are so many")
+                if size > MAX_VALUES:
+                    raise InputError(f"{self.path}: holds more than {MAX_VALUES} values, allowed are so many")
         return np.concatenate(parts)
 
     def line(self, row: int) -> int:

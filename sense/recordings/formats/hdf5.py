@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import atomic, writing
+from padforge.design.common.files import atomic_file, reraise_write_error
 from padforge.design.common.mat_files import plain_datasets
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.recording import Recording
@@ -36,7 +36,11 @@ def export_hdf5(recording: Recording, path: str | Path) -> None:
     import h5py
 
     path = export_path(recording, path)
-    with writing(path), atomic(path) as temporary, h5py.File(temporary, "w", track_order=True, locking=False) as file:
+    with (
+        reraise_write_error(path),
+        atomic_file(path) as temporary,
+        h5py.File(temporary, "w", track_order=True, locking=False) as file,
+    ):
         file.attrs["format"] = FORMAT
         file.attrs["source"] = json.dumps(dict(recording.source))
         arrays = {name: getattr(recording, attribute) for name, attribute in _ARRAYS.items()}

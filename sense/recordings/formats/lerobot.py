@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import scratch, write_json, writing
+from padforge.design.common.files import reraise_write_error, temporary_folder, write_json
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Indices
 from padforge.sense.recordings.recorder import refuse_existing
@@ -61,9 +61,9 @@ def export_lerobot(recording: Recording, path: Path, findings: ModelFindings | N
     starts, ends = _episodes(recording)
     columns, names = _columns(recording, starts, ends, findings)
     path = path.resolve()
-    with writing(path):
+    with reraise_write_error(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with scratch(path.parent) as folder:
+        with temporary_folder(path.parent) as folder:
             _write(folder / path.name, columns, names, ends - starts, _rate(recording.rate_hz))
             if path.exists():
                 path.rmdir()

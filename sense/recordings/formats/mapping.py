@@ -11,8 +11,8 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
-from padforge.design.common.validation import InputError, instance, shown
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import InputError, check_type, short_repr
+from padforge.design.common.validation import check_path as as_path
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6}
@@ -59,7 +59,7 @@ def file_and_mapping(path: object, mapping: object) -> tuple[Path, str]:
     Raises:
         InputError: one of them is something else.
     """
-    return as_path("path", path), instance("mapping", mapping, str)
+    return as_path("path", path), check_type("mapping", mapping, str)
 
 
 def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part]:
@@ -75,17 +75,19 @@ def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part
     named = [part.quantity for part in parts]
     for quantity in named:
         if quantity != "fibres" and named.count(quantity) > 1:
-            raise InputError(f"mapping {shown(text)} names {quantity} twice, expected once")
+            raise InputError(f"mapping {short_repr(text)} names {quantity} twice, expected once")
     needed = [quantity for quantity in ("time", "fibres") if quantity in allowed]
     for quantity in needed:
         if quantity not in named:
-            raise InputError(f"mapping {shown(text)} does not name {quantity}, expected {' and '.join(needed)} in each")
+            raise InputError(
+                f"mapping {short_repr(text)} does not name {quantity}, expected {' and '.join(needed)} in each"
+            )
     for one, other in (("x", "y"), ("begun", "lifted")):
         if (one in named) != (other in named):
-            raise InputError(f"mapping {shown(text)} names one of {one} and {other}, expected both or neither")
+            raise InputError(f"mapping {short_repr(text)} names one of {one} and {other}, expected both or neither")
     for one, other in (("x", "places"), ("press", "begun")):
         if one in named and other in named:
-            raise InputError(f"mapping {shown(text)} names {one} and {other}, expected one of them")
+            raise InputError(f"mapping {short_repr(text)} names {one} and {other}, expected one of them")
     return parts
 
 
@@ -94,7 +96,7 @@ def _part(text: str, allowed: Sequence[str]) -> Part:
     name, colon, unit = (piece.strip() for piece in (rest.rpartition(":") if ":" in rest else (rest, "", "")))
     if quantity not in allowed or not name:
         raise InputError(
-            f"mapping has {shown(text)}, expected QUANTITY=NAME or QUANTITY=NAME:UNIT, "
+            f"mapping has {short_repr(text)}, expected QUANTITY=NAME or QUANTITY=NAME:UNIT, "
             f"where QUANTITY is one of {', '.join(allowed)}"
         )
     return Part(quantity, name, _factor(quantity, unit) if colon else None)
@@ -110,7 +112,7 @@ def _factor(quantity: str, unit: str) -> float:
         factor = 0.0
     if not isfinite(factor) or factor == 0 or quantity == "press":
         allowed = f"{', '.join(units)} or a factor" if units else "none"
-        raise InputError(f"unit of {quantity} is {shown(unit)}, allowed is {allowed}")
+        raise InputError(f"unit of {quantity} is {short_repr(unit)}, allowed is {allowed}")
     return factor
 
 
@@ -132,12 +134,14 @@ def chosen(parts: Sequence[Part], names: Sequence[str]) -> list[tuple[Part, list
             pattern = part.name.replace("[", "[[]")  # units stand in such brackets
             places = [at for at, name in enumerate(names) if fnmatchcase(name, pattern) and at not in taken]
         if not places:
-            raise InputError(f"{part.quantity} is {shown(part.name)}, expected one of {listed(names)}")
+            raise InputError(f"{part.quantity} is {short_repr(part.name)}, expected one of {listed(names)}")
         if len(places) > 1 and part.quantity != "fibres":
             several = listed([names[at] for at in places])
-            raise InputError(f"{part.quantity} is {shown(part.name)}, which may be each of {several}; expected one")
+            raise InputError(
+                f"{part.quantity} is {short_repr(part.name)}, which may be each of {several}; expected one"
+            )
         if not taken.isdisjoint(places):
-            raise InputError(f"{part.quantity} is {shown(part.name)}, which is named before; expected each once")
+            raise InputError(f"{part.quantity} is {short_repr(part.name)}, which is named before; expected each once")
         taken.update(places)
         found.append((part, places))
     return found
@@ -146,4 +150,4 @@ def chosen(parts: Sequence[Part], names: Sequence[str]) -> list[tuple[Part, list
 def listed(names: Sequence[str], most: int = 12) -> str:
     """Names with commas between them, the first of many."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    return (", ".join(shown(name) for name in names[:most]) or "nothing") + more
+    return (", ".join(short_repr(name) for name in names[:most]) or "nothing") + more

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from padforge.design.common.validation import instance
-from padforge.design.common.validation import path as as_path
+from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.validation import check_type
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recording import Recording
 
@@ -46,7 +46,7 @@ def export_path(recording: object, path: object, findings: object = None) -> Pat
     Raises:
         InputError: one of them is something else.
     """
-    instance("recording", recording, Recording)
+    check_type("recording", recording, Recording)
     if findings is not None:
-        instance("findings", findings, ModelFindings)
+        check_type("findings", findings, ModelFindings)
     return as_path("path", path)

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.parallel import in_chunks
-from padforge.design.common.validation import InputError, instance, real, shown, whole
+from padforge.design.common.parallel import map_chunks
+from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 
 from .kernels import clipping, total_variation_l1, total_variation_l2
 from .kernels import running_median as median_kernel
@@ -51,8 +51,8 @@ def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
         raise InputError(f"times_s have shape {times.shape}, expected (R,)")
     refuse_beyond("times_s", times[:, None], MAX_S, "s")
     if (np.diff(times) < 0).any():
-        raise InputError(f"times_s are {shown(times_s)}, expected finite numbers that ascend")
-    if not (longest := real("longest_s", longest_s, 0.0, 1e300)):
+        raise InputError(f"times_s are {short_repr(times_s)}, expected finite numbers that ascend")
+    if not (longest := check_float("longest_s", longest_s, 0.0, 1e300)):
         raise InputError(f"longest_s is {longest_s!r}, allowed is a number above 0")
     return np.flatnonzero(np.diff(times) > longest) + 1
 
@@ -85,7 +85,7 @@ def total_variation(
             as above.
     """
     check_variation(lam, fidelity)
-    instance("causal", causal, bool)
+    check_type("causal", causal, bool)
     kernel = KERNELS[fidelity]
 
     def denoise(stretch: Array) -> Array:
@@ -140,7 +140,7 @@ def _by_channel(readings: ArrayLike, starts: ArrayLike, work: Callable[[Array], 
             for first, last in pairwise(edges):
                 out[c, first:last] = work(columns[c, first:last])
 
-    in_chunks(filter_channels, len(columns), 1 + _GRAIN // max(count, 1))
+    map_chunks(filter_channels, len(columns), 1 + _GRAIN // max(count, 1))
     return np.ascontiguousarray(out.T).reshape(array.shape)
 
 
@@ -164,15 +164,15 @@ def checked_readings(readings: ArrayLike) -> Array:
 def _checked_starts(starts: ArrayLike, readings: int) -> list[int]:
     array = as_numbers(starts, np.int64, "starts")
     if array.ndim != 1 or (np.diff(array) <= 0).any() or (len(array) and not 0 <= array[0] <= array[-1] < readings):
-        raise InputError(f"starts are {shown(starts)}, allowed are ascending indices of {readings} readings")
+        raise InputError(f"starts are {short_repr(starts)}, allowed are ascending indices of {readings} readings")
     return array.tolist()
 
 
 def check_variation(lam: float, fidelity: str) -> None:
     """Raise InputError unless `total_variation` takes these."""
     if not isinstance(fidelity, str) or fidelity not in KERNELS:
-        raise InputError(f"fidelity is {shown(fidelity)}, allowed is {' or '.join(KERNELS)}")
-    if not real("lam", lam, 0.0, GREATEST):
+        raise InputError(f"fidelity is {short_repr(fidelity)}, allowed is {' or '.join(KERNELS)}")
+    if not check_float("lam", lam, 0.0, GREATEST):
         raise InputError(f"lam is {lam!r}, allowed is a number above 0, up to {GREATEST:g}")
 
 
@@ -182,6 +182,6 @@ def window_reach(width: int, causal: bool) -> tuple[int, int]:
     Raises:
         InputError: a width that is no odd whole number above 0.
     """
-    if (width := whole("width", width, 1, WIDEST)) % 2 != 1:
+    if (width := check_int("width", width, 1, WIDEST)) % 2 != 1:
         raise InputError(f"width is {width!r}, allowed is an odd whole number above 0")
-    return (width - 1, 0) if instance("causal", causal, bool) else (width // 2, width // 2)
+    return (width - 1, 0) if check_type("causal", causal, bool) else (width // 2, width // 2)

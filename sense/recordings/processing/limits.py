@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.validation import MOST_VALUES, InputError, shown
+from padforge.design.common.validation import MAX_VALUES, InputError, short_repr
 
 MAX_FIBRES = 512
 MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
@@ -35,15 +35,15 @@ def as_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool 
     try:
         array = np.asarray(values)
     except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
-        raise InputError(f"{name} are {shown(values)}, expected an array of {what} ({error})") from error
+        raise InputError(f"{name} are {short_repr(values)}, expected an array of {what} ({error})") from error
     if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} are {shown(values)} ({array.dtype}), expected an array of {what}")
-    if array.size > MOST_VALUES:
-        raise InputError(f"{name} are {array.size} numbers, allowed are {MOST_VALUES}")
+        raise InputError(f"{name} are {short_repr(values)} ({array.dtype}), expected an array of {what}")
+    if array.size > MAX_VALUES:
+        raise InputError(f"{name} are {array.size} numbers, allowed are {MAX_VALUES}")
     with np.errstate(over="ignore"):  # of longer floats, which become infinity
         array = array.astype(np.float64, copy=copy) if array.dtype.kind == "f" else array
     if kind is np.int64 and not ((array >= -MAX_INDEX) & (array <= MAX_INDEX) & (array == np.trunc(array))).all():
-        raise InputError(f"{name} are {shown(values)}, expected an array of {what}")
+        raise InputError(f"{name} are {short_repr(values)}, expected an array of {what}")
     return array.astype(kind, copy=copy)
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.validation import InputError, whole
+from padforge.design.common.validation import InputError, check_int
 
 from .kernels.pad_state import unknown
 from .kernels.press_detection import find
@@ -64,7 +64,7 @@ class Finder:
     """
 
     def __init__(self, fibres: int) -> None:
-        fibres = whole("fibres", fibres, 1, MAX_FIBRES)
+        fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
         self._fibres, self._pad = unknown(fibres)
         self._last_s = -np.inf
         self._doubt, self._sure = (chi_square_limits(fibres, chance) for chance in (DOUBT, SURE))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.validation import InputError, whole
+from padforge.design.common.validation import InputError, check_int
 
 from .filters import KERNELS, NOBODY, Fidelity, check_variation, checked_readings, median_of, window_reach
 from .kernels import clipping
@@ -34,7 +34,10 @@ class TotalVariation:
             InputError: an argument out of range.
         """
         check_variation(lam, fidelity)
-        channels, most_held = whole("channels", channels, 1, MAX_FIBRES), whole("most_held", most_held, 1, 2**31)
+        channels, most_held = (
+            check_int("channels", channels, 1, MAX_FIBRES),
+            check_int("most_held", most_held, 1, 2**31),
+        )
         self._channels = [_Channel(float(lam), fidelity, most_held) for _ in range(channels)]
 
     @property
@@ -112,7 +115,7 @@ class RunningMedian:
         Raises:
             InputError: an argument out of range.
         """
-        channels = whole("channels", channels, 1, MAX_FIBRES)
+        channels = check_int("channels", channels, 1, MAX_FIBRES)
         self._before, self._after = window_reach(width, causal)
         self._held = np.empty((channels, 0))
         self._given = 0  # of the readings held, those whose median has been given

@@ -4,7 +4,7 @@ import numpy as np
 
 from padforge.design import Contact, Morphology, Twin
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import MOST_VALUES, InputError, instance, whole
+from padforge.design.common.validation import MAX_VALUES, InputError, check_int, check_type
 from padforge.design.settings import PadSettings
 from padforge.sense.recordings.press_plan import free_of, planned_in, size_of, uniform
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
@@ -44,8 +44,8 @@ def simulate(
             that is adaptive or no file of places, or a twin of which no channel reads a fibre.
     """
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
-    channels = len(pad.channels) if isinstance(pad, Twin) else len(instance("pad", pad, Morphology).knots)
-    whole("fibres of the pad", channels, 1, MAX_FIBRES)
+    channels = len(pad.channels) if isinstance(pad, Twin) else len(check_type("pad", pad, Morphology).knots)
+    check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     if rig.plan == "adaptive":
         raise InputError(
             "[rig] plan is adaptive, which only a recording in real time is steered by; allowed where presses are "
@@ -56,10 +56,10 @@ def simulate(
     rng = np.random.default_rng(rig.seed)
     plan = planned_in(model.pressed_mm, rig, rng, model.free)
     values = len(plan) * rig.readings_per_press * channels
-    if values > MOST_VALUES:
+    if values > MAX_VALUES:
         raise InputError(
             f"[rig] presses is {len(plan)}: with {rig.readings_per_press} readings each of {channels} fibres "
-            f"{values} values, allowed are {MOST_VALUES}"
+            f"{values} values, allowed are {MAX_VALUES}"
         )
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     readings = read_pad(model.answers(plan.places_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
@@ -79,7 +79,7 @@ def simulate(
 def _modelled(pad: Morphology | Twin, contact: Contact, size: PadSettings | None, like: Twin | None) -> SimulatedPad:
     if isinstance(pad, Twin):
         return measured(pad, size)
-    return planned(pad, contact, size) if like is None else measured_alike(pad, instance("like", like, Twin), size)
+    return planned(pad, contact, size) if like is None else measured_alike(pad, check_type("like", like, Twin), size)
 
 
 def random_places(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from padforge.design.common.files import read_json
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.settings import RigSettings
 
@@ -65,7 +65,7 @@ def _frame(folder: Path) -> Mapping[str, Any]:
     if wrong := [name for name, value in read.items() if value is None]:
         raise InputError(f"{path}: frame has no {wrong[0]}, expected {counts[wrong[0]]} finite numbers")
     if type(mirrored := frame.get("mirrored", False)) is not bool:
-        raise InputError(f"{path}: mirrored of frame is {shown(mirrored)}, expected true or false")
+        raise InputError(f"{path}: mirrored of frame is {short_repr(mirrored)}, expected true or false")
     return read | {"mirrored": mirrored}
 
 

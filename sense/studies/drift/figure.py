@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, head, tidy
+from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, add_title, style_axes
 
 COLUMNS = 2
 """Recordings side by side whose errors are shown."""
@@ -43,7 +43,7 @@ def draw(document: Mapping[str, Any]) -> Figure:
                 *axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=5
             )
     told = "errors on presses never trained on: filled for presses at random, hollow for the last"
-    head(figure, f"Drift of a fibre, and {told}")
+    add_title(figure, f"Drift of a fibre, and {told}")
     return figure
 
 
@@ -54,7 +54,7 @@ def _levels(axes: Axes, stretch: Mapping[str, Any]) -> None:
         axes.scatter(times_s / 60, own, s=2.5, color=colour, label=name, linewidths=0)
     axes.set(xlabel="time (min)", ylabel="filtered (V)")
     axes.set_title(f"{stretch['recording']}, fibre {stretch['fibre'] + 1}", loc="left", color=INK, fontsize=10)
-    tidy(axes)
+    style_axes(axes)
 
 
 def _readings(axes: Axes, stretch: Mapping[str, Any]) -> None:
@@ -71,7 +71,7 @@ def _readings(axes: Axes, stretch: Mapping[str, Any]) -> None:
             marks[:, 0] - start, marks[:, 1], "o", color=colour, markerfacecolor=face, markersize=size, label=name
         )
     axes.set(xlabel=f"time since {start / 60:.1f} min (s)", ylabel="V")
-    tidy(axes)
+    style_axes(axes)
 
 
 def _errors(axes: Axes, label: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -89,4 +89,4 @@ def _errors(axes: Axes, label: str, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.set(ylim=(len(schemes) - 0.5, -0.5), xlim=(0, None), xlabel="mean error (mm)")
     axes.set_title(f"{label}, {rows[0]['kind']}", loc="left", color=INK, fontsize=10)
     axes.grid(axis="x", color=FAINT, linewidth=0.6)
-    tidy(axes)
+    style_axes(axes)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.checkpoints import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, head, tidy
+from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, style_axes
 from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fresh_presses
@@ -247,7 +247,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.set_title(label, loc="left", color=INK, fontsize=10)
         axes.set(xlabel="depth pressed (mm)", ylabel="depth found (mm)" if at % columns == 0 else "")
         axes.legend(frameon=False, fontsize=8, markerscale=3, handletextpad=0.1)
-        tidy(axes)
+        style_axes(axes)
     axes = figure.add_subplot(grid[rows, :])
     for curve in curves:
         colour = CURVES[labels.index(curve["pad"]) % len(CURVES)]
@@ -258,6 +258,6 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     axes.set(ylim=(0, None), xlabel="depth pressed (mm)", ylabel="mean error of the place (mm)")
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=columns)
-    tidy(axes)
-    head(figure, f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits")
+    style_axes(axes)
+    add_title(figure, f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits")
     return figure

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.checkpoints import State
-from padforge.design.common.plotting import INK, draw_confusions, head
+from padforge.design.common.plotting import INK, add_title, draw_confusions
 from padforge.design.contact import signals
 from padforge.design.indentation import Indenter, indented_signals
 from padforge.design.morphology import Morphology
@@ -216,5 +216,5 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         if column == 0:
             axes.set_ylabel("pressed", color=INK)
         axes.set_xlabel("found" if at == len(SETS) - 1 else "", color=INK)
-    head(figure, f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on")
+    add_title(figure, f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on")
     return figure

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.checkpoints import State
-from padforge.design.common.plotting import CURVES, INK, draw_confusions, head, tidy
+from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions, style_axes
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fresh_presses
@@ -222,9 +222,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.set_title(label, loc="left", color=INK, fontsize=10)
         axes.set(xlabel="distance of the two contacts (mm)", ylabel="mean error (mm)" if at == 0 else "")
         axes.legend(frameon=False, fontsize=8, loc="upper left")
-        tidy(axes)
+        style_axes(axes)
         _draw_confusions(figure.add_subplot(grid[2, at]), document["confusions"][at]["counts"], at == 0)
-    head(
+    add_title(
         figure,
         f"Contacts at once on {document['settings']['test']} presses never trained on: places of two, number of up to "
         f"{document['settings']['most']}",
@@ -242,7 +242,7 @@ def _draw_bars(axes: Any, rows: list[dict[str, Any]], labels: list[str], colours
     axes.set_xticks(range(len(labels)), labels)
     axes.set_ylabel("mean error, two contacts (mm)")
     axes.legend(frameon=False, fontsize=8, ncols=len(colours), loc="lower left", bbox_to_anchor=(0, 1))
-    tidy(axes)
+    style_axes(axes)
 
 
 def _draw_confusions(axes: Any, counts: list[list[int]], first: bool) -> None:

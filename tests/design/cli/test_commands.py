@@ -9,16 +9,16 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.patches import Circle, Polygon
 
-from padforge.design import Contact, InputError, Morphology, SearchRun, Spec, Twin, draw_plan, score, search
+from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec, Twin, draw_plan, score, search
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
 from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
 from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
-from padforge.design.run import found_before, search_lines
+from padforge.design.run import load_result, search_lines
 from padforge.design.settings import PadSettings, SearchSettings
-from padforge.design.twin import Frame, TwinChannel, TwinScatter
+from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
 QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")
@@ -47,7 +47,7 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     ]
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
     assert set(document["straight"]) == {name for name in document["terms"] if "_lost_" in name}
-    result = found_before(Path("out/pad"))
+    result = load_result(Path("out/pad"))
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
     assert document["found_by"] == result.found_by == "straight fibres"
@@ -61,7 +61,7 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     for change in wrong:
         Path("out/pad/design.json").write_text(json.dumps(document | change))
         with pytest.raises(InputError, match="not as padforge writes it"):
-            found_before(Path("out/pad"))
+            load_result(Path("out/pad"))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def twin(tmp_path_factory):
     reach = np.array([0.0, 2, 5, 8, 11, 15]), np.array([1, 0.95, 0.6, 0.25, 0.05, 0])
     line = np.array([[-15.0, -5], [15, -5]])
     laid = (line, line, line[:, ::-1], None)
-    known = Frame(), *reach, laid, 0.03, (18.0, 31.5), 500
+    known = PlanTransform(), *reach, laid, 0.03, (18.0, 31.5), 500
     Twin(Morphology.straight(2, 10.0), channels, *known, scatter=TwinScatter(0.05, 0.5, 0.8)).save(path)
     return path
 
@@ -142,7 +142,7 @@ def test_a_search_for_a_twin_is_resumed(here, twin):
     pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
     begun = state_folders(Path("out/pad/search"))["twin"]
     with pytest.raises(SystemError):
-        search(pad, contact, settings, run=SearchRun(stop, begun))
+        search(pad, contact, settings, run=SearchOptions(stop, begun))
     assert list(begun.glob("start_*.npz"))
     _, resumed = designed("--twin", twin, "--resume", spec=long)
     assert resumed["terms"] == whole["terms"]

@@ -10,7 +10,7 @@ from padforge.design import Contact, InputError, Morphology, PadSettings, RulesS
 from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
 from padforge.design.editor.edits import Answers
-from padforge.design.editor.session import Session
+from padforge.design.editor.session import EditSession
 from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
 
 
@@ -21,7 +21,7 @@ def session(tmp_path, pad=None, **size):
         pad.save(source)
         size = dict(pad.layout.settings)
     judged = Answers(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(lost=1))
-    begun = Session(judged, source, tmp_path / "out.json", shown.append)
+    begun = EditSession(judged, source, tmp_path / "out.json", shown.append)
     begun.begin()
     return begun, shown
 

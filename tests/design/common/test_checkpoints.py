@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.validation import InputError
-from padforge.design.optimize.search import SearchResult, SearchRun, search
+from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from tests.design.pad.damage import damages, read_damaged
 from tools.kills import killed
@@ -81,12 +81,12 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes
     for method in ("descent", "genetic"):
         folder = tmp_path_factory.mktemp(method)
         with pytest.raises(KeyboardInterrupt):
-            searched(method, SearchRun(stop, folder))
+            searched(method, SearchOptions(stop, folder))
         found[method] = {path.name: path.read_bytes() for path in folder.iterdir()}
     return found
 
 
-def searched(method: str, run: SearchRun) -> SearchResult:
+def searched(method: str, run: SearchOptions) -> SearchResult:
     settings = SearchSettings(method=method, knots=1, starts=1, steps=3, lost=0, population=4, generations=2)  # pyright: ignore
     return search(PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False), run=run)
 
@@ -98,7 +98,7 @@ def test_damaged_states_are_gone_on_with_or_refused(begun, tmp_path_factory, met
     for name, content in begun[method].items():
         (folder / name).write_bytes(content)
     name = "start_0000.npz"
-    run = SearchRun(keep_in=folder, resume=True)
+    run = SearchOptions(keep_in=folder, resume=True)
     found = read_damaged(folder / name, begun[method][name], damage, lambda path: searched(method, run))
     assert found is None or np.isfinite(list(found.terms.values())).all()
 
@@ -114,4 +114,4 @@ def test_states_of_other_arrays_are_refused_in_one_line(begun, tmp_path: Path, m
             arrays: Any = {name: value for name, value in (state | {key: other}).items() if value is not None}
             np.savez(path, **arrays)
             with pytest.raises(InputError, match=r"start_0000\.npz"):
-                searched(method, SearchRun(keep_in=tmp_path, resume=True))
+                searched(method, SearchOptions(keep_in=tmp_path, resume=True))

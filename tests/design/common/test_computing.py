@@ -11,7 +11,7 @@ from functools import partial
 import pytest
 import torch
 
-from padforge.design.common.parallel import cluster, forget_outdated, one_torch_thread, run_tasks
+from padforge.design.common.parallel import clear_stale_kernels, cluster, one_torch_thread, run_tasks
 from padforge.design.common.validation import Fault
 
 
@@ -26,24 +26,24 @@ def package(tmp_path):
 
 def test_kernels_are_kept_until_a_source_of_their_package_changes(package):
     kept = [folder / "__pycache__" / "outer.py311.1.nbc" for folder in (package, package / "room")]
-    forget_outdated(package)
+    clear_stale_kernels(package)
     for path in kept:
         path.parent.mkdir(exist_ok=True)
         path.touch()
-    forget_outdated(package)
+    clear_stale_kernels(package)
     assert all(path.exists() for path in kept)
     (package / "inner.py").write_text("x = 2")
-    forget_outdated(package)
+    clear_stale_kernels(package)
     assert not any(path.exists() for path in kept)
     kept[0].touch()
     (package / "__pycache__" / "kernels.sha256").write_bytes(b"\xff\xfe")  # a damaged stamp is none
-    forget_outdated(package)
+    clear_stale_kernels(package)
     assert not kept[0].exists()
 
 
 def test_a_folder_that_cannot_be_written_is_left_alone(package):
     (package / "__pycache__").touch()
-    forget_outdated(package)
+    clear_stale_kernels(package)
     assert (package / "__pycache__").is_file()
 
 

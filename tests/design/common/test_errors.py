@@ -7,33 +7,37 @@ import numpy as np
 import pytest
 
 from padforge.design.common import validation as errors
-from padforge.design.common.validation import InputError, what_to_install
+from padforge.design.common.validation import InputError, missing_extra
 
-LONGEST = "a" * errors.LONGEST_PATH
+LONGEST = "a" * errors.MAX_PATH
 
 
 def test_numbers_and_paths_within_their_bounds_are_taken_and_a_refusal_is_one_line():
     assert str(InputError("pad\n.toml:\u2028none")) == "pad .toml: none"
-    assert [errors.whole("n", np.int8(n), 2, 5) for n in (2, 5)] == [2, 5]
+    assert [errors.check_int("n", np.int8(n), 2, 5) for n in (2, 5)] == [2, 5]
     for value in (0.0, 2.5, 1, np.float32(0.5)):
-        number = errors.real("x", value, 0.0, 2.5)
+        number = errors.check_float("x", value, 0.0, 2.5)
         assert (type(number), number) == (float, value)
-    assert errors.reals("xs", [0, 3, -3], 3).tolist() == [0, 3, -3]
-    assert errors.path("file", LONGEST) == Path(LONGEST)
+    assert errors.check_array("xs", [0, 3, -3], 3).tolist() == [0, 3, -3]
+    assert errors.check_path("file", LONGEST) == Path(LONGEST)
 
 
 @pytest.mark.parametrize(
     ("check", "values", "message"),
     [
-        (lambda x: errors.whole("n", x, 2, 5), (1, 6, True, 3.0), "n is .*, allowed is a whole number from 2 to 5"),
+        (lambda x: errors.check_int("n", x, 2, 5), (1, 6, True, 3.0), "n is .*, allowed is a whole number from 2 to 5"),
         (
-            lambda x: errors.real("x", x, 0.0, 2.5),
+            lambda x: errors.check_float("x", x, 0.0, 2.5),
             (-1e-9, 2.5 + 1e-9, math.nan, math.inf, True, "1", 10**400, None),
             r"x is .*, allowed is 0 to 2\.5",
         ),
-        (lambda x: errors.reals("xs", [0, x], 3), (3.5, -3.5), r"xs hold 3\.5, allowed is -3 to 3"),
-        (lambda x: errors.reals("xs", x), ([1, [2]], "a", [1j], [None], [math.nan]), "xs (are|hold) .*, expected"),
-        (lambda x: errors.path("file", x), ("", "a\0b", LONGEST + "a", 3, None), "file is .*, expected a path"),
+        (lambda x: errors.check_array("xs", [0, x], 3), (3.5, -3.5), r"xs hold 3\.5, allowed is -3 to 3"),
+        (
+            lambda x: errors.check_array("xs", x),
+            ([1, [2]], "a", [1j], [None], [math.nan]),
+            "xs (are|hold) .*, expected",
+        ),
+        (lambda x: errors.check_path("file", x), ("", "a\0b", LONGEST + "a", 3, None), "file is .*, expected a path"),
     ],
 )
 def test_what_is_just_beyond_them_or_of_another_kind_is_refused(check, values, message):
@@ -54,4 +58,4 @@ def test_what_is_just_beyond_them_or_of_another_kind_is_refused(check, values, m
     ],
 )
 def test_what_is_missing_is_told_with_what_brings_it(module, wanted, said):
-    assert what_to_install(ModuleNotFoundError(name=module), wanted) == (said and f"this needs {said}")
+    assert missing_extra(ModuleNotFoundError(name=module), wanted) == (said and f"this needs {said}")

@@ -24,7 +24,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
     files.write_json(path, {"format": "x/1"})
 
     def fail_halfway():
-        with files.atomic(path) as temporary:
+        with files.atomic_file(path) as temporary:
             temporary.write_text("half a fi")
             raise RuntimeError("halfway")
 
@@ -58,13 +58,13 @@ def test_what_cannot_be_read_or_written_is_named(tmp_path):
         files.read_bytes(path, 5)
     with pytest.raises(InputError, match=r"file/new\.json: cannot be written"):
         files.write_json(path / "new.json", {})
-    for taken in (files.refuse_unwritable, lambda path: files.claimed(path).__enter__()):
+    for taken in (files.check_writable, lambda path: files.locked_folder(path).__enter__()):
         with pytest.raises(InputError, match="is a file, expected a folder"):
             taken(path / "deeper")
 
 
 def test_a_file_within_another_one_is_put_in_place_once_with_ordinary_permissions(tmp_path):
-    with files.atomic(tmp_path / "a.txt") as outer, files.atomic(outer) as inner:
+    with files.atomic_file(tmp_path / "a.txt") as outer, files.atomic_file(outer) as inner:
         inner.write_text("whole")
         assert list(tmp_path.iterdir()) == [outer]
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
@@ -81,29 +81,29 @@ def another(folder):
 
 
 def test_one_run_at_a_time_writes_to_a_folder_which_goes_again_if_made_for_nothing(tmp_path):
-    with pytest.raises(KeyError), files.claimed(tmp_path / "a" / "b"):
+    with pytest.raises(KeyError), files.locked_folder(tmp_path / "a" / "b"):
         raise KeyError
     assert list(tmp_path.iterdir()) == []
-    with files.claimed(tmp_path / "a" / "b"):
+    with files.locked_folder(tmp_path / "a" / "b"):
         (tmp_path / "a" / "b" / "result").touch()
     assert (tmp_path / "a" / "b" / "result").exists()
     (tmp_path / "kept").mkdir()
-    with files.claimed(tmp_path / "kept"):
+    with files.locked_folder(tmp_path / "kept"):
         pass
     assert (tmp_path / "kept").exists()
     folder = tmp_path / "out" / "pad"
-    with files.claimed(folder):
+    with files.locked_folder(folder):
         assert "another run is writing there" in another(folder)
-        with pytest.raises(InputError, match="another run is writing there"), files.claimed(folder):
+        with pytest.raises(InputError, match="another run is writing there"), files.locked_folder(folder):
             pass
     code = CLAIM + "import os\nwith claimed(Path(sys.argv[1])): os._exit(9)"
     assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
-    with files.claimed(folder), files.claimed(tmp_path / "out" / "other"):
+    with files.locked_folder(folder), files.locked_folder(tmp_path / "out" / "other"):
         pass
 
 
 def replaced(folder, *names, without=(), text="new"):
-    with files.staged(folder, without) as stage:
+    with files.atomic_files(folder, without) as stage:
         for name in names:
             (stage / name).write_text(text)
             if name == "fails":
@@ -224,9 +224,9 @@ def windows(monkeypatch):
 def test_without_flock_two_runs_do_not_write_into_one_folder_and_a_locked_file_is_read_on(windows, tmp_path):
     for _ in range(2):
         with (
-            files.claimed(tmp_path),
+            files.locked_folder(tmp_path),
             pytest.raises(InputError, match="another run is writing there"),
-            files.claimed(tmp_path),
+            files.locked_folder(tmp_path),
         ):
             pass
     (tmp_path / "journal").write_bytes(b"line\n")

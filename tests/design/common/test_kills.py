@@ -30,7 +30,7 @@ def made(folder: Path) -> Path:
 
 
 def renewed(folder: Path) -> None:
-    with files.claimed(folder), files.staged(folder, without=["gone", "a"]) as stage:
+    with files.locked_folder(folder), files.atomic_files(folder, without=["gone", "a"]) as stage:
         for name in ("a", "b", "c"):
             (stage / name).write_bytes(b"new")
 
@@ -57,7 +57,7 @@ def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> N
 
 def test_the_next_run_clears_up_a_file_that_was_being_written(tmp_path: Path) -> None:
     def write() -> None:
-        with files.atomic(tmp_path / "a.json") as temporary:
+        with files.atomic_file(tmp_path / "a.json") as temporary:
             temporary.write_bytes(b"new")
 
     left = set()
@@ -143,7 +143,7 @@ def test_an_exchange_is_worth_nothing_elsewhere(tmp_path: Path, broken_off: Path
         lambda: files.read_bytes(folder / "a"),
         lambda: renewed(folder),
         lambda: files.write_text(folder / "b", "another"),
-        lambda: files.settle(folder),
+        lambda: files.recover(folder),
     ):
         with pytest.raises(InputError, match=f"{EXCHANGE}: begun in another folder"):
             use()
@@ -180,9 +180,9 @@ def test_who_may_not_put_files_in_place_reads_them_and_is_told_so(broken_off: Pa
     broken_off.chmod(0o555)
     assert {name: files.read_bytes(broken_off / name) for name in ("a", "b")} == NEW
     with pytest.raises(InputError, match="cannot be written"):
-        files.settle(broken_off)
+        files.recover(broken_off)
     broken_off.chmod(0o755)
-    files.settle(broken_off)
+    files.recover(broken_off)
     assert (broken_off / "b").read_bytes() == b"new"
 
 
@@ -224,12 +224,12 @@ def write_one(folder: Path) -> None:
 
 
 def write_some(folder: Path) -> None:
-    with files.staged(folder) as stage:
+    with files.atomic_files(folder) as stage:
         (stage / "new.json").touch()
 
 
 def claim(folder: Path) -> None:
-    with files.claimed(folder):
+    with files.locked_folder(folder):
         (folder / "new.json").touch()
 
 
@@ -269,7 +269,11 @@ def test_files_and_folders_are_not_taken_for_each_other_and_links_not_followed(t
 
 
 def test_what_somebody_is_at_work_with_stays(tmp_path: Path) -> None:
-    with files.scratch(tmp_path), files.unfinished_file(tmp_path, ".json"), files.atomic(tmp_path / "a.txt"):
+    with (
+        files.temporary_folder(tmp_path),
+        files.temporary_file(tmp_path, ".json"),
+        files.atomic_file(tmp_path / "a.txt"),
+    ):
         at_work = names(tmp_path)
         assert len(at_work) == 3
         files.clear_litter(tmp_path)

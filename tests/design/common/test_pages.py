@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from padforge.design.common import server as listening
-from padforge.design.common.page import PageSection, html_pieces, table
+from padforge.design.common.page import PageSection, render_markdown, table
 from padforge.design.common.page import page as whole_page
 from padforge.design.common.server import HOST, LocalPage
 from padforge.design.common.validation import InputError
@@ -149,13 +149,13 @@ def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monk
 def test_markdown_becomes_elements_and_html_in_it_and_in_sections_is_text():
     rows = "| a | b |\n| --- | --- |\n| 1.5 mm | fail |"
     steps = "1. Stir **well**.\n2. Read `x.json`."
-    head, rows, steps, end = html_pieces(f"# Title\n\n## Mix\n\n{rows}\n\n{steps}\n\nDone.")
+    head, rows, steps, end = render_markdown(f"# Title\n\n## Mix\n\n{rows}\n\n{steps}\n\nDone.")
     assert head == "<h3>Mix</h3>"
     assert rows == table(["a", "b"], [["1.5 mm", "fail"]])
     assert '<td class="number">1.5 mm</td><td class="fail">fail</td>' in rows
     assert re.sub(r"\s", "", steps) == ("<ol><li>Stir<strong>well</strong>.</li><li>Read<code>x.json</code>.</li></ol>")
     assert end.strip() == "<p>Done.</p>"
-    (piece,) = html_pieces('<img src="x"> [a](javascript:b) ![c](http://d) &lt;')
+    (piece,) = render_markdown('<img src="x"> [a](javascript:b) ![c](http://d) &lt;')
     assert piece.strip() == "<p>&lt;img src=&quot;x&quot;&gt; [a](javascript:b) ![c](http://d) &amp;lt;</p>"
     text = whole_page("<b>", "&", [PageSection("A <i> b", [table(["<u>"], [["<s>"]])], [("<1>", "<2>")])])
     assert not re.search("<[ius12]>", text)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from padforge.benchmarks import objective
 from padforge.design import Contact, Morphology, published_objective, signals
-from padforge.design.contact import boustrophedon
+from padforge.design.contact import serpentine_presses
 from padforge.design.objectives.published import (
     disorder,
     disorder_area,
@@ -115,7 +115,7 @@ def test_published_presses_cover_the_grid():
 @pytest.mark.parametrize(("name", "share"), [("square_grid_cir", 0.70), ("5para_dis", 0.58)])
 def test_idle_share_of_the_published_pads(published, name, share):
     """Table III of the paper: 70 % and 57 % in simulation."""
-    places = boustrophedon(between_fibres(Layout.of(4)), 32, 5 / 49)
+    places = serpentine_presses(between_fibres(Layout.of(4)), 32, 5 / 49)
     changes = signals(Morphology.load(published / f"{name}.mat"), places, PUBLISHED_CONTACT)
     assert idle_share(changes) == pytest.approx(share, abs=0.01)
 

@@ -12,13 +12,13 @@ from padforge.design.objectives.expected_error import (
     BY_NOISE,
     RIDGE,
     WIDTH,
+    aggregate_failures,
     confusable,
     drawn_window,
     expected_error,
     expected_errors,
     judged_windows,
     kernel_weights,
-    over_losses,
     straight_full_scale,
     window_presses,
 )
@@ -137,14 +137,16 @@ def test_a_gain_of_a_tenth_counts_alike_however_many_fibres_are_lost():
     kept = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     given = torch.tensor([0.1, 0.2, 0.4, 2.7])
     even = (1 / 3, 1 / 3, 1 / 3)
-    usual = over_losses(given, kept, even).item()
+    usual = aggregate_failures(given, kept, even).item()
     assert usual == pytest.approx((0.1 * 0.3 * 2.7) ** (1 / 3))
     for level in ([0], [1, 2], [3]):
         better = given.clone()
         better[level] *= 0.9
-        assert over_losses(better, kept, even).item() == pytest.approx(0.9 ** (1 / 3) * usual)
-    assert over_losses(given[:3], kept[:3], (0.2, 0.8, 0.0)).item() == pytest.approx(0.1**0.2 * 0.3**0.8)
-    assert over_losses(given[:1], kept[:1], even).item() == pytest.approx(0.1), "what cannot be lost counts for nothing"
+        assert aggregate_failures(better, kept, even).item() == pytest.approx(0.9 ** (1 / 3) * usual)
+    assert aggregate_failures(given[:3], kept[:3], (0.2, 0.8, 0.0)).item() == pytest.approx(0.1**0.2 * 0.3**0.8)
+    assert aggregate_failures(given[:1], kept[:1], even).item() == pytest.approx(0.1), (
+        "what cannot be lost counts for nothing"
+    )
 
 
 def test_the_bound_is_that_of_the_whole_covariance_inverted():
@@ -179,7 +181,9 @@ def test_its_gradient_is_that_of_differences(scatter):
     kept, shares = torch.tensor([[1.0, 1, 1], [1, 0, 1]]).double(), (0.6, 0.4)
 
     def joint(signals):
-        return over_losses(expected_error(signals, places, STEP, torch.tensor(FREE), kept, scatter), kept, shares)
+        return aggregate_failures(
+            expected_error(signals, places, STEP, torch.tensor(FREE), kept, scatter), kept, shares
+        )
 
     joint(signals).backward()
     way = torch.tensor(np.random.default_rng(6).standard_normal(signals.shape))

@@ -9,7 +9,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.networks import (
     RIDGE,
     ColumnScale,
-    Fit,
+    LmBatchState,
     Network,
     curvature,
     dual_curvature,
@@ -59,7 +59,7 @@ def jacobians(x, fit):
 @pytest.mark.parametrize(("inputs", "hidden", "outputs"), [(3, 7, 2), (1, 1, 1), (9, 20, 3)])
 def test_both_forms_of_the_equations_are_those_of_the_whole_jacobian(inputs, hidden, outputs):
     weights, x, y = network_parts(2, inputs, hidden, outputs)
-    fit = Fit.of(weights, x, y[:, 0])
+    fit = LmBatchState.of(weights, x, y[:, 0])
     slope, primal, dual = pull_back(x, fit, fit.error), curvature(x, fit), dual_curvature(x, fit)
     for network in range(2):
         alone = fit.rows(torch.tensor([network]))
@@ -75,7 +75,7 @@ def test_both_forms_of_the_equations_are_those_of_the_whole_jacobian(inputs, hid
 def test_the_slope_is_the_derivative_of_the_least_squares_over_the_output_weights(samples, hidden):
     weights, x, y = network_parts(1, 3, hidden, 2, samples)
     weights.requires_grad_()
-    fit = Fit.of(weights, x, y[:, 0])
+    fit = LmBatchState.of(weights, x, y[:, 0])
     (slope,) = torch.autograd.grad(fit.squares.sum(), weights)
     torch.testing.assert_close(slope.flatten(1), 2 * pull_back(x, fit, fit.error), atol=1e-6, rtol=1e-6)
 

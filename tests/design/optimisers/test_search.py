@@ -12,7 +12,7 @@ from padforge.design.networks import localisation_error
 from padforge.design.objectives.expected_error import error_terms, expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities, ambiguity_terms, score
-from padforge.design.optimize.search import SearchRun, search
+from padforge.design.optimize.search import SearchOptions, search
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
@@ -28,7 +28,7 @@ def test_a_search_depends_on_the_seed_and_not_on_how_it_runs(method, monkeypatch
     first, reported = search(pad, None, settings, FREE), []
     monkeypatch.setattr("padforge.design.optimize.search.SLICE_S", -1.0)  # a slice ends after its first step
     with ThreadPoolExecutor(1) as executor:
-        run = SearchRun(lambda *progress: reported.append(progress), executor=executor)
+        run = SearchOptions(lambda *progress: reported.append(progress), executor=executor)
         sliced = search(pad, None, settings, FREE, run=run)
     assert len(reported) == (2 * 25 if method == "descent" else 3)
     assert method == "genetic" or first.found_by.startswith("start")  # better than straight fibres
@@ -223,7 +223,9 @@ def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
 def test_what_cannot_be_searched_is_refused(asked, message):
     def begin():
         run = asked.get("run")
-        search(**{"pad": PAD, "settings": SMALL} | asked | {"run": SearchRun(**run) if isinstance(run, dict) else run})
+        search(
+            **{"pad": PAD, "settings": SMALL} | asked | {"run": SearchOptions(**run) if isinstance(run, dict) else run}
+        )
 
     with pytest.raises(InputError, match=message):
         begin()

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from padforge.cli import cli
-from padforge.design import InputError, PadSettings, RulesSettings, SearchRun, SearchSettings, search
+from padforge.design import InputError, PadSettings, RulesSettings, SearchOptions, SearchSettings, search
 from padforge.design.common import parallel as computing
 from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.command_line import run_to_end
@@ -45,7 +45,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
             if len(reported) == 2:
                 raise KilledError
 
-        return search(PAD, None, settings, FREE, run=SearchRun(report, tmp_path / "search", resume=True))
+        return search(PAD, None, settings, FREE, run=SearchOptions(report, tmp_path / "search", resume=True))
 
     while kills < 20:
         try:
@@ -61,7 +61,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
 
 def test_states_stay_until_they_are_cleared_and_only_those_of_this_search_are_taken(tmp_path):
     folder, quick = tmp_path / "search", SMALL.model_copy(update={"starts": 1, "steps": 2})
-    run, path = SearchRun(keep_in=folder, resume=True), folder / "start_0000.npz"
+    run, path = SearchOptions(keep_in=folder, resume=True), folder / "start_0000.npz"
     first = search(PAD, None, quick, FREE, run=run)
     assert search(PAD, None, quick, FREE, run=run).morphology == first.morphology
     with pytest.raises(InputError, match="begun with search seed 0, now 5"):
@@ -97,21 +97,21 @@ def test_no_files_of_others_are_removed(tmp_path):
 def test_ctrl_c_keeps_the_best_so_far(method):
     """The signal comes from the first report; what was found by then is returned, and says so."""
     settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
-    result = search(PAD, None, settings, run=SearchRun(lambda *progress: signal.raise_signal(signal.SIGINT)))
+    result = search(PAD, None, settings, run=SearchOptions(lambda *progress: signal.raise_signal(signal.SIGINT)))
     assert result.stopped == "interrupted"
     assert len(result.morphology.knots) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_time_budget_ends_it_with_the_best_so_far():
-    result = search(PAD, None, SMALL.model_copy(update={"steps": 1_000_000}), run=SearchRun(time_budget=0.3))
+    result = search(PAD, None, SMALL.model_copy(update={"steps": 1_000_000}), run=SearchOptions(time_budget=0.3))
     assert result.stopped == "out of time"
     assert result.violations == []
     assert result.seconds < 30
 
 
 def test_a_search_out_of_time_before_its_first_step_gives_its_fibres():
-    result = search(PAD, None, SMALL, run=SearchRun(time_budget=1e-6))
+    result = search(PAD, None, SMALL, run=SearchOptions(time_budget=1e-6))
     assert result.stopped == "out of time"
     assert result.morphology.knots.shape == (2, 5, 2)
 
@@ -127,7 +127,7 @@ class Hung(Executor):
 
 def test_the_deadline_holds_on_an_executor_that_hangs(monkeypatch):
     monkeypatch.setattr(stopping, "LATEST_S", 0.1)
-    result = search(PAD, None, SMALL, run=SearchRun(time_budget=0.1, executor=Hung()))
+    result = search(PAD, None, SMALL, run=SearchOptions(time_budget=0.1, executor=Hung()))
     assert result.stopped == "out of time"
     assert len(result.morphology.knots) == 2
 
@@ -137,7 +137,7 @@ def test_the_second_ctrl_c_leaves_an_executor_that_hangs_behind():
     timers = [threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)) for after in (0.2, 0.4)]
     for timer in timers:
         timer.start()
-    assert search(PAD, None, SMALL, run=SearchRun(executor=Hung())).stopped == "interrupted"
+    assert search(PAD, None, SMALL, run=SearchOptions(executor=Hung())).stopped == "interrupted"
 
 
 @POSIX
@@ -252,7 +252,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
                 threading.Thread(target=os.kill, args=(victim, signal.SIGKILL)).start()
 
         executor = cast(Executor, client.get_executor(pure=False, retries=10))
-        there = search(PAD, None, SMALL, FREE, run=SearchRun(report, executor=executor))
+        there = search(PAD, None, SMALL, FREE, run=SearchOptions(report, executor=executor))
         assert len(slices) > 2
         with pytest.raises(ProcessLookupError):
             os.kill(victim, 0)

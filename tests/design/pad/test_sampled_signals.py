@@ -9,7 +9,7 @@ from matplotlib.path import Path as Outline
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.contact import boustrophedon
+from padforge.design.contact import serpentine_presses
 from padforge.design.objectives.published import published_terms
 from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.pad.wild_pads import SEEDS, contacts
@@ -95,9 +95,9 @@ def test_a_population_is_its_members_one_by_one_and_the_serpentine_fills_its_rec
     assert not np.allclose(signals(Morphology(pads[0].knots, 5.0), presses), signals(pads[0], presses), atol=0.1)
     pad = Morphology.random((3, 2), 4, seed=0, pitch_mm=(5.0, 8.0))
     assert published_terms(pad.knots[None], Contact(), layout=pad.layout) == published_terms(pad, Contact())
-    positions = boustrophedon(((0.5, 2), (4.5, 3)), 3)
+    positions = serpentine_presses(((0.5, 2), (4.5, 3)), 3)
     expected = [(0.5, 2), (2.5, 2), (4.5, 2), (4.5, 2.5), (2.5, 2.5), (0.5, 2.5), (0.5, 3), (2.5, 3), (4.5, 3)]
     assert positions.tolist() == [list(position) for position in expected]
-    moved = boustrophedon(((0.5, 2), (4.5, 3)), 3, jitter=0.1) - positions
+    moved = serpentine_presses(((0.5, 2), (4.5, 3)), 3, jitter=0.1) - positions
     assert ((moved >= 0) & (moved <= 0.1)).all()
     assert np.ptp(moved) > 0.05

@@ -10,7 +10,7 @@ import pytest
 from padforge.design import InputError, Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.paths.curves import flatten
-from padforge.design.twin import Frame, TwinChannel, TwinReadings, TwinScatter
+from padforge.design.twin import PlanTransform, TwinChannel, TwinReadings, TwinScatter
 
 PAD = Morphology.random(2, knots=3, seed=5)
 DISTANCE = np.linspace(0, 1.6, 9)
@@ -24,7 +24,7 @@ def twin() -> Twin:
     read = (2, None, 0, 1)
     channels = tuple(TwinChannel(c, fibre, -0.05 * (fibre is not None), 0.002, 0.9) for c, fibre in enumerate(read))
     laid = (*(PAD.to_mm(line) for line in flatten(PAD, 1e-4)[:3]), None)
-    frame = Frame(True, 5.0, (2.0, -1.0), 0.95)
+    frame = PlanTransform(True, 5.0, (2.0, -1.0), 0.95)
     return Twin(PAD, channels, frame, DISTANCE * PAD.pitch_mm, WEIGHT, laid, 0.015, (20.0, 22.0), 900)
 
 
@@ -55,7 +55,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     double = replace(twin, sensitivity=tuple(None if x is None else np.full(len(x) - 1, 2.0) for x in twin.laid_mm))
     assert double.laid_stretch(PLACES) == pytest.approx(2 * twin.laid_stretch(PLACES))
     straight = np.column_stack([np.linspace(-20, 20, 400), np.zeros(400)])
-    plain = replace(twin, laid_mm=(straight, None, None, None), frame=Frame())
+    plain = replace(twin, laid_mm=(straight, None, None, None), frame=PlanTransform())
     angled = replace(plain, angle_weight=0.5 * WEIGHT)
     over, beside = np.array([[0.0, 0.0], [0.0, 12.0]])
     assert angled.laid_stretch([over])[0, 0] > plain.laid_stretch([over])[0, 0]
@@ -63,7 +63,9 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     for none in ([[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]):
         with pytest.raises(InputError, match="places_mm"):
             twin.laid_stretch(none)
-    assert Frame(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(np.array([[0.0, -4.0]]))
+    assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
+        np.array([[0.0, -4.0]])
+    )
 
 
 @pytest.mark.parametrize(

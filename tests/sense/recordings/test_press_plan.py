@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from padforge.design import InputError, Morphology
-from padforge.design.common.settings import validated
+from padforge.design.common.settings import validate
 from padforge.design.settings import PadSettings
 from padforge.sense.recordings.press_plan import PressPlan, planned, read_plan
 from padforge.sense.settings import RigSettings
@@ -17,7 +17,7 @@ KINDS = ("uniform", "grid", "boustrophedon", "adaptive")
 
 def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
     pad = Morphology.straight(4 if size is None else size.layout)
-    return planned(pad, validated(RigSettings, settings, "rig"), np.random.default_rng(0), size)
+    return planned(pad, validate(RigSettings, settings, "rig"), np.random.default_rng(0), size)
 
 
 def test_a_plan_survives_json_and_comes_from_a_file(tmp_path):
@@ -51,7 +51,7 @@ def test_plans_keep_to_what_is_pressed_of_the_pad(kind: str) -> None:
     pad = Morphology.straight(4)
 
     def places(**size) -> np.ndarray:
-        rig = validated(RigSettings, presses, "rig")
+        rig = validate(RigSettings, presses, "rig")
         return planned(pad, rig, np.random.default_rng(0), PadSettings(**size)).places_mm
 
     strip = places(sensed_mm=(50.0, 8.0))

@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-from padforge.design.common.parallel import forget_outdated
+from padforge.design.common.parallel import clear_stale_kernels
 
-forget_outdated(Path(__file__).parent)
+clear_stale_kernels(Path(__file__).parent)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, real
+from padforge.design.common.validation import InputError, check_float
 from padforge.sense.recordings.processing.limits import MAX_S, Array
 from padforge.sense.recordings.recording import Recording
 
@@ -66,7 +66,7 @@ def read(text: bytes, readings: Array) -> tuple[Recording, float, str] | None:
             return None
         arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_WHOLE)}
         recording = Recording(readings=readings, **arrays, source=document["source"])
-        epoch_s = real("epoch_s", document["epoch_s"], -MAX_S, MAX_S)
+        epoch_s = check_float("epoch_s", document["epoch_s"], -MAX_S, MAX_S)
         return recording, epoch_s, str(document["digest"])
     except (InputError, KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None

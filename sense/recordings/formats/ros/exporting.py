@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import UNFINISHED, staged, writing
+from padforge.design.common.files import UNFINISHED, atomic_files, reraise_write_error
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.formats.model_findings import ModelFindings, export_path
 from padforge.sense.recordings.processing.limits import Array, as_numbers
@@ -62,7 +62,7 @@ def export_bag(
     messages[topics.RECORDING] = [np.frombuffer(bytes(store.serialize_cdr(text, text.__msgtype__)), np.uint8)]
     stamps[topics.RECORDING] = stamps[topics.READINGS][:1]
     _refuse_too_many(messages)
-    with writing(path), staged(path.parent) as folder:
+    with reraise_write_error(path), atomic_files(path.parent) as folder:
         _write(store, folder / f"{UNFINISHED}{path.stem}", stamps, messages).replace(folder / path.name)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.recordings.formats.assembly import assembled
 from padforge.sense.recordings.formats.mapping import (
     MILLIMETRES,
@@ -103,7 +103,7 @@ def _exported(store: "Typestore", path: Path) -> Recording:
     try:
         for name, topic in found.items():
             if topic.kind != topics.KINDS[name]:
-                raise InputError(f"{name} is of {shown(topic.kind)}, expected {topics.KINDS[name]}")
+                raise InputError(f"{name} is of {short_repr(topic.kind)}, expected {topics.KINDS[name]}")
         streams = {name: _stream(store, found[name], paths) for name, paths in _OWN.items() if name in found}
         if topics.RECORDING in found:
             text = found[topics.RECORDING].rows[-1][-1].tobytes()[8:].rstrip(b"\0")
@@ -228,14 +228,14 @@ def _values(quantity: str, stream: topics.Stream) -> NDArray[Any]:
 def _typed(store: "Typestore", part: Part, name: str, found: Mapping[str, Topic]) -> topics.Stream:
     """The numbers of a topic, of a type that can hold the quantity."""
     if name not in found:
-        raise InputError(f"{part.quantity} is {shown(name)}, which has no messages")
+        raise InputError(f"{part.quantity} is {short_repr(name)}, which has no messages")
     kind, allowed = found[name].kind, _TYPES[part.quantity]
     if kind not in allowed:
-        raise InputError(f"{part.quantity} is {shown(name)} of {shown(kind)}, expected {', '.join(allowed)}")
+        raise InputError(f"{part.quantity} is {short_repr(name)} of {short_repr(kind)}, expected {', '.join(allowed)}")
     try:
         return _stream(store, found[name], allowed[kind])
     except InputError as error:
-        raise InputError(f"{part.quantity} is {shown(name)}: {error}") from error
+        raise InputError(f"{part.quantity} is {short_repr(name)}: {error}") from error
 
 
 def _held(stamps: Indices, values: NDArray[Any], clock: Indices) -> Array:

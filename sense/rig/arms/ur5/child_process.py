@@ -1,6 +1,7 @@
 """The child process that holds ur-rtde, which can hang or crash: orders on stdin, states and answers on stdout.
 
-Run as `python -m padforge.sense.rig.arms.ur5.child_process HOST`. Orders are JSON lines, an empty one a heartbeat. The arm's
+Run as `python -m padforge.sense.rig.arms.ur5.child_process HOST`. Orders are JSON lines, an empty one a heartbeat. The
+arm's
 watchdog is kicked from here alone, so the arm stops by itself where this process ends or hangs. It also stops where
 the parent ends, or gives no sign of life during a move. Nothing here unlocks, powers or starts an arm.
 """

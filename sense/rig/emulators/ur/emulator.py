@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
-from padforge.design.common.files import unfinished_file
+from padforge.design.common.files import temporary_file
 from padforge.sense.rig.devices.processes import start
 from padforge.sense.rig.devices.protocols import Array, Pose, RigFault
 
@@ -57,7 +57,7 @@ class UrEmulator:
     def __enter__(self) -> Self:
         self._end = ExitStack()
         with ExitStack() as begun:
-            path = begun.enter_context(unfinished_file(Path(tempfile.gettempdir()), prefix=_TRUTH))
+            path = begun.enter_context(temporary_file(Path(tempfile.gettempdir()), prefix=_TRUTH))
             create(path)
             self._process = start(
                 "padforge.sense.rig.emulators.ur.server", json.dumps(self._settings | {"truth": str(path)})

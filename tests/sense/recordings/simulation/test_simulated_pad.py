@@ -8,7 +8,7 @@ import pytest
 
 from padforge.design import InputError, Morphology, Twin
 from padforge.design.contact import relative_stretch
-from padforge.design.twin import Frame, TwinChannel, TwinReadings
+from padforge.design.twin import PlanTransform, TwinChannel, TwinReadings
 from padforge.sense import Recording, RigSettings, simulate
 from padforge.sense.recordings.simulation.simulated_pad import measured
 from padforge.sense.recordings.simulation.strengths import strengths
@@ -19,12 +19,12 @@ STILL: dict[str, Any] = {"noise_mv": 0.0, "drift_mv": 0.0}
 DISTANCE_MM, WEIGHT = 11.25 * np.linspace(0, 1.2, 9), np.append(np.exp(-0.5 * (np.linspace(0, 1.05, 8) / 0.5) ** 2), 0)
 
 
-def twin_of(frame: Frame | None = None, noise_v: float = 0.0, readings: TwinReadings | None = None) -> Twin:
+def twin_of(frame: PlanTransform | None = None, noise_v: float = 0.0, readings: TwinReadings | None = None) -> Twin:
     """Channel 1 is dead; 0, 2 and 3 read the fibres 3, 0 and 1 of a straight pad."""
     wired = [(3, GAINS[0]), (None, 0.0), (0, GAINS[1]), (1, GAINS[2])]
     channels = [TwinChannel(c, fibre, gain, noise_v, 0.9) for c, (fibre, gain) in enumerate(wired)]
     laid = *(PAD.to_mm(line) for line in PAD.knots[[0, 1]]), None, PAD.to_mm(PAD.knots[3])
-    told = tuple(channels), frame or Frame(), DISTANCE_MM, WEIGHT, laid
+    told = tuple(channels), frame or PlanTransform(), DISTANCE_MM, WEIGHT, laid
     return Twin(PAD, *told, 0.02, (22.5, 22.5), 900, readings=readings)
 
 
@@ -35,7 +35,7 @@ def responses(recording: Recording) -> np.ndarray:
 
 
 def test_channels_respond_as_the_twin_names_them_a_dead_one_by_noise_alone_and_a_seed_tells_it_all() -> None:
-    twin = twin_of(Frame(turn_deg=5, shift_mm=(2, -1), scale=0.9))
+    twin = twin_of(PlanTransform(turn_deg=5, shift_mm=(2, -1), scale=0.9))
     recording = simulate(twin, RigSettings(presses=200, hysteresis=0, **STILL))
     expected = np.zeros((200, 4))
     expected[:, [0, 2, 3]] = GAINS * twin.laid_stretch(recording.presses_mm)[:, [3, 0, 1]]
@@ -53,14 +53,14 @@ def test_channels_respond_as_the_twin_names_them_a_dead_one_by_noise_alone_and_a
 
 def test_a_mirrored_pad_answers_as_at_the_mirrored_place_and_is_pressed_where_it_was_printed() -> None:
     places = np.array([[4.0, 3.0], [-7.0, 1.0], [2.0, -9.0]])
-    plain, mirrored = (measured(twin_of(Frame(mirrored=mirrored))) for mirrored in (False, True))
+    plain, mirrored = (measured(twin_of(PlanTransform(mirrored=mirrored))) for mirrored in (False, True))
     assert mirrored.answers(places * [-1, 1]) == pytest.approx(plain.answers(places))
     assert np.abs(mirrored.answers(places) - plain.answers(places)).max() > 0.01
     twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
     for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
-        recording = simulate(replace(twin, frame=Frame(turn_deg=turn_deg)), RigSettings(presses=400))
+        recording = simulate(replace(twin, frame=PlanTransform(turn_deg=turn_deg)), RigSettings(presses=400))
         assert np.ptp(recording.presses_mm, axis=0) == pytest.approx(sides, rel=0.02)
-    askew = replace(twin, frame=Frame(turn_deg=10, scale=0.8))
+    askew = replace(twin, frame=PlanTransform(turn_deg=10, scale=0.8))
     half = np.array(measured(askew).pressed_mm[1])
     spans = np.ptp(askew.frame.to_plan(half * [[-1, -1], [-1, 1], [1, 1], [1, -1]]), axis=0)
     assert spans == pytest.approx((20, 10))
@@ -78,7 +78,10 @@ def test_responses_scatter_as_the_twin_says(looks: float, rig: dict) -> None:
 
 
 def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin_or_is_refused() -> None:
-    twin, other = twin_of(Frame(mirrored=True, shift_mm=(3, 3))), Morphology.random(3, knots=2, seed=1, pitch_mm=9)
+    twin, other = (
+        twin_of(PlanTransform(mirrored=True, shift_mm=(3, 3))),
+        Morphology.random(3, knots=2, seed=1, pitch_mm=9),
+    )
     recording = simulate(other, RigSettings(presses=100, hysteresis=0, creep=0, **STILL), like=twin)
     expected = -0.05 * relative_stretch(other, other.to_grid(recording.presses_mm), twin.contact())
     assert responses(recording) == pytest.approx(expected, abs=1e-3)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from padforge.design.twin import Frame as TwinFrame
+from padforge.design.twin import PlanTransform as TwinFrame
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.rig.session.pad_frame import Frame
 from tests.sense.rig.devices.fakes import RIG

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.validation import InputError, short_repr
 
 MOST_CHUNK_BYTES = 2**26
 """Most that one chunk may hold, unpacked; recorders make them of 1 to 4 MiB."""
@@ -88,13 +88,15 @@ class Bag:
         if kind.count("/") != 2:  # the short form that ROS 1 had
             kind = kind.replace("/", "/msg/")
         if self.kinds.setdefault(name, kind) != kind:
-            raise InputError(f"topic {shown(name)} is of {shown(self.kinds[name])} and of {shown(kind)}")
+            raise InputError(f"topic {short_repr(name)} is of {short_repr(self.kinds[name])} and of {short_repr(kind)}")
         if len(self.kinds) > MOST_TOPICS:
             raise InputError(f"it has more than {MOST_TOPICS} topics, allowed are so many")
         if not self._wanted(name):
             return None
         if encoding != "cdr":
-            raise InputError(f"topic {shown(name)} is written as {shown(encoding)}, expected 'cdr', as ROS 2 writes it")
+            raise InputError(
+                f"topic {short_repr(name)} is written as {short_repr(encoding)}, expected 'cdr', as ROS 2 writes it"
+            )
         return self.topics.setdefault(name, Topic(kind))
 
     def count(self) -> None:

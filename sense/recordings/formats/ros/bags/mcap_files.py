@@ -4,7 +4,7 @@ import struct
 import zlib
 from typing import BinaryIO
 
-from padforge.design.common.validation import InputError, shown
+from padforge.design.common.validation import InputError, short_repr
 
 from .bag import CUT, MOST_CHUNK_BYTES, Bag, Topic
 
@@ -87,7 +87,7 @@ def _unpacked(chunk: _Reader, length: int, bag: Bag) -> memoryview:
         except ImportError:
             from backports.zstd import ZstdDecompressor as Decompressor
     elif packing:
-        raise InputError(f"a chunk is packed by {shown(packing)}, expected lz4, zstd or nothing")
+        raise InputError(f"a chunk is packed by {short_repr(packing)}, expected lz4, zstd or nothing")
     else:
         Decompressor = None
     try:
@@ -132,5 +132,5 @@ def _read_record(code: int, body: memoryview, bag: Bag, schemas: dict[int, str],
     (schema,) = reader.take("<H")
     name, encoding = reader.text(), reader.text()
     if schema not in schemas:
-        raise InputError(f"topic {shown(name)} is of a type that is not told")
+        raise InputError(f"topic {short_repr(name)} is of a type that is not told")
     channels[number] = bag.open(name, schemas[schema], encoding)

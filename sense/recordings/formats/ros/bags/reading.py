@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from padforge.design.common.files import read_bytes, require_file
+from padforge.design.common.files import check_file, read_bytes
 from padforge.design.common.validation import InputError
 
 from .bag import CUT, Bag, Topic
@@ -37,7 +37,7 @@ def read_bag(path: Path, wanted: Callable[[str], bool]) -> tuple[dict[str, Topic
     """
     bag = Bag(wanted)
     for file in _files(path):
-        file = require_file(file, MOST_FILE_BYTES)
+        file = check_file(file, MOST_FILE_BYTES)
         with _blamed(file):
             if file.suffix.lower() == ".mcap":
                 with file.open("rb") as stream:
