@@ -16,7 +16,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import FailureError, PressSets, fresh_presses, training_presses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import outside
+from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def _sets(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter
         return found * scatter.gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
 
     learned, fresh = (
-        positions[outside(positions, size)]
+        positions[is_outside(positions, size)]
         for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, TEST, seed))
     )
     return PressSets(learned, responses(learned), fresh, responses(fresh), seed)

@@ -18,16 +18,16 @@ from padforge.design.common.files import read_json, write_json
 from padforge.design.common.mat_files import load_mat
 from padforge.design.common.validation import InputError, check_array, check_int, check_mapping, check_type, short_repr
 from padforge.design.common.validation import check_path as as_path
-from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, Law, frames
+from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frames
 from padforge.design.kernels.published import quantized_signals
-from padforge.design.settings import MOST_FIBRES, Contact, Counts, Layout, Pitch
+from padforge.design.settings import MAX_FIBRES, Contact, Counts, Layout, Pitch
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LEAST_SPAN = 1e-12
+MIN_SPAN = 1e-12
 """Least distance of knots along a fibre's travel axis, grid units: slopes stay numbers that can be squared."""
-FARTHEST = 1e6
+MAX_COORDINATE = 1e6
 """Greatest coordinate of a place, by amount, in grid units or mm."""
 MARGIN = 1e-3
 """Least distance of a free knot to the pad's edge, grid units, as in the published optimiser."""
@@ -42,18 +42,18 @@ def layout_of(fibres: int, layout: Layout | None = None) -> Layout:
     if layout is None:
         if fibres % 2 or not fibres:
             raise InputError(f"these are {fibres} fibres, expected 2 M: as many horizontals as verticals")
-        return Layout.of(fibres // 2)
+        return Layout.create(fibres // 2)
     if fibres != layout.fibres:
         raise InputError(f"these are {fibres} fibres, expected {layout}")
     return layout
 
 
-def kernel_ends(layout: Layout) -> Ends:
+def fibre_ends(layout: Layout) -> Ends:
     """Where its fibres end, as kernels take it."""
     return Ends(*layout.counts, *layout.spacing[::-1])
 
 
-def assemble(inner: Array, layout: Layout | None = None) -> Array:
+def assemble_knots(inner: Array, layout: Layout | None = None) -> Array:
     """Whole fibres from free knots: sort along the travel axis, keep knots apart, add the fixed ends.
 
     Args:
@@ -87,7 +87,7 @@ def _separate(travel: Array, step: float = 1e-9) -> None:
         travel[..., k] = np.minimum(travel[..., k], travel[..., k + 1] - step)
 
 
-def of_parameters(parameters: ArrayLike) -> Array:
+def knots_from_parameters(parameters: ArrayLike) -> Array:
     """Knots (2M, N+2, 2) of the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals,
     their y.
 
@@ -98,10 +98,10 @@ def of_parameters(parameters: ArrayLike) -> Array:
     if para.size == 0 or para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
         raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
     columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
-    return assemble(columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2))
+    return assemble_knots(columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2))
 
 
-def axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
+def split_axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
     """Travel and cross coordinates (P, F, n) of knots (P, F, n, 2), of which so many, from the first, run along x."""
     travel, cross = (
         np.concatenate([knots[:, :horizontals, :, axis], knots[:, horizontals:, :, 1 - axis]], axis=1)
@@ -112,7 +112,7 @@ def axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
 
 PITCH_MM = 11.25
 """Pitch of the built pads."""
-MOST_SAMPLES = 2**20
+MAX_SAMPLES = 2**20
 """Most points a fibre is sampled at."""
 
 
@@ -126,10 +126,10 @@ def read_knots(path: Path) -> Array:
     """
     content = load_mat(path, ("para",))
     try:
-        knots = of_parameters(content["para"])
+        knots = knots_from_parameters(content["para"])
     except (InputError, ValueError, TypeError) as error:
         raise InputError(f"{path}: {error}") from error
-    straight = assemble(np.empty((len(knots), 0, 2)))
+    straight = assemble_knots(np.empty((len(knots), 0, 2)))
     try:
         return straight if _misfit(straight, content) < 1e-9 < _misfit(knots, content) else knots
     except (InputError, ValueError, TypeError, IndexError, KeyError, AttributeError) as error:
@@ -143,16 +143,19 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
         return 0.0
     settings = content["K"]
     contact = Contact(radius=float(settings["object_size"].item()), sides=int(settings["str_shp"].item()))
-    places, expected = check_array("loc_all", content["loc_all"][:presses], FARTHEST), content["sens_raw_all"][:presses]
+    places, expected = (
+        check_array("loc_all", content["loc_all"][:presses], MAX_COORDINATE),
+        content["sens_raw_all"][:presses],
+    )
     if places.ndim != 2 or places.shape[1] != 2:
         raise InputError(f"loc_all has shape {content['loc_all'].shape}, expected (Q, 2)")
-    samples = check_int("fineness", int(settings["fineness"].item()), 2, MOST_SAMPLES)
+    samples = check_int("fineness", int(settings["fineness"].item()), 2, MAX_SAMPLES)
     horizontals = len(knots) // 2
-    travel, cross = axes(knots[None], horizontals)
+    travel, cross = split_axes(knots[None], horizontals)
     misfits = []
     for weight in (UNIFORM, INVERSE_SQUARE):
         found = np.zeros((1, len(places), len(knots)))
-        shape = (*frames(contact.radius, contact.sides), Law(contact.radius, weight, MANHATTAN))
+        shape = (*frames(contact.radius, contact.sides), WeightLaw(contact.radius, weight, MANHATTAN))
         quantized_signals(travel, cross, horizontals, places, shape, samples, 0, len(knots), found)
         misfits.append(float(np.abs(found[0] - expected).max()))
     return min(misfits)
@@ -161,7 +164,7 @@ def _misfit(knots: Array, content: dict[str, Any], presses: int = 32) -> float:
 SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"
 """Of a square pad of one pitch, which every version reads, and of any other one."""
 
-MOST_KNOTS = 2**22
+MAX_KNOTS = 2**22
 """Most knots of a pad, over all its fibres."""
 
 
@@ -193,7 +196,7 @@ class Morphology:
         if self.fibres is None and len(knots) % 2:
             raise InputError(f"knots have shape {knots.shape}, expected (2 M, N + 2, 2), or fibres that are told")
         half = len(knots) // 2
-        layout = Layout.of((half, half) if self.fibres is None else self.fibres, self.pitch_mm)
+        layout = Layout.create((half, half) if self.fibres is None else self.fibres, self.pitch_mm)
         _validate(knots, layout)
         if not layout.is_square:
             knots = _kept(knots, layout)
@@ -237,11 +240,11 @@ class Morphology:
     @classmethod
     def straight(cls, fibres: Counts | Layout, pitch_mm: Pitch = 11.25) -> "Morphology":
         """Straight fibres, N = 0: M of either family, or (H, V), or those of a layout, whose pitch counts."""
-        layout = Layout.of(fibres, pitch_mm)
-        return cls.of_layout(assemble(np.empty((layout.fibres, 0, 2)), layout), layout)
+        layout = Layout.create(fibres, pitch_mm)
+        return cls.from_layout(assemble_knots(np.empty((layout.fibres, 0, 2)), layout), layout)
 
     @classmethod
-    def of_layout(cls, knots: Array, layout: Layout, provenance: Mapping[str, Any] | None = None) -> "Morphology":
+    def from_layout(cls, knots: Array, layout: Layout, provenance: Mapping[str, Any] | None = None) -> "Morphology":
         """Of knots (H + V, N+2, 2) in grid units, whose ends lie as the layout says."""
         check_type("layout", layout, Layout)
         return cls(knots, layout.pitch_mm, {} if provenance is None else provenance, layout.counts)
@@ -251,17 +254,17 @@ class Morphology:
         cls, fibres: Counts | Layout, knots: int, seed: int | np.random.Generator = 0, pitch_mm: Pitch = 11.25
     ) -> "Morphology":
         """Knots drawn uniformly over the pad, as the published search starts from; fibres as `straight` takes them."""
-        layout = Layout.of(fibres, pitch_mm)
+        layout = Layout.create(fibres, pitch_mm)
         knots = _knot_count(layout, knots)
         known = seed if isinstance(seed, np.random.Generator) else check_int("seed", seed, 0, 2**64 - 1)
         rng = np.random.default_rng(known)
         inner = rng.uniform(MARGIN, np.array(layout.extent) - MARGIN, (layout.fibres, knots, 2))
-        return cls.of_layout(assemble(inner, layout), layout)
+        return cls.from_layout(assemble_knots(inner, layout), layout)
 
     @classmethod
     def from_parameters(cls, parameters: ArrayLike, pitch_mm: Pitch = 11.25) -> "Morphology":
         """From the published parameter matrix `para`, (N, 4M): x of horizontals, their y, x of verticals, their y."""
-        return cls(of_parameters(parameters), pitch_mm)
+        return cls(knots_from_parameters(parameters), pitch_mm)
 
     def tiled(self, times: int) -> "Morphology":
         """A pad of M `times` fibres a family, this one's course repeated over its surface, times x times.
@@ -273,8 +276,8 @@ class Morphology:
         """
         if not self.layout.is_square:
             raise InputError(f"a pad of {self.layout} is no tile, expected M + M fibres of one pitch")
-        times = check_int("times", times, 1, MOST_FIBRES // self.grid)
-        _knot_count(Layout.of(self.grid * times), times * (self.knots.shape[1] - 1) + 1)
+        times = check_int("times", times, 1, MAX_FIBRES // self.grid)
+        _knot_count(Layout.create(self.grid * times), times * (self.knots.shape[1] - 1) + 1)
         grid, size = self.grid, self.grid * times
         out = np.empty((2 * size, times * (self.knots.shape[1] - 1) + 3, 2))
         for family in (0, 1):
@@ -306,12 +309,12 @@ class Morphology:
                 raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         document = read_json(path, SQUARE_FORMAT, FORMAT)
         try:
-            return cls.of_document(document)
+            return cls.from_dict(document)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
     @classmethod
-    def of_document(cls, document: Mapping[str, Any]) -> "Morphology":
+    def from_dict(cls, document: Mapping[str, Any]) -> "Morphology":
         """From what `document` gave.
 
         Raises:
@@ -322,10 +325,10 @@ class Morphology:
             knots = np.array(document["knots"], dtype=np.float64)
             square = document.get("format", SQUARE_FORMAT) == SQUARE_FORMAT
             fibres = _fibres_of(document, len(knots)) if square else document["fibres"]
-            layout = Layout.of(fibres, document["pitch_mm"])
+            layout = Layout.create(fibres, document["pitch_mm"])
             if not square:
                 knots = _from_pitches(knots, layout)
-            return cls.of_layout(knots, layout, document.get("provenance", {}))
+            return cls.from_layout(knots, layout, document.get("provenance", {}))
         except InputError:
             raise
         except (KeyError, TypeError, OverflowError) as error:
@@ -333,7 +336,7 @@ class Morphology:
         except ValueError as error:
             raise InputError(error) from error
 
-    def document(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All of it as JSON: knots in pitches, those along x for x and those along y for y."""
         if self.layout.is_square:
             kind, knots = {"format": SQUARE_FORMAT, "grid": self.grid, "pitch_mm": self.pitch_mm}, self.knots
@@ -345,7 +348,7 @@ class Morphology:
 
     def save(self, path: str | Path) -> None:
         """Write a `morphology.json`, atomically; reading it back gives the same knots to the last bit."""
-        write_json(as_path("path", path), self.document())
+        write_json(as_path("path", path), self.to_dict())
 
     def to_mm(self, places: ArrayLike) -> Array:
         """Grid units to mm with the origin at the pad's centre, the frame presses are recorded in."""
@@ -362,7 +365,7 @@ class Morphology:
 
 def _as_places(name: str, values: ArrayLike) -> Array:
     """(..., 2) places, none of them too."""
-    places = check_array(name, values, FARTHEST)
+    places = check_array(name, values, MAX_COORDINATE)
     if places.shape == (0,):
         return places.reshape(0, 2)
     if places.shape[-1:] != (2,):
@@ -372,7 +375,7 @@ def _as_places(name: str, values: ArrayLike) -> Array:
 
 def _knot_count(layout: Layout, knots: int) -> int:
     """Inner knots of a fibre, as far as there may be so many."""
-    return check_int("knots", knots, 0, MOST_KNOTS // layout.fibres - 2)
+    return check_int("knots", knots, 0, MAX_KNOTS // layout.fibres - 2)
 
 
 def _fibres_of(document: Mapping[str, Any], count: int) -> tuple[int, int]:
@@ -414,12 +417,10 @@ def _validate(knots: Array, layout: Layout) -> None:
     for family, (rows, name) in enumerate(zip(layout.families, ("horizontal", "vertical"), strict=True)):
         fibres = knots[rows]
         travel, cross = fibres[..., family], fibres[..., 1 - family]
-        near = (np.diff(travel, axis=1) < LEAST_SPAN).any(axis=1)
+        near = (np.diff(travel, axis=1) < MIN_SPAN).any(axis=1)
         if near.any():
             fibre = int(np.argmax(near)) + 1
-            raise InputError(
-                f"{name} fibre {fibre}: knots do not ascend by {LEAST_SPAN:g} or more along its travel axis"
-            )
+            raise InputError(f"{name} fibre {fibre}: knots do not ascend by {MIN_SPAN:g} or more along its travel axis")
         moved = np.stack([travel[:, 0], travel[:, -1] - layout.extent[family]])
         if moved.any() or (cross[:, [0, -1]] != layout.levels[rows, None]).any():
             raise InputError(

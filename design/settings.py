@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PITCH_MM = 11.25
 """Of the built pad."""
-MOST_FIBRES = 1024
+MAX_FIBRES = 1024
 """Most fibres of a family, of a pad that is made of tiles too."""
 
 Pair = tuple[float, float]
@@ -52,14 +52,14 @@ class Layout:
 
     def __post_init__(self) -> None:
         for name in ("horizontals", "verticals"):
-            object.__setattr__(self, name, check_int(name, getattr(self, name), 0, MOST_FIBRES))
+            object.__setattr__(self, name, check_int(name, getattr(self, name), 0, MAX_FIBRES))
         for name in ("pitch_x_mm", "pitch_y_mm"):
             object.__setattr__(self, name, check_float(name.removesuffix("_mm"), getattr(self, name), 0.1, 1000))
         if not self.fibres:
             raise InputError("a pad of 0 horizontals and 0 verticals has no fibre, allowed is 1 or more in all")
 
     @classmethod
-    def of(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
+    def create(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
         """From what is short: M or (H, V), and one pitch or (along x, along y); a layout is itself.
 
         Raises:
@@ -70,7 +70,7 @@ class Layout:
         if isinstance(fibres, tuple | list):
             horizontals, verticals = _two("fibres", fibres)
         else:
-            horizontals = verticals = check_int("grid", fibres, 1, MOST_FIBRES)
+            horizontals = verticals = check_int("grid", fibres, 1, MAX_FIBRES)
         if isinstance(pitch_mm, tuple | list):
             along_x, along_y = _two("pitch_mm", pitch_mm)
         else:
@@ -337,7 +337,7 @@ class RulesSettings(Settings):
 
 Share = Annotated[float, Field(ge=0, le=1e6)]
 
-Lost = Annotated[
+MaxFailures = Annotated[
     Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Share, ...], Field(min_length=1, max_length=9)],
     BeforeValidator(as_tuple),
 ]
@@ -349,7 +349,7 @@ SIDE = 7
 """The published search presses 7 x 7 places."""
 LEVELS = 4096
 """Levels of the published 12-bit converter."""
-MOST_LEVELS = 2**24
+MAX_LEVELS = 2**24
 
 
 class Scatter(NamedTuple):
@@ -398,9 +398,9 @@ class SearchSettings(Settings):
         default=WEIGHTS, description="weights of entropy, sharpness and disorder in the genetic search"
     )
     presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
-    levels: int = Field(default=LEVELS, ge=1, le=MOST_LEVELS, description="levels of a signal in the genetic search")
+    levels: int = Field(default=LEVELS, ge=1, le=MAX_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
-    lost: Lost = Field(
+    max_failures: MaxFailures = Field(
         default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
     )
     noise: float = Field(
@@ -431,7 +431,7 @@ class SearchSettings(Settings):
         """How responses scatter that are designed for."""
         return Scatter(self.noise, self.scatter, self.scatter_common)
 
-    @field_validator("lost", "weights")
+    @field_validator("max_failures", "weights")
     @classmethod
     def _some_weight(cls, weights: int | tuple[float, ...]) -> int | tuple[float, ...]:
         if isinstance(weights, tuple) and sum(weights) == 0:
@@ -555,14 +555,14 @@ class PadSettings(Settings):
         """Where its fibres end."""
         horizontals = self.grid if self.horizontals is None else self.horizontals
         verticals = self.grid if self.verticals is None else self.verticals
-        return Layout.of((horizontals, verticals), self.pitch_mm)
+        return Layout.create((horizontals, verticals), self.pitch_mm)
 
     @property
     def sensed(self) -> Rectangle:
         """`sensed_rectangle` of this pad."""
         return sensed_rectangle(self.layout, self.sensed_mm)
 
-    def of(self, layout: Layout) -> "PadSettings":
+    def for_layout(self, layout: Layout) -> "PadSettings":
         """These settings of a pad of that layout.
 
         Raises:
@@ -614,7 +614,7 @@ def _stated_layout(stated: Mapping[str, Any]) -> Layout | None:
     if not {"grid", "horizontals", "verticals", "pitch_mm"} <= stated.keys():
         return None
     counts = [stated["grid"] if stated[name] is None else stated[name] for name in ("horizontals", "verticals")]
-    return Layout.of((counts[0], counts[1]), stated["pitch_mm"]) if any(counts) else None
+    return Layout.create((counts[0], counts[1]), stated["pitch_mm"]) if any(counts) else None
 
 
 PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
