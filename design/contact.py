@@ -22,8 +22,8 @@ from padforge.design.morphology import (
     Array,
     Ints,
     Morphology,
+    check_layout,
     fibre_ends,
-    layout_of,
     split_axes,
 )
 from padforge.design.paths.curves import lengths
@@ -171,7 +171,7 @@ def fibre_axes(
     fibres = knots.shape[-3] if knots.ndim >= 3 else 0
     if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
         raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
-    ends = fibre_ends(layout_of(fibres, layout))
+    ends = fibre_ends(check_layout(fibres, layout))
     # in C order, else the kernels would be compiled anew for the order of a caller's array, which takes many seconds
     travel, cross = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
     if not isinstance(pad, Morphology) and not (np.diff(travel) >= MIN_SPAN).all():

@@ -90,7 +90,7 @@ def _sets(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter
 
     def responses(positions: Array) -> Array:
         found = relative_stretch(pad, positions, contact) / scale
-        return found * scatter.gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
+        return found * scatter.sample_gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
 
     learned, fresh = (
         positions[is_outside(positions, size)]
@@ -104,7 +104,7 @@ FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:
     """What is designed for: the contact that `spec` states, or the usual one of such a search."""
-    return spec.section(Contact) if spec.given(Contact) else settings.usual_contact
+    return spec.section(Contact) if spec.given(Contact) else settings.default_contact
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

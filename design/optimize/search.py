@@ -170,7 +170,7 @@ def search(
     """
     begin = time.perf_counter()
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
-    contact = or_default("contact", contact, Contact, settings.usual_contact)
+    contact = or_default("contact", contact, Contact, settings.default_contact)
     problem = build_problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
     run = SearchOptions() if run is None else check_type("run", run, SearchOptions)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None

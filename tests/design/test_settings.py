@@ -269,8 +269,8 @@ def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_pap
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
     quick = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
     assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
-    assert SearchSettings().usual_contact == Contact()
-    assert SearchSettings(method="genetic").usual_contact == PUBLISHED_CONTACT
+    assert SearchSettings().default_contact == Contact()
+    assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
     terms, published = design.score(pad, lost=0), design.score(pad, PUBLISHED_CONTACT, lost=0)
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:
