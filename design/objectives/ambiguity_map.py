@@ -6,7 +6,7 @@ The mean over all places is what `padforge.design.objectives.score.ambiguities` 
 import numpy as np
 
 from padforge.design.contact import fibre_axes, press_shape, signals
-from padforge.design.kernels.ambiguity import ambiguity_by_place
+from padforge.design.kernels.ambiguity import compute_ambiguity
 from padforge.design.kernels.measured_signals import element_signals, element_spacing, fibre_elements
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology
@@ -34,7 +34,7 @@ def ambiguity_map(
     padded = [(*loss, *(fibres,) * (most - len(loss))) for level in losses for loss in level]
     ends = np.cumsum([len(level) for level in losses])
     scaled = np.ascontiguousarray(found / (2 * noise * full_scale))
-    spread = ambiguity_by_place(scaled, presses, np.array(padded, dtype=np.int64))
+    spread = compute_ambiguity(scaled, presses, np.array(padded, dtype=np.int64))
     return np.stack([level.mean(axis=1) for level in np.split(spread, ends[:-1], axis=1)])
 
 

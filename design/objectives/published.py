@@ -42,18 +42,18 @@ def quantize(signals: Array, levels: int = LEVELS) -> Array:
     """
     out = np.zeros(signals.shape)
     if len(signals):
-        kernels.to_levels(np.asarray(signals, dtype=np.float64), levels, out)
+        kernels.quantize(np.asarray(signals, dtype=np.float64), levels, out)
     return out
 
 
 def joint_entropy(levels: Array) -> float:
     """Joint entropy in bits of the rows of (Q, C), whole numbers: at most log2 Q, reached where all rows differ."""
-    return float(kernels.row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
+    return float(kernels.compute_row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
 
 
 def published_sharpness(levels: Array) -> float:
     """Z of formula (4): sum over columns of |second difference| along the press order."""
-    return float(kernels.second_differences(np.asarray(levels, dtype=np.float64)))
+    return float(kernels.sum_second_differences(np.asarray(levels, dtype=np.float64)))
 
 
 def disorder(knots: Array, samples: int = 2000) -> float:
@@ -69,7 +69,7 @@ def disorder(knots: Array, samples: int = 2000) -> float:
         The sum, in grid units.
     """
     grid = len(knots) // 2
-    return float(kernels.disorder(sample_curves(knots[None], grid, samples)[0], grid))
+    return float(kernels.sum_disorder(sample_curves(knots[None], grid, samples)[0], grid))
 
 
 def disorder_area(pad: Morphology) -> float:
@@ -80,7 +80,7 @@ def disorder_area(pad: Morphology) -> float:
     """
     travel, cross, ends, _ = fibre_axes(pad)
     slopes = population_slopes(travel, cross)[0]
-    return max(0.0, float(kernels.disorder_area(travel[0], cross[0], slopes, ends.horizontals)))
+    return max(0.0, float(kernels.integrate_disorder(travel[0], cross[0], slopes, ends.horizontals)))
 
 
 def idle_share(signals: Array, threshold: float = 0.0) -> float:

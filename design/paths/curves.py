@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.design.common.validation import InputError, check_float, check_type
-from padforge.design.kernels.geometry import near_intervals
+from padforge.design.kernels.geometry import find_near_intervals
 from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Morphology, assemble_knots
 from padforge.design.settings import Layout
@@ -212,7 +212,7 @@ def common_stretches(lines: Sequence[Array], others: Sequence[Array], width: flo
         others: polylines (n, 2), one or more, in the same unit.
         width: distance below which two lines count as running along each other.
     """
-    near = near_intervals(*_joined(lines), *_joined(others), width)
+    near = find_near_intervals(*_joined(lines), *_joined(others), width)
     pair = near[:, 0].astype(int) * len(others) + near[:, 1].astype(int)
     # pairs laid out one after another on one axis: intervals that follow on each other are one stretch
     offset = pair * (near[:, 3].max(initial=0.0) + 2 * width)
