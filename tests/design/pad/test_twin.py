@@ -61,7 +61,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     assert angled.as_built_stretch([over])[0, 0] > plain.as_built_stretch([over])[0, 0]
     assert angled.as_built_stretch([beside])[0, 0] < plain.as_built_stretch([beside])[0, 0]
     for none in ([[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]):
-        with pytest.raises(InputError, match="places_mm"):
+        with pytest.raises(InputError, match="positions_mm"):
             twin.as_built_stretch(none)
     assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
         np.array([[0.0, -4.0]])
@@ -73,7 +73,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     [
         ({"channels": (TwinChannel(0, 9, 0.1, 0.0, 0.9),)}, "a channel reads fibre 9"),
         ({"channels": tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))}, "two channels read the same fibre"),
-        ({"weight": WEIGHT[:-1]}, "weight of reach"),
+        ({"weight": WEIGHT[:-1]}, "weight of sensitivity_profile"),
         ({"weight": np.where(WEIGHT == 0, 0.1, WEIGHT)}, "the last weight must be 0"),
         ({"as_built_mm": (None,)}, "as_built_mm must have"),
         ({"sensitivity": (None, None, None, None)}, "sensitivity must have"),
