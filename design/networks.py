@@ -17,7 +17,7 @@ from padforge.design.common.validation import InputError, check_int, check_type,
 from padforge.design.contact import serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 if TYPE_CHECKING:
     pass
@@ -518,7 +518,7 @@ def localisation_error(
     fibres = len(check_type("pad", pad, Morphology).knots)
     if not isinstance(lost, Sequence) or isinstance(lost, str):
         raise InputError(f"lost is {short_repr(lost)}, expected numbers of lost fibres")
-    levels = [number for number in lost if check_int("lost", number, 0, 2 * MOST_FIBRES) < fibres]
+    levels = [number for number in lost if check_int("lost", number, 0, 2 * MAX_FIBRES) < fibres]
     sets = [math.comb(fibres, number) for number in levels]
     if subsets is not None:
         sets = [min(all_of_them, check_int("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]

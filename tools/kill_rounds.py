@@ -32,7 +32,7 @@ grid = 2
 knots = 2
 starts = 2
 steps = 30
-lost = 1
+max_failures = 1
 [rules]
 enforce = false
 [rig]

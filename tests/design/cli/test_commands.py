@@ -20,7 +20,7 @@ from padforge.design.run import load_result, search_lines
 from padforge.design.settings import PadSettings, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
-QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
+QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nmax_failures = 1\n"
 QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")
 
 
@@ -42,7 +42,7 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     told, document = designed(spec=QUICK)
     pad, asked = Morphology.straight(2), {"lost": 1, "size": PadSettings(grid=2)}
     straight = [
-        *expected_errors(pad, Contact(), SearchSettings(lost=1), asked["size"]),
+        *expected_errors(pad, Contact(), SearchSettings(max_failures=1), asked["size"]),
         *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
     ]
     assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
@@ -98,8 +98,8 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
 
 def judged(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
-    asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
-    settings = SearchSettings(lost=1, noise=noise, scatter=0.05, scatter_common=0.5)
+    asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
+    settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
     return score(pad, contact, **asked) | error_terms(expected_errors(pad, contact, settings, asked["size"]))
 
 

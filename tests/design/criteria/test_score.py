@@ -55,8 +55,8 @@ def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
     [
         (Morphology.straight(3), {"size": PadSettings(sensed_mm=(46, 20))}, "the pad itself is 45 mm wide"),
         (Morphology.random(16, 3000, seed=0), {"lost": 0}, "too many"),
-        (Morphology.straight(2), {"lost": -1}, r"\[search\] lost"),
-        (Morphology.straight(2), {"lost": (0.0, 0.0)}, r"\[search\] lost"),
+        (Morphology.straight(2), {"lost": -1}, r"\[search\] max_failures"),
+        (Morphology.straight(2), {"lost": (0.0, 0.0)}, r"\[search\] max_failures"),
         (Morphology.straight(2), {"noise": 0.0}, r"\[search\] noise"),
         (Morphology.straight(2), {"contact": 0.6}, "contact"),
         (Morphology.straight(2), {"rules": {}}, "rules"),

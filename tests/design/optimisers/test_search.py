@@ -17,7 +17,7 @@ from padforge.design.paths.curves import refine
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)
-SMALL = SearchSettings(knots=3, starts=2, steps=25, population=10, generations=3, lost=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=25, population=10, generations=3, max_failures=1)
 QUICK = SMALL.model_copy(update={"starts": 1, "steps": 1, "generations": 1})
 REPAIR = "padforge.design.optimize.gradient.REPAIR_STEPS"
 
@@ -126,10 +126,14 @@ def test_rules_that_cannot_be_met_end_with_what_is_broken(rules, broken, monkeyp
 @pytest.mark.parametrize(
     ("settings", "rules", "pitch_mm"),
     [
-        ({"knots": 1, "lost": 8, "noise": 1e-9, "sharpness": 1e6}, {"min_gap_mm": 1000.0}, 0.1),
-        ({"knots": 64, "lost": (1e-300, 1e6), "noise": 10.0}, {"min_bend_radius_mm": 1000.0}, 1000.0),
-        ({"method": "genetic", "population": 4, "lost": (5e-324,), "seed": 2**32 - 1}, {"border_mm": 1000.0}, 5.0),
-        ({"knots": 2, "lost": (0.0, 1.0), "starts": 3}, {"max_length_mm": 1e-300}, 11.25),
+        ({"knots": 1, "max_failures": 8, "noise": 1e-9, "sharpness": 1e6}, {"min_gap_mm": 1000.0}, 0.1),
+        ({"knots": 64, "max_failures": (1e-300, 1e6), "noise": 10.0}, {"min_bend_radius_mm": 1000.0}, 1000.0),
+        (
+            {"method": "genetic", "population": 4, "max_failures": (5e-324,), "seed": 2**32 - 1},
+            {"border_mm": 1000.0},
+            5.0,
+        ),
+        ({"knots": 2, "max_failures": (0.0, 1.0), "starts": 3}, {"max_length_mm": 1e-300}, 11.25),
     ],
 )
 def test_settings_at_their_ends_give_a_pad_with_finite_terms(settings, rules, pitch_mm, monkeypatch):
@@ -181,7 +185,7 @@ def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
     pad, rules = PadSettings(horizontals=2, verticals=1, bent_radius_mm=6.0), RulesSettings(min_bend_radius_mm=4.0)
     knots = refine(Morphology.straight(pad.layout).knots, 3, pad.layout)
     knots[0, 2, 1] += 0.13
-    origin = Morphology.of_layout(knots, pad.layout)
+    origin = Morphology.from_layout(knots, pad.layout)
     assert check_rules(origin, rules) == []
     assert check_rules(origin, rules, pad) != []
     result = search(pad, None, QUICK, rules, origin=origin)
@@ -208,7 +212,7 @@ def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
         ({"origin": Morphology.straight((2, 2), (5.0, 10.0))}, "to start from has"),
         ({"origin": Morphology.random(2, 7)}, "knots is 3, allowed is at least the 7"),
         ({"settings": SearchSettings(method="genetic", population=100_000)}, "population is 100000: that takes"),
-        ({"settings": SearchSettings(lost=(0.0,) * 4 + (1.0,))}, "leaves some of the 4 fibres"),
+        ({"settings": SearchSettings(max_failures=(0.0,) * 4 + (1.0,))}, "leaves some of the 4 fibres"),
         (
             {"pad": PadSettings(bent_radius_mm=1.5), "rules": RulesSettings(min_bend_radius_mm=2)},
             r"bent_radius_mm is 1.5, allowed is at least 2, .*min_bend_radius_mm",
