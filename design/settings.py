@@ -337,7 +337,7 @@ class RulesSettings(Settings):
 
 Share = Annotated[float, Field(ge=0, le=1e6)]
 
-Lost = Annotated[
+MaxFailures = Annotated[
     Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Share, ...], Field(min_length=1, max_length=9)],
     BeforeValidator(as_tuple),
 ]
@@ -380,7 +380,7 @@ class SearchSettings(Settings):
 
     Attributes:
         noise, scatter, scatter_common: the defaults are what the responses of a built pad scatter by.
-        lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
+        max_failures: how many fibres may fail; or weights of 0, 1, 2, ... failed fibres.
         weights, presses, levels: of the published objective, alpha, beta and gamma; the side of its square of presses;
             and the levels that signals are rounded up to.
         contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
@@ -400,7 +400,7 @@ class SearchSettings(Settings):
     presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
     levels: int = Field(default=LEVELS, ge=1, le=MOST_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
-    lost: Lost = Field(
+    max_failures: MaxFailures = Field(
         default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
     )
     noise: float = Field(
@@ -431,7 +431,7 @@ class SearchSettings(Settings):
         """How responses scatter that are designed for."""
         return Scatter(self.noise, self.scatter, self.scatter_common)
 
-    @field_validator("lost", "weights")
+    @field_validator("max_failures", "weights")
     @classmethod
     def _some_weight(cls, weights: int | tuple[float, ...]) -> int | tuple[float, ...]:
         if isinstance(weights, tuple) and sum(weights) == 0:

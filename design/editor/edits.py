@@ -138,7 +138,7 @@ class Answers:
         return free_presses(self.size)
 
     def _spread(self, pad: Morphology) -> Array:
-        return ambiguity_map(pad, self._presses, self.contact, self.search.lost, AMBIGUITY_NOISE)
+        return ambiguity_map(pad, self._presses, self.contact, self.search.max_failures, AMBIGUITY_NOISE)
 
 
 def _told(pad: Morphology, course: Array) -> list[list[float]]:

@@ -322,7 +322,7 @@ class GradientSearch:
         presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
         while not presses.free.any():  # it lies in a keep-out
             presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
-        shares = loss_shares(search.lost)
+        shares = loss_shares(search.max_failures)
         masks, _ = sample_failures(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
         masks, scatter = masks.float(), search.response_scatter.scaled(louder)

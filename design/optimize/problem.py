@@ -131,8 +131,8 @@ def build_problem(
                 f"population is {settings.population}: that takes {room} numbers for {fibres} fibres of "
                 f"{settings.knots} knots, allowed are {MAX_VALUES // 4}"
             )
-    if not any(loss_shares(settings.lost)[:fibres]):
-        raise InputError(f"lost is {settings.lost}, allowed is what leaves some of the {fibres} fibres")
+    if not any(loss_shares(settings.max_failures)[:fibres]):
+        raise InputError(f"max_failures is {settings.max_failures}, allowed is what leaves some of the {fibres} fibres")
     if origin is not None:
         check_type("origin", origin, Morphology)
         knots = origin.knots.shape[1] - 2

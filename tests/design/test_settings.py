@@ -115,7 +115,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
     assert (search["weights"], search["presses"], search["levels"]) == ((1.0, 1e-7, 5e-6), 7, 4096)
-    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.02, 0.0)
+    assert (search["max_failures"], search["noise"], search["sharpness"]) == (3, 0.02, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
         (PadSettings, "grid", (1, 64), (0,)),
         (PadSettings, "sensed_mm", ("beyond", "fibres", (56.25, 0.1)), ("all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0)),
         (Contact, "sides", (3,), (2,)),
-        (SearchSettings, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
+        (SearchSettings, "max_failures", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
         (SearchSettings, "noise", (1e-9, 10.0), (0.0, 10.1)),
         (SearchSettings, "weights", ((1.0, 0.0, 0.0), (0.0, 1e6, 5e-324)), ((0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,))),
         (SearchSettings, "presses", (2, 64), (1, 65)),
@@ -212,7 +212,11 @@ HOLE = [[0, 0], [4, 0], [0, 4]]
         (PadSettings, {"keep_out_mm": [np.array(HOLE)]}, {"keep_out_mm": [HOLE]}),
         (Contact, {"radius": np.float64(0.9), "sides": np.int32(4)}, {"radius": 0.9, "sides": 4}),
         (Contact, {"reach": np.array([[0, 1], [5, 0.5], [12, 0]])}, {"reach": ((0, 1), (5, 0.5), (12, 0))}),
-        (SearchSettings, {"lost": np.array([0.5, 0.5]), "seed": np.uint32(7)}, {"lost": (0.5, 0.5), "seed": 7}),
+        (
+            SearchSettings,
+            {"max_failures": np.array([0.5, 0.5]), "seed": np.uint32(7)},
+            {"max_failures": (0.5, 0.5), "seed": 7},
+        ),
         (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
         (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
     ],
@@ -242,11 +246,11 @@ def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_pap
         design.signals_quantized(pad, presses), design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
     )
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
-    quick = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
+    quick = {"n_failed": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
     assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
     assert SearchSettings().usual_contact == Contact()
     assert SearchSettings(method="genetic").usual_contact == PUBLISHED_CONTACT
-    terms, published = design.score(pad, lost=0), design.score(pad, PUBLISHED_CONTACT, lost=0)
+    terms, published = design.score(pad, max_failures=0), design.score(pad, PUBLISHED_CONTACT, max_failures=0)
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:
         assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name

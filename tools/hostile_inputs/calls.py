@@ -31,7 +31,7 @@ def sound() -> dict[str, Any]:
     """Arguments that suit, by the name of a parameter, of the files in the current folder."""
     pad = design.Morphology.load("pad/morphology.json")
     recording = sense.open_recording("pad/recording")
-    search = design.SearchSettings(knots=1, starts=1, steps=2, lost=1)
+    search = design.SearchSettings(knots=1, starts=1, steps=2, max_failures=1)
     found = {
         "pad": pad,
         "knots": pad.knots,

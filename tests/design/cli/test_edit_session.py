@@ -20,7 +20,7 @@ def session(tmp_path, pad=None, **size):
         source = tmp_path / "pad.json"
         pad.save(source)
         size = dict(pad.layout.settings)
-    judged = Answers(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(lost=1))
+    judged = Answers(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(max_failures=1))
     begun = EditSession(judged, source, tmp_path / "out.json", shown.append)
     begun.begin()
     return begun, shown

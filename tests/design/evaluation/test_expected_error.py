@@ -242,7 +242,7 @@ def test_judging_a_huge_pad_looks_at_a_draw_of_windows_and_of_presses():
 def test_places_far_apart_on_a_large_pad_may_not_look_alike():
     """Fibres that fold back answer alike at places more than a window apart: which a window alone does not see."""
     pad = Morphology.straight(PadSettings(grid=8).layout)
-    search, size, contact = SearchSettings(lost=0), PadSettings(grid=8), Contact()
+    search, size, contact = SearchSettings(max_failures=0), PadSettings(grid=8), Contact()
     usual = expected_errors(pad, contact, search, size)[0]
 
     def folded(positions):
@@ -272,7 +272,7 @@ def test_fibres_of_a_strip_are_compared_each_by_its_own_full_scale():
     full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, Contact(), "beyond")
     assert (weights.numpy() * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
     assert kernel_weights(PadSettings(grid=4).layout).numpy() == pytest.approx(np.ones(8))
-    search = SearchSettings(lost=0)
+    search = SearchSettings(max_failures=0)
     strip, square = (
         expected_errors(Morphology.straight(each.layout), Contact(), search, each)[0]
         for each in (size, PadSettings(grid=4))
@@ -307,13 +307,13 @@ def test_longer_fibres_of_the_same_signal_err_more():
         knots[fibre, [1, 7], 1 - along] += 0.6
     longer = Morphology.of_layout(knots, size.layout)
     narrow = Contact(reach=((0, 1), (1, 0.8), (2, 0.4), (3, 0.1), (4, 0)))
-    search = SearchSettings(lost=1)
+    search = SearchSettings(max_failures=1)
     a, b = (expected_errors(pad, narrow, search, size) for pad in (straight, longer))
     assert np.all(np.array(b) > a)
 
 
 def test_a_pad_that_answers_no_press_errs_as_a_guess():
-    asked = Contact(radius=1e-9), SearchSettings(lost=1, noise=0.01), PadSettings(grid=2)
+    asked = Contact(radius=1e-9), SearchSettings(max_failures=1, noise=0.01), PadSettings(grid=2)
     found = expected_errors(Morphology.straight(2), *asked)
     assert found == pytest.approx([found[0]] * 2)
     assert found[0] > 0.8
