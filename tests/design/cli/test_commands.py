@@ -89,7 +89,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
     assert (used.noise, used.scatter, used.scatter_common) == (pytest.approx(0.8 * 0.02 / (0.1 * scale)), 0.05, 0.5)
     assert (used.knots, pad.grid, pad.pitch_mm, pad.sensed_mm) == (2, 2, 10, (18, 30))
     wider = settings_for_twin(Spec({"pad": {"pitch_mm": 20.0}}), twin)
-    assert wider.section(Contact).reach[-1] == (15, 0)
+    assert wider.section(Contact).sensitivity_profile[-1] == (15, 0)
     assert (wider.section(PadSettings).pitch_mm, wider.section(PadSettings).sensed_mm) == (20, (18, 31.5))
     Morphology.straight(2, 10.0).save(here / "pad.json")
     scored = CliRunner().invoke(design, ["score", "pad.json", "--twin", str(twin)], catch_exceptions=False)
