@@ -13,7 +13,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
 from padforge.design.paths.curves import crossings, flatten
 from padforge.design.settings import Contact
-from padforge.design.settings import Polygon as Corners
+from padforge.design.settings import Corners
 
 
 def draw_plan(
