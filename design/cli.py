@@ -304,7 +304,7 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
     size = settings.section(PadSettings, **pad.layout.settings)
     asked = settings.section(Contact), search.max_failures
-    terms = error_terms(expected_errors(pad, settings.section(Contact), search, size))
+    terms = error_terms(expected_errors(pad, settings.section(Contact), search, size), pad.unit_mm)
     terms |= score_terms(pad, *asked, rules=rules, size=size)
     found = [asdict(violation) for violation in check_rules(pad, rules, size)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)

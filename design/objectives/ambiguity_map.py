@@ -17,19 +17,20 @@ from padforge.design.settings import Contact
 
 
 def ambiguity_map(
-    pad: Morphology, presses: Array, contact: Contact, lost: int | tuple[float, ...], noise: float
+    pad: Morphology, presses: Array, contact: Contact, max_failures: int | tuple[float, ...], noise: float
 ) -> Array:
     """(K, Q) ambiguity of every press with 0, 1, ... K - 1 fibres lost, mean over such losses, grid units.
 
     Args:
         presses: (Q, 2) grid units, each of which may be taken for any other. contact: exact, but for a measured reach
             within the PRECISION of `measured_signals`.
-        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
+        max_failures: how many fibres may fail at most, or weights of 0, 1, ... failed.
+        noise: of a signal, share of full scale.
     """
     found = _signals(pad, presses, contact) / lengths(pad)
     largest = found.max(axis=0)
     full_scale = largest[largest > 0].mean() if largest.any() else 1.0
-    fibres, most = found.shape[1], min(len(loss_shares(lost)), found.shape[1]) - 1
+    fibres, most = found.shape[1], min(len(loss_shares(max_failures)), found.shape[1]) - 1
     losses = [failure_subsets(fibres, k, MOST_LOSSES) for k in range(most + 1)]
     padded = [(*loss, *(fibres,) * (most - len(loss))) for level in losses for loss in level]
     ends = np.cumsum([len(level) for level in losses])

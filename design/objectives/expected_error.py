@@ -137,9 +137,9 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     return np.mean(errors, axis=0).tolist()
 
 
-def error_terms(errors: Sequence[float]) -> dict[str, float]:
-    """Return `expected_errors` by name."""
-    return {f"expected_error_lost_{lost}": value for lost, value in enumerate(errors)}
+def error_terms(errors: Sequence[float], unit_mm: float) -> dict[str, float]:
+    """Return `expected_errors`, in grid units of `unit_mm`, by name in mm."""
+    return {f"expected_error_mm_{n_failed}": unit_mm * error for n_failed, error in enumerate(errors)}
 
 
 def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> float:

@@ -126,7 +126,7 @@ class SearchResult:
             count as found, but by the published method.
         terms: every term of `score` for it, and its expected errors.
         violations: the rules it breaks; empty where rules are not enforced.
-        found_by: where it is from: "start 2", "genetic", "straight fibres", or "origin", the pad it was to start from.
+        candidate: where it is from: "start 2", "genetic", "straight fibres", or "origin", the pad it was to start from.
         straight: expected errors and ambiguities of straight fibres on the same pad, by name, to set beside its own.
         history: one entry per noted step: {"run", "step", "objective"}.
         enforced: whether it was to keep to the rules.
@@ -137,7 +137,7 @@ class SearchResult:
     morphology: Morphology
     terms: dict[str, float]
     violations: list[Violation]
-    found_by: str
+    candidate: str
     straight: dict[str, float]
     enforced: bool = True
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -196,7 +196,7 @@ def search(
 
 def score_result(
     morphology: Morphology,
-    found_by: str,
+    candidate: str,
     pad: PadSettings,
     contact: Contact,
     settings: SearchSettings,
@@ -206,17 +206,17 @@ def score_result(
 
     Args:
         morphology: the pad.
-        found_by: where it is from.
+        candidate: where it is from.
         pad, contact, settings, rules: as `search` takes them.
     """
     problem = build_problem(pad, contact, settings, rules, None)
     straight = _Candidate("straight fibres", _straight(problem, Stop(time.perf_counter(), None)), problem)
-    return _scored(_Candidate(found_by, morphology, problem), straight, problem)
+    return _scored(_Candidate(candidate, morphology, problem), straight, problem)
 
 
 def _scored(best: "_Candidate", straight: "_Candidate", problem: SearchProblem) -> SearchResult:
     terms = best.errors() | all_terms(best.pad, best.ambiguities(), problem.contacts[0], problem.rules, problem.pad)
-    beside = straight.errors() | ambiguity_terms(straight.ambiguities())
+    beside = straight.errors() | ambiguity_terms(straight.ambiguities(), straight.pad.unit_mm)
     return SearchResult(best.pad, terms, best.broken, best.name, beside, problem.rules.enforce)
 
 
@@ -279,7 +279,7 @@ class _Candidate:
 
     def errors(self) -> dict[str, float]:
         """With 0, 1, ... lost, under the first contact, by name."""
-        return error_terms(self._errors[0])
+        return error_terms(self._errors[0], self.pad.unit_mm)
 
 
 def _straight(problem: SearchProblem, stop: Stop) -> Morphology:

@@ -267,11 +267,11 @@ def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_pap
         design.signals_quantized(pad, presses), design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
     )
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
-    quick = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
+    quick = {"n_failed": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
     assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
     assert SearchSettings().default_contact == Contact()
     assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
-    terms, published = design.score(pad, lost=0), design.score(pad, PUBLISHED_CONTACT, lost=0)
+    terms, published = design.score(pad, max_failures=0), design.score(pad, PUBLISHED_CONTACT, max_failures=0)
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:
         assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name

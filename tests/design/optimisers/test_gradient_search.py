@@ -169,7 +169,9 @@ def test_descent_beats_the_square_grid_within_the_rules():
     asked = PUBLISHED_SEARCH.model_copy(update={"knots": 9, "starts": 1, "steps": 60, "max_failures": 1})
     found = search(PUBLISHED_PAD, PUBLISHED_CONTACT, asked)
     pads = found.morphology, Morphology.straight(4)
-    pad, grid = (score(m, PUBLISHED_CONTACT, lost=1, noise=0.02, size=PadSettings(sensed_mm="fibres")) for m in pads)
+    pad, grid = (
+        score(m, PUBLISHED_CONTACT, max_failures=1, noise=0.02, size=PadSettings(sensed_mm="fibres")) for m in pads
+    )
     assert found.violations == []
-    assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
-    assert pad["ambiguity_lost_1"] < 0.5 * grid["ambiguity_lost_1"]
+    assert pad["ambiguity_mm_0"] < 0.5 * grid["ambiguity_mm_0"]
+    assert pad["ambiguity_mm_1"] < 0.5 * grid["ambiguity_mm_1"]
