@@ -43,7 +43,9 @@ def draw_plan(
         line.get_path().should_simplify = False
         ha, va, dx, dy = ("left", "center", 0.02, 0) if horizontal else ("center", "bottom", 0, 0.02)
         axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
-    places = [(pad.to_mm(c.place), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)]
+    places = [
+        (pad.to_mm(c.position), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)
+    ]
     for same, size, color in ((False, 10, INK), (True, 40, ALARM)):
         chosen = np.array([place for place, family in places if family == same]).reshape(-1, 2)
         axes.scatter(*chosen.T, s=size, facecolor="none" if same else color, edgecolor=color, linewidth=0.8, zorder=3)

@@ -186,7 +186,9 @@ def _crossings(pad: Morphology, rules: RulesSettings) -> list[Violation]:
     found = []
     if len(same) > rules.same_family_crossings:
         count, limit = len(same), rules.same_family_crossings
-        found += [Violation("same_family_crossings", _pair(c), count, limit, _place(pad.to_mm(c.place))) for c in same]
+        found += [
+            Violation("same_family_crossings", _pair(c), count, limit, _place(pad.to_mm(c.position))) for c in same
+        ]
     if most is not None and len(across) > most:
         found.append(Violation("max_crossings", (), len(across), most))
     return found + (_angles(pad, across, least_angle) if least_angle > 0 else [])
@@ -196,7 +198,7 @@ def _angles(pad: Morphology, across: list[Crossing], limit: float) -> list[Viola
     angles = crossing_angles(pad, across)
     worst: dict[tuple[int, int], Violation] = {}
     for i in np.argsort(angles, kind="stable")[: np.count_nonzero(angles < limit)]:  # a pair's least angle comes first
-        place = _place(pad.to_mm(across[i].place))
+        place = _place(pad.to_mm(across[i].position))
         worst.setdefault(
             _pair(across[i]), Violation("min_crossing_angle_deg", _pair(across[i]), float(angles[i]), limit, place)
         )

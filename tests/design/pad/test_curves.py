@@ -79,7 +79,7 @@ def test_wild_curves_keep_to_their_knots_and_every_horizontal_crosses_every_vert
     across = [c for c in found if c.first < pad.grid <= c.second]
     grid = range(pad.grid)
     assert {(c.first, c.second) for c in across} == {(h, pad.grid + v) for h in grid for v in grid}
-    places, angles = np.array([c.place for c in found]), crossing_angles(pad, across)
+    places, angles = np.array([c.position for c in found]), crossing_angles(pad, across)
     assert ((places >= -1e-9) & (places <= pad.grid + 1 + 1e-9)).all()
     assert ((angles >= 0) & (angles <= 90)).all()
     assert crossings(pad, across=False) == [c for c in found if c not in across]
@@ -93,16 +93,16 @@ def test_lengths_and_crossings_of_straight_bent_and_touching_fibres():
     np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
     found = crossings(Morphology.straight(3))
     assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
-    np.testing.assert_allclose([c.place for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
+    np.testing.assert_allclose([c.position for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
     fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
     pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
     found = crossings(pad)
-    np.testing.assert_allclose([c.place for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
+    np.testing.assert_allclose([c.position for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
     np.testing.assert_allclose(crossing_angles(pad, found), [90, 0, 90])
     bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
     pad = Morphology(np.stack([fibre, bow]))
     found = crossings(pad)
-    touch = [np.allclose(c.place, 1) for c in found]
+    touch = [np.allclose(c.position, 1) for c in found]
     assert sum(touch) == 1
     assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
 
@@ -113,7 +113,7 @@ def test_angles_are_those_of_scipys_tangents(pad):
     across = [c for c in crossings(pad) if c.first < pad.grid <= c.second]
     slope = [scipy_curve(pad, fibre).derivative() for fibre in range(2 * pad.grid)]
     for c, angle in zip(across, crossing_angles(pad, across), strict=True):
-        rise, run = slope[c.first](c.place[0]), slope[c.second](c.place[1])
+        rise, run = slope[c.first](c.position[0]), slope[c.second](c.position[1])
         between = np.degrees(np.arctan(rise) + np.arctan(run) - np.pi / 2) % 180
         assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
 
