@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
-from padforge.design.paths.fitting import HAIR, add_spare_knots, fit_knots, remove_spare_knots
+from padforge.design.paths.fitting import SPARE_LENGTH, add_spare_knots, fit_knots, remove_spare_knots
 
 
 def off(knots, points):
@@ -27,7 +27,7 @@ def test_straight_curves_waves_and_steps_need_few_knots():
     assert off(found, points) < 0.06
     assert len(found) < 40
     assert len(fit_knots(points, 0.5)) < len(found)
-    assert len(fit_knots(points, 1e-6, most=12)) == 14
+    assert len(fit_knots(points, 1e-6, max_inner=12)) == 14
     assert (np.diff(found[:, 0]) > 0).all()
     assert np.array_equal(found[[0, -1]], points[[0, -1]])
     found = fit_knots(np.array([[0.0, 0], [10, 0], [10.001, 5], [20, 5]]), 0.05)
@@ -67,7 +67,7 @@ def test_a_course_that_turns_inside_stays_and_is_found_again(heights, count):
     course[3, 1] = 2.95 if course[2, 1] < 2.9 and course[4, 1] < 2.9 else 0.05
     course[[2, 4], 1] = 1.5  # so it turns at its fourth knot
     off, found = moved(course, count)
-    assert off < 10 * HAIR
+    assert off < 10 * SPARE_LENGTH
     assert found == pytest.approx(course)
 
 
