@@ -80,15 +80,15 @@ def import_(
     knots = found.pad.knots.shape[1] - 2
     lines = [
         f"import: {len(fibres)} fibres of {knots} knots -> {folder / 'morphology.json'}",
-        f"  {found.placed}",
+        f"  {found.placement}",
         *(
-            f"  fibre {each['fibre']}: {each['name']}, within {each['off_mm']:.3f} mm"
-            + (f", ends moved by {each['moved_mm']:.3f} mm" if each["moved_mm"] >= 5e-4 else "")
+            f"  fibre {each['fibre']}: {each['name']}, within {each['max_error_mm']:.3f} mm"
+            + (f", ends moved by {each['end_shift_mm']:.3f} mm" if each["end_shift_mm"] >= 5e-4 else "")
             for each in fibres
         ),
         *([f"  broken  {violation}" for violation in broken] or ["  all rules hold"]),
     ]
-    document = {"fibres": fibres, "knots": knots, "placed": found.placed, "violations": list(map(asdict, broken))}
+    document = {"fibres": fibres, "knots": knots, "placement": found.placement, "violations": list(map(asdict, broken))}
     show_result(document, lines, as_json)
     context.exit(1 if broken else 0)
 

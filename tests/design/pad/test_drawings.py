@@ -69,7 +69,7 @@ def test_curves_become_fibres_whose_ends_are_put_right_within_the_tolerance(tmp_
     assert shapely.distance(shapely.points(drawn), upper).max() < 0.06
     ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
     found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
-    assert found.fibres[1].moved_mm == pytest.approx(0.03)
+    assert found.fibres[1].end_shift_mm == pytest.approx(0.03)
     with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
         import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
     assert "--tolerance-mm" in str(told.value)
@@ -106,7 +106,7 @@ def test_pieces_are_put_together_and_what_another_file_would_have_to_declare_dra
         *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
     ]
     found = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
-    assert found.fibres[1].off_mm < 0.05
+    assert found.fibres[1].max_error_mm < 0.05
     assert "to" in found.fibres[1].name
     path = svg(tmp_path, f"&a;{PATHS[:-2]}/>&b;")
     path.write_text('<!DOCTYPE svg SYSTEM "svg11.dtd">' + path.read_text())
@@ -232,7 +232,7 @@ def several(space) -> None:
 )
 def test_a_dxf_of_all_kinds_is_read(tmp_path: Path, draw, middle_mm: float) -> None:
     found = import_plan(dxf(tmp_path, lambda space: (straight_ones(space), draw(space))), LAYOUT, 0.05)
-    assert all(fibre.off_mm < 0.06 for fibre in found.fibres)
+    assert all(fibre.max_error_mm < 0.06 for fibre in found.fibres)
     line = found.pad.to_mm(flatten(found.pad, 1e-4)[0])
     assert np.interp(0, *line.T) == pytest.approx(middle_mm, abs=0.1)
 
@@ -270,7 +270,7 @@ def test_our_own_plan_comes_back(tmp_path: Path) -> None:
     found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
     assert apart(found.pad, pad) < 0.08
     assert found.pad.knots.shape[1] <= 6 + 3
-    assert found.placed == "the border is that named pad"
+    assert found.placement == "the border is that named pad"
 
 
 def test_the_command_writes_a_morphology_and_tells_of_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
