@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import MAX_BYTES, atomic_file, clear_litter, read_bytes, read_json, write_json
+from padforge.design.common.files import MAX_BYTES, atomic_file, read_bytes, read_json, remove_leftovers, write_json
 from padforge.design.common.validation import InputError, short_repr
 
 FORMAT = "padforge-search/1"
@@ -82,7 +82,7 @@ class Checkpoints:
                 if _STATE.fullmatch(path.name) and path.is_file() and not path.is_symlink():
                     path.unlink()
             about.unlink()
-        clear_litter(self.folder)
+        remove_leftovers(self.folder)
         with suppress(OSError):  # where it is not there, or there is more in it than states
             self.folder.rmdir()
 
