@@ -109,7 +109,7 @@ def build(
     require_formats(formats)
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
     made_by = provenance("fabricate", inputs=_require_files(inputs), packages=packages)  # minutes later they may differ
-    profiling.looked_at("formats", len(set(formats)), len(FORMATS))
+    profiling.add_count("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
         plan.require_levels()
