@@ -16,14 +16,14 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import FailureError, PressSets, fresh_presses, training_presses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import outside
-from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
+from padforge.design.paths.keep_outs import is_outside
+from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
 WIDTHS = (5.0, 6.2, 7.9)
-"""Standard deviations of the reaches, about Gaussian, that a press may have, mm; that of MEASURED_REACH second."""
+"""Standard deviations of the reaches, about Gaussian, that a press may have, mm; that of MEASURED_PROFILE second."""
 SIDE, TEST, HIDDEN = 32, 500, 20
 """Presses a side to learn from, and fresh ones; neurons of a network: the 50 published ones learn the scatter by heart,
 and err a tenth more in more time."""
@@ -42,8 +42,8 @@ class ContactErrors:
 
 def contacts_in_question(believed: Contact) -> dict[str, Contact]:
     """The contact believed and others that a pad may really meet, by what they are called; none twice."""
-    spread = [(width, tuple((width / WIDTHS[1] * d, weight) for d, weight in MEASURED_REACH)) for width in WIDTHS]
-    others = {f"reach of {width:g} mm": Contact(reach=reach) for width, reach in spread}
+    spread = [(width, tuple((width / WIDTHS[1] * d, weight) for d, weight in MEASURED_PROFILE)) for width in WIDTHS]
+    others = {f"reach of {width:g} mm": Contact(sensitivity_profile=reach) for width, reach in spread}
     others["published disc, K = 0.6"] = PUBLISHED_CONTACT
     return {"as believed": believed} | {name: other for name, other in others.items() if other != believed}
 
@@ -90,10 +90,10 @@ def _sets(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter
 
     def responses(positions: Array) -> Array:
         found = relative_stretch(pad, positions, contact) / scale
-        return found * scatter.gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
+        return found * scatter.sample_gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
 
     learned, fresh = (
-        positions[outside(positions, size)]
+        positions[is_outside(positions, size)]
         for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, TEST, seed))
     )
     return PressSets(learned, responses(learned), fresh, responses(fresh), seed)
@@ -104,7 +104,7 @@ FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:
     """What is designed for: the contact that `spec` states, or the usual one of such a search."""
-    return spec.section(Contact) if spec.stated(Contact) else settings.usual_contact
+    return spec.section(Contact) if spec.stated(Contact) else settings.default_contact
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

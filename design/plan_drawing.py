@@ -12,8 +12,7 @@ from padforge.design.common.validation import InputError, check_array, check_typ
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
 from padforge.design.paths.curves import crossings, flatten
-from padforge.design.settings import Contact
-from padforge.design.settings import Polygon as Corners
+from padforge.design.settings import Contact, Corners
 
 
 def draw_plan(
@@ -67,8 +66,8 @@ def draw_plan(
 
 
 def _contact_shape(contact: Contact, unit_mm: float) -> Circle | Polygon:
-    radius = _half_width(contact.reach) if contact.reach else contact.radius * unit_mm
-    if contact.reach or contact.sides is None:
+    radius = _half_width(contact.sensitivity_profile) if contact.sensitivity_profile else contact.radius * unit_mm
+    if contact.sensitivity_profile or contact.sides is None:
         return Circle((0, 0), radius, color=INK, alpha=0.15, linewidth=0)
     angle = 2 * np.pi * np.arange(contact.sides) / contact.sides
     return Polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]), color=INK, alpha=0.15, linewidth=0)

@@ -56,10 +56,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
                     ),
                     table(
                         ["fibres failed", "expected error (mm)", "straight (mm)"],
-                        [
-                            [failed, *(_mm(each, f"expected_error_lost_{failed}", unit_mm) for each in both)]
-                            for failed in levels
-                        ],
+                        [[failed, *(_mm(each, f"expected_error_mm_{failed}") for each in both)] for failed in levels],
                     ),
                 ],
             ),
@@ -72,7 +69,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         [
             (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
             (holds, "design rules"),
-            (f"{_mm(terms, 'expected_error_lost_0', unit_mm)} mm", "expected error of the design"),
+            (f"{_mm(terms, 'expected_error_mm_0')} mm", "expected error of the design"),
         ],
     )
     return [fibres]
@@ -102,7 +99,7 @@ def stage_pages(
     strange: list[str] = []
     for name, path, made_of in stages:
         if path.exists():
-            document = read_json(path, f"padforge-{name}/1")
+            document = read_json(path, f"padforge-{name}/{2 if name == 'design' else 1}")
             with reraise_as_input_error(path):
                 strange += _misfits(folder, name, document, recording)
                 sections += made_of(folder, document)
@@ -157,10 +154,10 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     )
 
 
-def _mm(terms: Mapping[str, Any], name: str, unit_mm: float) -> str:
+def _mm(terms: Mapping[str, Any], name: str) -> str:
     """A term in mm; nothing where a search before this version left none."""
     value = terms.get(name)
-    return "-" if value is None else f"{float(value) * unit_mm:#.3g}"
+    return "-" if value is None else f"{float(value):#.3g}"
 
 
 def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
@@ -188,9 +185,9 @@ def _places(broken: Sequence[Mapping[str, Any]]) -> list[list[object]]:
 
 def _terms(terms: Mapping[str, float]) -> Iterator[list[object]]:
     for name, value in terms.items():
-        if "_lost_" in name:
-            measure = name.split("_lost_")[0].replace("_", " ")
-            yield [name, value, f"{measure} with {name[-1]} fibres lost, grid units"]
+        if "_mm_" in name:
+            measure = name.split("_mm_")[0].replace("_", " ")
+            yield [name, value, f"{measure} with {name[-1]} fibres failed, mm"]
         elif name.startswith("penalty_"):
             yield [name, value, f"how far {name.removeprefix('penalty_')} is broken, as the search has it"]
         else:

@@ -87,9 +87,9 @@ def run_search(
             usual = spec.section(SearchSettings, **overrides)
             result = search_for_twin(*wanted, usual, origin=asked.begin, run=run)
     document = {
-        "format": "padforge-design/1",
+        "format": "padforge-design/2",
         "terms": result.terms,
-        "found_by": result.found_by,
+        "candidate": result.candidate,
         "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],
         "history": result.history,
@@ -98,7 +98,7 @@ def run_search(
         "provenance": asked.made_by,
     }
     with stage("figures"), atomic_files(out) as together:
-        Morphology.of_layout(result.morphology.knots, pad.layout, asked.made_by).save(together / path.name)
+        Morphology.from_layout(result.morphology.knots, pad.layout, asked.made_by).save(together / path.name)
         check_replaceable(path, together / path.name, remade, force)  # a search of the same settings may end elsewhere
         document["morphology_sha256"] = sha256(together / path.name)
         figure = draw_plan(result.morphology, asked.contact, result.violations, pad.keep_out_mm)
@@ -152,7 +152,7 @@ def load_result(out: Path) -> SearchResult | None:
     path = out / "design.json"
     if not (path.exists() and (out / "morphology.json").exists()):
         return None
-    document = read_json(path, "padforge-design/1")
+    document = read_json(path, "padforge-design/2")
     with reraise_as_input_error(path):
         if document["morphology_sha256"] != sha256(out / "morphology.json"):
             return None
@@ -165,7 +165,7 @@ def load_result(out: Path) -> SearchResult | None:
             Morphology.load(out / "morphology.json"),
             terms,
             violations,
-            str(document["found_by"]),
+            str(document["candidate"]),
             straight,
             bool(document["provenance"]["settings"]["rules"]["enforce"]),
             document["history"],
@@ -206,14 +206,13 @@ def _located(result: SearchResult) -> list[str]:
         [value for term, value in terms.items() if term.startswith("expected_error")]
         for terms in (result.terms, result.straight)
     )
-    unit_mm = result.morphology.unit_mm
-    designed, plain = (" / ".join(f"{unit_mm * value:.2f}" for value in values) for values in (errors, straight))
+    designed, plain = (" / ".join(f"{value:.2f}" for value in values) for values in (errors, straight))
     failed = " / ".join(map(str, range(len(errors))))
     lines = [
         f"  expected error {designed} mm with {failed} fibres failed, before anything is built",
         f"                 {plain} mm with straight fibres",
     ]
-    if result.found_by == "straight fibres":
+    if result.candidate == "straight fibres":
         return [*lines, "  these are straight fibres: nothing better was found; more steps or time may find it"]
     alike = [str(k) for k, pair in enumerate(zip(errors, straight, strict=True)) if pair[0] > (1 - SURE) * pair[1]]
     if alike:

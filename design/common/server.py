@@ -265,11 +265,12 @@ class _PageServer(ConnectionServer):
         try:
             while True:
                 with self._changed:
-                    is_new = self._changed.wait_for(lambda: self._has_ended or self._number > number, KEEP_ALIVE_S)
+                    self._changed.wait_for(lambda sent=number: self._has_ended or self._number > sent, KEEP_ALIVE_S)
                     if self._has_ended and self._number == number:
                         return
-                    number, message = self._number, self._message
-                send(f"data: {message}\n\n".encode() if is_new else b":\n\n")
+                    message = f"data: {self._message}\n\n" if self._number > number else ":\n\n"
+                    number = self._number
+                send(message.encode())
                 time.sleep(MIN_INTERVAL_S)
         finally:
             with self._changed:

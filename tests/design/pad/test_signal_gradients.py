@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 
 from padforge.design import Contact, Morphology, signals
 from padforge.design.contact import fibre_axes
-from padforge.design.morphology import kernel_ends
+from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import SEEDS, wild_contacts, wild_pads
@@ -22,9 +22,9 @@ CONTACTS = [
     Contact(sides=None, weight="inverse_square", length="euclidean"),
     Contact(weight="inverse"),
     Contact(sides=None, weight="inverse", length="euclidean"),
-    Contact(reach=REACH),
-    Contact(reach=REACH, length="euclidean"),
-    Contact(reach=((0.0, -0.3), (2.3, -0.5), (4.0, -0.35), (5.6, 0.1), (6.8, 0.2), (10.1, 0.0))),
+    Contact(sensitivity_profile=REACH),
+    Contact(sensitivity_profile=REACH, length="euclidean"),
+    Contact(sensitivity_profile=((0.0, -0.3), (2.3, -0.5), (4.0, -0.35), (5.6, 0.1), (6.8, 0.2), (10.1, 0.0))),
 ]
 
 
@@ -37,7 +37,7 @@ def straight_axes(grid):
 def torch_signals(travel, cross, presses, contact):
     slope = pchip_slopes(travel, cross)
     return press_signals(
-        travel, cross, slope, presses, contact, kernel_ends(Layout.of(len(travel) // 2)), DEFAULT_PITCH_MM
+        travel, cross, slope, presses, contact, fibre_ends(Layout.create(len(travel) // 2)), DEFAULT_PITCH_MM
     )
 
 
@@ -60,7 +60,9 @@ def taylor_ratio(contact, seed):
     return left[0] / left[1]
 
 
-@pytest.mark.parametrize("contact", CONTACTS, ids=lambda c: f"{len(c.reach) or c.sides}-{c.weight}-{c.length}")
+@pytest.mark.parametrize(
+    "contact", CONTACTS, ids=lambda c: f"{len(c.sensitivity_profile) or c.sides}-{c.weight}-{c.length}"
+)
 def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(contact):
     assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
 
@@ -68,7 +70,7 @@ def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(conta
 @pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[5], CONTACTS[9]], ids=["polygon", "inverse square", "reach"])
 @pytest.mark.parametrize("counts", [(2, 3), (3, 1), (0, 2)])
 def test_the_torch_function_gives_the_exact_signals_and_their_gradient_on_rectangles(contact, counts):
-    pad, rng = Morphology.random(Layout.of(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
+    pad, rng = Morphology.random(Layout.create(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0, pad.layout.extent, (20, 2))
     travel, cross, ends, _ = fibre_axes(pad)
 
