@@ -133,7 +133,7 @@ def _run_exact(
     def compute(begin: int, end: int) -> int:
         return exact_signals(along, across, slope, max_offsets, ends, presses, *shape, begin, end, starts, fibre, out)
 
-    visited = sum(map_chunks(compute, len(along) * len(presses), grain=2000))
+    visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
     if profiling.is_profiling():
         record_visits(along, max_offsets, ends, presses, shape[1], visited)
     return visited
@@ -154,8 +154,8 @@ def record_visits(
     """
     pads, fibres, knots = along.shape
     touched = sum(int(geometry.count_touched(offsets, presses, extents, ends)[-1]) for offsets in max_offsets)
-    profiling.looked_at("fibres, press by press", touched, pads * len(presses) * fibres)
-    profiling.looked_at("spans, press by press", visited, pads * len(presses) * fibres * (knots - 1))
+    profiling.add_count("fibres, press by press", touched, pads * len(presses) * fibres)
+    profiling.add_count("spans, press by press", visited, pads * len(presses) * fibres * (knots - 1))
 
 
 def _sum_simultaneous(signals: Array, shape: tuple[int, ...]) -> Array:

@@ -175,5 +175,5 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
         knots = along[0], across[0], slope, ends.horizontals
         integrate_elongations(*knots, centres, a, steepness, max_error, shape, begin, end, out)
 
-    map_chunks(compute, len(centres), grain=50)
+    map_chunks(compute, len(centres), min_chunk=50)
     return out

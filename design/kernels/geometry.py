@@ -133,7 +133,7 @@ def select_frame(shape: Any, family: int) -> Any:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def max_offsets(cross: Any, ends: Any) -> Any:
+def max_offsets(across: Any, ends: Any) -> Any:
     """Compute the largest offset of the fibres of each family from their own level.
 
     Args:
@@ -143,13 +143,13 @@ def max_offsets(cross: Any, ends: Any) -> Any:
     Returns:
         Offsets; shape (P, 2).
     """
-    population, fibres, _ = cross.shape
+    population, fibres, _ = across.shape
     out = np.zeros((population, 2))
     for p in range(population):
         for f in range(fibres):
             family, first, _, spacing = family_of(f, ends)
             level = (f - first + 1) * spacing
-            for at in cross[p, f]:
+            for at in across[p, f]:
                 out[p, family] = max(out[p, family], abs(at - level))
     return out
 

@@ -93,7 +93,9 @@ def test_lengths_and_crossings_of_straight_bent_and_touching_fibres():
     np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
     found = crossings(Morphology.straight(3))
     assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
-    np.testing.assert_allclose([c.position for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
+    np.testing.assert_allclose(
+        [c.position for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12
+    )
     fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
     pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
     found = crossings(pad)
