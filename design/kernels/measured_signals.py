@@ -219,9 +219,9 @@ def _differentiate_elements(
                         piece = _find_piece(square, profile, piece)
                         start, c0, c1, c2, c3 = profile[piece]
                         x = square - start
-                        force = 2 * up * elements.length[k] * (c1 + x * (2 * c2 + 3 * x * c3))
-                        out[0, k] += force * dt
-                        out[1, k] += force * dv
+                        radial_derivative = 2 * up * elements.length[k] * (c1 + x * (2 * c2 + 3 * x * c3))
+                        out[0, k] += radial_derivative * dt
+                        out[1, k] += radial_derivative * dv
                         out[2, k] += up * (c0 + x * (c1 + x * (c2 + x * c3)))
 
 
