@@ -309,6 +309,14 @@ def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, see
 
 
 def grid_positions(rectangle: Rectangle, side: int) -> Array:
-    """Return side x side positions (side^2, 2), evenly from corner to corner of a rectangle, row by row from below."""
+    """Return evenly spaced positions from corner to corner of a rectangle, row by row from below.
+
+    Args:
+        rectangle: low and high corner.
+        side: positions per row, and rows.
+
+    Returns:
+        Positions; shape (side^2, 2), in the unit of the rectangle.
+    """
     x, y = (np.linspace(low, high, side) for low, high in zip(*rectangle, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

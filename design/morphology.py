@@ -41,7 +41,11 @@ MARGIN = 1e-3
 
 
 def check_layout(n_fibres: int, layout: Layout | None = None) -> Layout:
-    """Return the layout of a number of fibres: the one stated, or that of a square pad of the default pitch.
+    """Return the layout of a number of fibres.
+
+    Args:
+        n_fibres: number of fibres.
+        layout: their layout; that of a square pad of the default pitch if None.
 
     Raises:
         InputError: a number that is not the layout's, or without a layout no even number.

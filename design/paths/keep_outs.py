@@ -49,7 +49,15 @@ def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
 
 
 def is_outside(positions: NDArray[np.float64], pad: PadSettings) -> NDArray[np.bool_]:
-    """Whether positions (Q, 2), in grid units, lie outside all keep-outs; shape (Q,)."""
+    """Whether positions lie outside all keep-outs.
+
+    Args:
+        positions: shape (Q, 2), grid units.
+        pad: the pad and its keep-outs.
+
+    Returns:
+        Mask; shape (Q,).
+    """
     free = np.ones(len(positions), bool)
     for polygon in keep_outs(pad):
         free &= ~shapely.intersects_xy(polygon, positions)
