@@ -27,7 +27,7 @@ from functools import partial
 from importlib import metadata
 from itertools import count
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from padforge.design.common.validation import InputError, short_repr
 
@@ -140,7 +140,7 @@ def lock(file: IO[Any] | int, busy: str) -> None:
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Lock a file or folder during the body; do nothing on Windows, where nothing that is open can be renamed.
+    """Lock a file or folder during the body, as `lock`; do nothing on Windows, where nothing open can be renamed.
 
     Args:
         path: the file or folder.
@@ -327,20 +327,6 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         ValueError: it holds NaN or infinity, which JSON does not have.
     """
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
-def open_in_place(path: Path) -> BinaryIO:
-    """Open an existing file for reading and writing in place, unbuffered, without following a symbolic link.
-
-    Raises:
-        InputError: it is a symbolic link.
-        OSError: it cannot be opened.
-    """
-    file = path.open("r+b", buffering=0)
-    if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
-        file.close()
-        raise InputError(f"{path}: is a link, and none is followed where a file is gone on with")
-    return file
 
 
 def sync(path: Path) -> None:
