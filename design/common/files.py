@@ -429,9 +429,11 @@ def recover(folder: Path) -> None:
         InputError: it cannot be completed, or is of another user or folder.
     """
     exchange, deadline = folder / EXCHANGE, time.monotonic() + PATIENCE_S
-    while (note := _read_note(folder)) is not None:
+    while _read_note(folder) is not None:
         try:
             with reraise_write_error(folder), locked(exchange, f"{folder}: another run is moving its files there"):
+                if (note := _read_note(folder)) is None:  # read again under the lock, without which it may change
+                    return
                 user = getattr(os, "geteuid", int)()  # on Windows all files are of user 0
                 if {exchange.lstat().st_uid, (exchange / _NOTE).lstat().st_uid} != {user}:
                     raise InputError(f"{exchange}: left by a run of another user, who completes it by another run")
@@ -441,8 +443,9 @@ def recover(folder: Path) -> None:
                     with suppress(FileNotFoundError):  # it has moved
                         (exchange / name).replace(folder / name)
                 # One rename ends the exchange: if its folder is not removed then, it is a leftover like any other.
-                leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")
-                shutil.rmtree(leftover, ignore_errors=True)
+                with suppress(FileNotFoundError):  # on Windows, where another run may have ended it
+                    leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")
+                    shutil.rmtree(leftover, ignore_errors=True)
         except BusyError:
             if time.monotonic() > deadline:
                 raise
