@@ -305,7 +305,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
         return
     with reraise_write_error(path):
         if path.exists() and not path.is_file():
-            raise InputError(f"{path}: cannot be written (it is there and no file)")
+            raise InputError(f"{path}: cannot be written (it exists and is no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
         recover(path.parent)  # else a later recovery would replace the new file by an older one
         with temporary_file(path.parent, path.suffix) as temporary:
