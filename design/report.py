@@ -203,3 +203,36 @@ def _inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
             yield f"{name} {digest} ({here})"
         else:
             yield f"{name} {digest}"
+
+
+def contact_line(document: Mapping[str, Any]) -> str:
+    """Summarise a `contacts.json`: errors with all fibres under the assumed contact, and their range under others."""
+    parts = []
+    for pad in ("designed", "straight"):
+        assumed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
+        parts.append(f"{assumed:.2f} mm under the assumed contact, {min(others):.2f} to {max(others):.2f} mm otherwise")
+    return f"contact: mean error of a small network {parts[0]}; of straight fibres {parts[1]}"
+
+
+def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+    """Return how the simulated errors in a `contacts.json` depend on the contact model.
+
+    Args:
+        folder: of the document.
+        document: as padforge writes it.
+
+    Raises:
+        KeyError, TypeError, ValueError: the document is not as padforge writes it.
+    """
+    rows, scatter = document["rows"], document["scatter"]
+    levels = range(max(len(row["errors_mm"]) for row in rows))
+    lead = (
+        "The contact is assumed until a printed pad is identified. Here the pad, and straight fibres of the same pad,"
+        " are simulated under other contacts as well: mean error in mm of a small network, trained afresh under each"
+        f" on one reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
+        f" {float(scatter['floor']):.1%} of full scale. Where rows differ, simulated errors depend on the contact as"
+        " much as on the pad; where straight fibres are better, optimising has not paid off."
+    )
+    head = ["contact", "fibres", *(f"{n_failed} failed" for n_failed in levels)]
+    body = [[row["contact"], row["pad"], *(f"{error:.2f}" for error in row["errors_mm"])] for row in rows]
+    return [PageSection("Contact model", [paragraph(lead), table(head, body)])]

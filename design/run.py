@@ -19,7 +19,7 @@ from padforge.design.common.files import (
 from padforge.design.common.plotting import save_figure
 from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
-from padforge.design.contact_comparison import contact_of
+from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation, check_rules
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
@@ -136,7 +136,7 @@ def _request(spec: "Spec", overrides: dict[str, Any], origin: str | None = None,
         begin, inputs = Morphology.load(origin), [*inputs, Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
-    contact = contact_of(spec, settings)
+    contact = design_contact(spec, settings)
     made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))  # as they are read
     used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     made_by["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}

@@ -123,7 +123,7 @@ def search_for_twin(
         pads = {name: each for name, each in pads.items() if not problem.broken(each)} or {"twin": afresh.morphology}
     with stage("judge"):
         found = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
-    name = choose({each.pad: np.array([level.mean for level in each.errors]) for each in found})
+    name = choose({each.pad: np.array(each.errors_mm) for each in found})
     parts = {"usual": plain, "twin": afresh, "from usual": further}
     history = [entry | {"run": f"{part}, {entry['run']}"} for part, each in parts.items() for entry in each.history]
     return replace(
