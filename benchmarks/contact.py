@@ -11,7 +11,7 @@ from numba import njit
 from scipy.interpolate import PchipInterpolator
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.contact import quantized_and_samples, signals_and_spans, signals_sparse
+from padforge.design.contact import quantized_signals_and_samples, signals_and_spans, signals_sparse
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
@@ -101,7 +101,7 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTr
     for samples in SAMPLES:
         plain = partial(plain_signals, pad, presses, contact, samples)
         scan = partial(scanned_signals, pad.knots, presses, contact.radius, contact.sides or 0, samples)
-        cull = partial(quantized_and_samples, pad, presses, contact, samples)
+        cull = partial(quantized_signals_and_samples, pad, presses, contact, samples)
 
         def scanned(found: Array) -> Mapping[str, float]:
             return {"error": error(found, true()), "visited": 1.0}

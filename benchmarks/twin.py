@@ -110,7 +110,7 @@ def printed_pad(
 
     silent = twin(0.0)
     places = rng.uniform(-0.5, 0.5, (400, 2)) * (width, height)
-    signals = silent.laid_stretch(places)
+    signals = silent.as_built_stretch(places)
     largest = [abs(gains[c]) * signals[:, fibre].max() for c, fibre in enumerate(read) if fibre is not None]
     return twin(noise * float(np.mean(largest)))
 
@@ -185,7 +185,7 @@ def _judged(world: str, found: Identification | Predict) -> Mapping[str, float |
     """Error of responses at fresh places, share of their spread; and of an identification what else it found."""
     pad = printed(world)
     places_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (FRESH, 2)) * pad.sensed_mm
-    signals_there, live = pad.laid_stretch(places_mm), [c for c in pad.channels if c.fibre is not None]
+    signals_there, live = pad.as_built_stretch(places_mm), [c for c in pad.channels if c.fibre is not None]
     true = np.column_stack([channel.gain_v * signals_there[:, channel.fibre] for channel in live])
     if not isinstance(found, Identification):
         return {"error": _off(found(places_mm)[:, [channel.channel for channel in live]], true)}

@@ -73,7 +73,7 @@ def import_(
     made_by["settings"] = {"pad": size.model_dump(mode="json"), "tolerance_mm": tolerance_mm}
     folder = out or pad_folder(plan)
     with atomic_files(folder) as together:
-        Morphology.of_layout(found.pad.knots, size.layout, made_by).save(together / "morphology.json")
+        Morphology.from_layout(found.pad.knots, size.layout, made_by).save(together / "morphology.json")
         check_replaceable(folder / "morphology.json", together / "morphology.json", force=force)
     broken = check_rules(found.pad, rules, size)
     fibres = [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(found.fibres, 1)]
@@ -229,7 +229,7 @@ def design(
     with locked_folder(out), cluster(scheduler) as executor:
         how = SearchOptions(resume=resume, time_budget=time_budget, executor=executor)
         document, result = run_search(load_spec(spec), out, overrides, origin, how, twin, force=force)
-    if twin is not None and (left := Twin.load(twin).left_out()):
+    if twin is not None and (left := Twin.load(twin).ignored_effects()):
         click.echo(f"{twin}: {left}", err=True)
     show_result(document, search_lines(result, out), as_json)
     context.exit(INTERRUPTED if result.stopped == "interrupted" else 1 if result.violations else 0)

@@ -18,7 +18,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import SimulatedPresses, fresh_presses, training_presses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import outside
+from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
@@ -104,10 +104,10 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
 
     def respond(positions: Array) -> Array:
         stretch = relative_stretch(pad, positions, contact) / scale
-        return stretch * scatter.gains(stretch.shape, rng) + scatter.floor * rng.standard_normal(stretch.shape)
+        return stretch * scatter.sample_gains(stretch.shape, rng) + scatter.floor * rng.standard_normal(stretch.shape)
 
     training, fresh = (
-        positions[outside(positions, size)]
+        positions[is_outside(positions, size)]
         for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, N_TEST, seed))
     )
     return SimulatedPresses(training, respond(training), fresh, respond(fresh), seed)
@@ -115,7 +115,7 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
     """Return the contact designed for: the one that `spec` states, or the default of such a search."""
-    return spec.section(Contact) if spec.given(Contact) else settings.usual_contact
+    return spec.section(Contact) if spec.given(Contact) else settings.default_contact
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

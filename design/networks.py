@@ -17,7 +17,7 @@ from padforge.design.contact import serpentine_presses, signals
 from padforge.design.levenberg_marquardt import train_batch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 EPOCHS = 1000
 TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
@@ -268,7 +268,7 @@ def localisation_error(
     fibres = len(check_type("pad", pad, Morphology).knots)
     if not isinstance(n_failed, Sequence) or isinstance(n_failed, str):
         raise InputError(f"n_failed is {short_repr(n_failed)}, expected numbers of failed fibres")
-    levels = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MOST_FIBRES) < fibres]
+    levels = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MAX_FIBRES) < fibres]
     counts = [math.comb(fibres, number) for number in levels]
     if subsets is not None:
         counts = [min(count, check_int("subsets", subsets, 1, MAX_NETWORKS)) for count in counts]

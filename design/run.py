@@ -98,7 +98,7 @@ def run_search(
         "provenance": asked.made_by,
     }
     with stage("figures"), atomic_files(out) as together:
-        Morphology.of_layout(result.morphology.knots, pad.layout, asked.made_by).save(together / path.name)
+        Morphology.from_layout(result.morphology.knots, pad.layout, asked.made_by).save(together / path.name)
         check_replaceable(path, together / path.name, remade, force)  # a search of the same settings may end elsewhere
         document["morphology_sha256"] = sha256(together / path.name)
         figure = draw_plan(result.morphology, asked.contact, result.violations, pad.keep_out_mm)

@@ -13,7 +13,7 @@ from padforge.design.objectives.ambiguity_map import ambiguity_map
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import AMBIGUITY_NOISE, free_presses
 from padforge.design.paths.curves import beziers
-from padforge.design.paths.fitting import with_spares
+from padforge.design.paths.fitting import add_spare_knots
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
 
 NEAREST = 1e-3
@@ -92,7 +92,7 @@ class Answers:
     def morphology(self, courses: Courses) -> Morphology:
         """The courses as a pad."""
         layout = self.size.layout
-        return Morphology.of_layout(with_spares(courses, layout), layout)
+        return Morphology.from_layout(add_spare_knots(courses, layout), layout)
 
     def of(self, courses: Courses) -> dict[str, Any]:
         """All that is told of courses, JSON, in mm from the middle of the pad and grid units."""

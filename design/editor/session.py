@@ -12,8 +12,8 @@ from typing import Any
 from padforge.design.common.files import check_replaceable, find_dependents, provenance
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 from padforge.design.editor.edits import Answers, Courses, moved, straight_courses, with_knot, without_knot
-from padforge.design.morphology import FARTHEST, Morphology
-from padforge.design.paths.fitting import without_spares
+from padforge.design.morphology import MAX_COORDINATE, Morphology
+from padforge.design.paths.fitting import remove_spare_knots
 
 MOST_STEPS = 1000
 """That are remembered."""
@@ -100,7 +100,9 @@ class EditSession:
         self._made_by = provenance("padforge design edit", None, [] if source is None else [source])
         self._made_by["settings"] = {"pad": answers.size.model_dump(mode="json")}
         check_replaceable(out, self._made_by, force=force)
-        begin = straight_courses(layout) if source is None else without_spares(Morphology.load(source).knots, layout)
+        begin = (
+            straight_courses(layout) if source is None else remove_spare_knots(Morphology.load(source).knots, layout)
+        )
         self._history = EditHistory(tuple(begin))
         self._lock, self._number, self._name = Lock(), 0, secrets.token_hex(8)
         self._told = "" if source is None else f"as {source} has it"
@@ -168,7 +170,7 @@ class EditSession:
             if self.out.is_file() and kept:
                 self.out = free_name(self.out)
             pad = self._answers.morphology(courses)
-            Morphology.of_layout(pad.knots, pad.layout, self._made_by).save(self.out)
+            Morphology.from_layout(pad.knots, pad.layout, self._made_by).save(self.out)
             self._ours = True
             self._history.keep(courses)
             self._told = f"saved to {self.out}"
@@ -223,7 +225,7 @@ class EditSession:
     def _place(self, asked: Mapping[str, Any]) -> list[float]:
         """Where something is asked for, grid units."""
         layout = self._answers.size.layout
-        place_mm = (check_float(name, asked.get(name), -FARTHEST, FARTHEST) for name in ("x_mm", "y_mm"))
+        place_mm = (check_float(name, asked.get(name), -MAX_COORDINATE, MAX_COORDINATE) for name in ("x_mm", "y_mm"))
         return [at / layout.unit_mm + extent / 2 for at, extent in zip(place_mm, layout.extent, strict=True)]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from padforge.design.contact import fibre_axes, press_shape, signals
 from padforge.design.kernels.ambiguity import ambiguity_by_place
-from padforge.design.kernels.measured_signals import element_signals, fibre_elements, spacing_of
+from padforge.design.kernels.measured_signals import element_signals, element_spacing, fibre_elements
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets, loss_shares
@@ -46,7 +46,7 @@ def _signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
     travel, cross, ends, _ = fibre_axes(pad)
     slope = population_slopes(travel, cross)[0]
     law = press_shape(contact, pad.unit_mm)[2]
-    spacing = spacing_of(contact.profile_points(pad.unit_mm))
+    spacing = element_spacing(contact.profile_points(pad.unit_mm))
     elements = fibre_elements(travel[0], cross[0], slope, ends.horizontals, presses, law.radius, spacing, law.length)
     out = np.empty((len(presses), len(slope)))
     element_signals(travel[0], cross[0], elements, presses, law.radius, law.profile, out)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_type
-from padforge.design.contact import lattice, relative_stretch, serpentine_presses, signals, signals_quantized
+from padforge.design.contact import grid_positions, relative_stretch, serpentine_presses, signals, signals_quantized
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, loss_shares
 from padforge.design.objectives.published import (
@@ -19,7 +19,7 @@ from padforge.design.objectives.published import (
     published_terms,
     quantize,
 )
-from padforge.design.paths.keep_outs import outside
+from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, SearchSettings
 
 
@@ -94,8 +94,8 @@ def free_presses(size: PadSettings) -> Array:
     Raises:
         InputError: there is none.
     """
-    presses = lattice(size.sensed, SIDE)
-    presses = presses[outside(presses, size)]
+    presses = grid_positions(size.sensed, SIDE)
+    presses = presses[is_outside(presses, size)]
     if not len(presses):
         raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
     return presses
@@ -132,7 +132,7 @@ def score(
     from .penalties import PER_SPAN
 
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
-    size = or_default("size", size, PadSettings).of(check_type("pad", pad, Morphology).layout)
+    size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
     asked = SearchSettings(max_failures=max_failures, noise=noise)
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:

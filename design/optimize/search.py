@@ -28,7 +28,7 @@ from padforge.design.objectives.fibre_loss import loss_shares
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms, sharpness_of
 from padforge.design.optimize.problem import SearchProblem, Stop, build_problem, stopped_by_interrupt
-from padforge.design.paths.keep_outs import straight_course
+from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def search(
     """
     begin = time.perf_counter()
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
-    contact = or_default("contact", contact, Contact, settings.usual_contact)
+    contact = or_default("contact", contact, Contact, settings.default_contact)
     problem = build_problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
     run = SearchOptions() if run is None else check_type("run", run, SearchOptions)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
@@ -285,7 +285,7 @@ class _Candidate:
 def _straight(problem: SearchProblem, stop: Stop) -> Morphology:
     """Straight fibres with as many knots as those that are searched, but for bows around keep-outs, as mended."""
     size, search = problem.pad, problem.search
-    pad = Morphology.of_layout(straight_course(size, problem.rules, search.knots), size.layout)
+    pad = Morphology.from_layout(straight_paths(size, problem.rules, search.knots), size.layout)
     if not size.keep_out_mm or not problem.broken(pad):
         return pad
     from_it = replace(problem, search=search.model_copy(update={"method": "descent"}), origin=pad)

@@ -161,11 +161,11 @@ def test_a_rectangle_is_what_was_stated_and_its_middle_is_pressed():
     assert stated.sensed == sensed_rectangle(stated.layout)
     assert Spec(tomllib.loads(commented_toml({"pad": PadSettings}, {"pad": stated}))).section(PadSettings) == stated
     assert PadSettings.model_validate_json(stated.model_dump_json()) == stated
-    assert stated.of(Layout.of(4)).layout == Layout.of(4)
+    assert stated.for_layout(Layout.create(4)).layout == Layout.create(4)
     assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
-    assert sensed_rectangle(Layout.of(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
-    assert sensed_rectangle(Layout.of(4), "fibres") == ((1, 1), (4, 4))
-    assert sensed_rectangle(Layout.of(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
+    assert sensed_rectangle(Layout.create(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
+    assert sensed_rectangle(Layout.create(4), "fibres") == ((1, 1), (4, 4))
+    assert sensed_rectangle(Layout.create(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
     assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
     again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
@@ -269,8 +269,8 @@ def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_pap
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
     quick = {"n_failed": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
     assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
-    assert SearchSettings().usual_contact == Contact()
-    assert SearchSettings(method="genetic").usual_contact == PUBLISHED_CONTACT
+    assert SearchSettings().default_contact == Contact()
+    assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
     terms, published = design.score(pad, max_failures=0), design.score(pad, PUBLISHED_CONTACT, max_failures=0)
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:

@@ -73,7 +73,7 @@ def sound() -> dict[str, Any]:
         "depths": np.array([0.1]),
         "tables": {"contact": {"radius": 0.5}},
         "held_back": (0, 1),
-        "document": pad.document(),
+        "document": pad.to_dict(),
         "levels": (0, 1),
         "tolerance": 1e-2,
         "provenance": {},

@@ -99,7 +99,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
 
 def judged(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
-    asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
+    asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
     settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
     return score(pad, contact, **asked) | error_terms(
         expected_errors(pad, contact, settings, asked["size"]), pad.unit_mm

@@ -39,7 +39,7 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     _, shown = session(tmp_path, pad)
     assert [view["ready"] for view in shown] == [False, True]
     view = shown[-1]
-    size = PadSettings().of(pad.layout)
+    size = PadSettings().for_layout(pad.layout)
     assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
     assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size), abs=3e-4)
     assert np.mean(view["map"], axis=1) == pytest.approx(view["ambiguity"], abs=1e-4)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from padforge.design.contact import lattice, relative_stretch, signals
+from padforge.design.contact import grid_positions, relative_stretch, signals
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import expected_error as module
 from padforge.design.objectives.expected_error import (
@@ -268,7 +268,7 @@ def test_fibres_of_a_strip_are_compared_each_by_its_own_full_scale():
     """Those along a strip show a third of those across it; a localizer scales its inputs, and is no worse for it."""
     size = PadSettings(horizontals=3, verticals=12)
     weights = kernel_weights(size.layout)
-    stretch = relative_stretch(Morphology.straight(size.layout), lattice(size.sensed, 40), Contact())
+    stretch = relative_stretch(Morphology.straight(size.layout), grid_positions(size.sensed, 40), Contact())
     full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, Contact(), "beyond")
     assert (weights.numpy() * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
     assert kernel_weights(PadSettings(grid=4).layout).numpy() == pytest.approx(np.ones(8))
@@ -281,7 +281,7 @@ def test_fibres_of_a_strip_are_compared_each_by_its_own_full_scale():
 
 
 def test_responses_are_shares_of_the_length_in_full_scales_of_straight_fibres():
-    pad, presses = Morphology.random(3, knots=4, seed=2), lattice(((0.5, 0.5), (3.5, 3.5)), 9)
+    pad, presses = Morphology.random(3, knots=4, seed=2), grid_positions(((0.5, 0.5), (3.5, 3.5)), 9)
     stretch = relative_stretch(pad, presses, Contact())
     assert stretch * lengths(pad) == pytest.approx(signals(pad, presses, Contact()))
     scale = straight_full_scale(pad.layout, Contact(), "beyond")
@@ -305,7 +305,7 @@ def test_longer_fibres_of_the_same_signal_err_more():
         along = 0 if fibre < 2 else 1
         knots[fibre, :, along] = [0, 0.1, 0.2, 0.3, 1.5, 2.7, 2.8, 2.9, 3]
         knots[fibre, [1, 7], 1 - along] += 0.6
-    longer = Morphology.of_layout(knots, size.layout)
+    longer = Morphology.from_layout(knots, size.layout)
     narrow = Contact(sensitivity_profile=((0, 1), (1, 0.8), (2, 0.4), (3, 0.1), (4, 0)))
     search = SearchSettings(max_failures=1)
     a, b = (expected_errors(pad, narrow, search, size) for pad in (straight, longer))

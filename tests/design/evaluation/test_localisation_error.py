@@ -52,7 +52,7 @@ def test_the_result_depends_on_the_seed_and_not_on_the_cores(monkeypatch):
 
 @pytest.mark.parametrize("grid", [1, 4])
 def test_presses_to_test_on_are_others_than_those_learned(grid):
-    between = between_fibres(Layout.of(grid))
+    between = between_fibres(Layout.create(grid))
     learned, fresh = training_presses(between, 32, seed=0), fresh_presses(between, 2000, seed=0)
     low, high = (0.5, 1.5) if grid == 1 else (1, grid)
     assert not set(map(tuple, learned)) & set(map(tuple, fresh))

@@ -184,7 +184,7 @@ def test_a_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
     pad, rules = PadSettings(horizontals=2, verticals=1, bent_radius_mm=6.0), RulesSettings(min_bend_radius_mm=4.0)
     knots = refine(Morphology.straight(pad.layout).knots, 3, pad.layout)
     knots[0, 2, 1] += 0.13
-    origin = Morphology.of_layout(knots, pad.layout)
+    origin = Morphology.from_layout(knots, pad.layout)
     assert check_rules(origin, rules) == []
     assert check_rules(origin, rules, pad) != []
     result = search(pad, None, QUICK, rules, origin=origin)
