@@ -79,7 +79,7 @@ def run_search(
     pad, path = asked.pad, out / "morphology.json"
     check_replaceable(path, asked.made_by, remade, force)
     with progress() as bar:
-        run = replace(run or SearchOptions(), report=progress_callback(bar), keep_in=out / "search")
+        run = replace(run or SearchOptions(), on_progress=progress_callback(bar), keep_in=out / "search")
         wanted = pad, asked.contact, asked.settings, asked.rules
         if twin is None:
             result = search(*wanted, origin=asked.begin, run=run)

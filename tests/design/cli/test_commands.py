@@ -13,11 +13,11 @@ from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
-from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
-from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
 from padforge.design.run import load_result, search_lines
-from padforge.design.settings import PadSettings, SearchSettings
+from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nmax_failures = 1\n"
@@ -100,10 +100,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
 def judged(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
     asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
-    settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
-    return score(pad, contact, **asked) | error_terms(
-        expected_errors(pad, contact, settings, asked["size"]), pad.unit_mm
-    )
+    return score(pad, contact, **asked, scatter=Scatter(noise, 0.05, 0.5))
 
 
 @pytest.mark.slow
