@@ -115,7 +115,7 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
     """Return the contact designed for: the one that `spec` states, or the default of such a search."""
-    return spec.section(Contact) if spec.given(Contact) else settings.default_contact
+    return spec.section(Contact) if spec.stated(Contact) else settings.default_contact
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

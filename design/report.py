@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import read_json, reraise_as_input_error, unchanged
+from padforge.design.common.files import find_unchanged, read_json, reraise_as_input_error
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
@@ -118,7 +118,7 @@ def _misfits(
     made_by = document["provenance"]
     inputs, told = made_by.get("inputs", {}), f"{stage} ({made_by.get('command')})"
     made_of = inputs.get(PAD) if stage != "design" else document.get("morphology_sha256")
-    if isinstance(made_of, str) and (folder / PAD).is_file() and not unchanged(folder, {PAD: made_of}):
+    if isinstance(made_of, str) and (folder / PAD).is_file() and not find_unchanged(folder, {PAD: made_of}):
         yield f"{told} is of another pad than the {PAD} here"
     learnt_from = inputs.get("recording")
     if isinstance(learnt_from, str) and recording() not in (None, learnt_from):
@@ -199,7 +199,7 @@ def _inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
         if not isinstance(digest, str):
             yield f"{name}: {digest['command']}" if digest else name
         elif Path(name).name == name and (folder / name).is_file():  # no name leads to files of others
-            here = "the one here" if unchanged(folder, {name: digest}) else "not the one here"
+            here = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
             yield f"{name} {digest} ({here})"
         else:
             yield f"{name} {digest}"

@@ -139,7 +139,7 @@ class Run:
         from padforge.design.settings import Contact
 
         used = {name: self.spec.section(sections()[name]).model_dump(mode="json") for name in _SETTINGS[stage]}
-        stated = {"contact": self.spec.given(Contact)} if "contact" in used else {}
+        stated = {"contact": self.spec.stated(Contact)} if "contact" in used else {}
         return {"settings": used, "stated": stated, "seed": self.seed, "inputs": dict(inputs or {})}
 
     def left_s(self, share: float = 1.0, keep_s: float = 0.0) -> float | None:

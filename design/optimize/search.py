@@ -142,7 +142,7 @@ def search(
     states = checkpoints.begin(run.resume) if checkpoints else {}
     stop = Stop(begin, run.time_budget)
     finished = sum(bool(state["done"]) for state in states.values())
-    profiling.looked_at("starts", len(problem.starts) - finished, len(problem.starts))
+    profiling.add_count("starts", len(problem.starts) - finished, len(problem.starts))
     with profiling.stage("search"), stop_on_interrupt(stop), one_torch_thread():
         _advance(problem, states, stop, run, checkpoints)
         pads = _finish_starts(problem, states, stop)
@@ -319,7 +319,7 @@ def _advance(
         return None if last.done or stop else partial(advance_start, problem, start, last.state)
 
     abandoned = partial(stop.abandoned, is_remote=run.executor is not None)
-    for start, last in run_tasks(first_slices(), run.executor, then=next_slice, given_up=abandoned):
+    for start, last in run_tasks(first_slices(), run.executor, follow_up=next_slice, is_abandoned=abandoned):
         states[start] = last.state
         if checkpoints:
             checkpoints.save(start, last.state)

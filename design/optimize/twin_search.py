@@ -49,9 +49,9 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
     """
     twin = Twin.load(path)
-    if spec.given(Contact) and spec.section(Contact) != Contact():
+    if spec.stated(Contact) and spec.section(Contact) != Contact():
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
-    layout, stated = twin.morphology.layout, spec.given(PadSettings)
+    layout, stated = twin.morphology.layout, spec.stated(PadSettings)
     keys = {**layout.settings, **{key: stated[key] for key in LAYOUT_KEYS if key in stated}}
     if pad is not None:
         keys = {**pad.layout.settings}
@@ -62,7 +62,7 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         {
             "pad": keys | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
             "contact": twin.contact().model_dump(),
-            "search": {**spec.given(SearchSettings), **_scatter_settings(twin, size)},
+            "search": {**spec.stated(SearchSettings), **_scatter_settings(twin, size)},
         }
     )
 
