@@ -22,6 +22,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation, check_rules
+from padforge.design.objectives.score import describe_terms
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
 from padforge.design.plan_drawing import draw_plan
@@ -89,6 +90,7 @@ def run_search(
     document = {
         "format": "padforge-design/2",
         "terms": result.terms,
+        "descriptions": describe_terms(result.terms),
         "candidate": result.candidate,
         "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],

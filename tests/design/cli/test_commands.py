@@ -51,6 +51,7 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     result = load_result(Path("out/pad"))
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
+    assert document["descriptions"].keys() == document["terms"].keys()
     assert document["candidate"] == result.candidate == "straight fibres"
     assert search_lines(result, Path("out/pad"))[1:] == told[1:]
     first, second = straight_mm[:2]
