@@ -85,8 +85,8 @@ def run_search(
         if twin is None:
             result = search(*wanted, origin=asked.begin, run=run)
         else:
-            usual = spec.section(SearchSettings, **overrides)
-            result = search_for_twin(*wanted, usual, origin=asked.begin, run=run)
+            default = spec.section(SearchSettings, **overrides)
+            result = search_for_twin(*wanted, default, origin=asked.begin, run=run)
     document = {
         "format": "padforge-design/2",
         "terms": result.terms,

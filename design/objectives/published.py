@@ -200,13 +200,13 @@ def published_terms(
         positions = check_presses(presses)[0]
     contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
     shape = press_shape(contact, grid_unit_mm(pads, layout))
-    found = np.zeros((len(along), 3))
+    terms = np.zeros((len(along), 3))
 
     def work(begin: int, end: int) -> None:
-        terms_kernel(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, found)
+        terms_kernel(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
 
     map_chunks(work, len(along), min_chunk=8)
-    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
+    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in terms.tolist()]
 
 
 def published_objective(

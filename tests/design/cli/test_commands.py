@@ -109,7 +109,7 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(here, twin):
     _, document = designed("--twin", twin, spec=QUICK_SEARCH)
     used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
     assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
-    assert document["candidate"] in ("twin", "from usual", "usual", "straight fibres")
+    assert document["candidate"] in ("twin", "from default", "default", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
     assert document["terms"] == pytest.approx(judged(pad, contact, used["search"]["noise"]), rel=1e-9)
