@@ -12,22 +12,22 @@ function within(group, parts) { byId(group).replaceChildren(...parts) }
 function build(view, handlers) {
   const {scale, x, y} = frame(view), [wide, high] = view.cell_mm
   layers = {key: layerKey(view), cells: [], fibres: [], knots: []}
-  layers.cells = view.places_mm.map(([px, py]) => drawn("rect", {
+  layers.cells = view.places_mm.map(([px, py]) => svgElement("rect", {
     x: x(px - wide / 2), y: y(py + high / 2), width: wide * scale, height: high * scale,
   }))
   within("map", layers.cells)
   const [left, low, right, top] = view.sensed_mm
-  within("grid", [...gridParts(view), drawn("rect", {
+  within("grid", [...gridElements(view), svgElement("rect", {
     class: "sensed", x: x(left), y: y(top), width: (right - left) * scale, height: (top - low) * scale,
   })])
-  within("outs", view.keep_out_mm.map(corners => drawn("polygon", {
+  within("outs", view.keep_out_mm.map(corners => svgElement("polygon", {
     class: "out", points: corners.map(([px, py]) => `${x(px)},${y(py)}`).join(" "),
   })))
   layers.fibres = view.fibres.map((fibre, index) => {
-    const group = drawn("g", {class: `f${fibre.family}`})
-    const parts = ["halo", "course", "hit"].map(name => drawn("path", {class: name}))
+    const group = svgElement("g", {class: `f${fibre.family}`})
+    const parts = ["halo", "course", "hit"].map(name => svgElement("path", {class: name}))
     const [ex, ey] = fibre.knots.at(-1), across = fibre.family === 0
-    const name = drawn("text", {
+    const name = svgElement("text", {
       x: x(ex) + (across ? 5 : 0), y: y(ey) + (across ? 4 : -6), "text-anchor": across ? "start" : "middle",
     }, index + 1)
     parts[2].addEventListener("pointerdown", () => handlers.choose(index))
@@ -39,8 +39,8 @@ function build(view, handlers) {
   const order = view.fibres.map((fibre, index) => [fibre.family === view.deep ? 0 : 1, index]).sort((a, b) => a[0] - b[0] || a[1] - b[1])
   within("lines", order.map(([, index]) => layers.fibres[index].group))
   layers.knots = view.fibres.map((fibre, f) => fibre.knots.slice(1, -1).map((_, k) => {
-    const knot = drawn("g", {class: "knot", role: "button"})
-    knot.append(drawn("circle", {class: "grip", r: 13}), drawn("circle", {class: "dot", r: 4}))
+    const knot = svgElement("g", {class: "knot", role: "button"})
+    knot.append(svgElement("circle", {class: "grip", r: 13}), svgElement("circle", {class: "dot", r: 4}))
     knot.addEventListener("pointerdown", event => handlers.hold(f, k + 1, event))
     knot.addEventListener("focus", () => handlers.choose(f, k + 1))
     return knot
@@ -71,7 +71,7 @@ function update(view, chosen, limit, lost) {
   })
   within("places", view.rules.filter(rule => rule.place_mm).map(rule => {
     const cx = x(rule.place_mm[0]), cy = y(rule.place_mm[1])
-    return drawn("path", {class: "place", d: `M${cx - 6},${cy - 6}l12,12m0,-12l-12,12`})
+    return svgElement("path", {class: "place", d: `M${cx - 6},${cy - 6}l12,12m0,-12l-12,12`})
   }))
 }
 

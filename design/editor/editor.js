@@ -145,10 +145,10 @@ function options(id, texts) {
 function tellAnswer() {
   const broken = view.rules, families = ["horizontal", "vertical"]
   byId("rules").className = broken.length ? "" : "hold"
-  byId("rules").replaceChildren(...(broken.length ? broken.map(rule => rule.text) : ["all rules hold"]).map(text => made("li", "", text)))
+  byId("rules").replaceChildren(...(broken.length ? broken.map(rule => rule.text) : ["all rules hold"]).map(text => htmlElement("li", "", text)))
   byId("ambiguity").replaceChildren(...view.ambiguity.map((value, lost) => {
-    const row = made("tr", "", ""), straight = view.straight[lost]
-    row.append(made("th", "", lost), made("td", value < straight ? "better" : value > straight ? "worse" : "", value.toPrecision(3)), made("td", "", straight.toPrecision(3)))
+    const row = htmlElement("tr", "", ""), straight = view.straight[lost]
+    row.append(htmlElement("th", "", lost), htmlElement("td", value < straight ? "better" : value > straight ? "worse" : "", value.toPrecision(3)), htmlElement("td", "", straight.toPrecision(3)))
     return row
   }))
   options("lost", view.ambiguity.map((_, lost) => `${lost}`))
@@ -179,7 +179,7 @@ function draw() {
 function show(next) {
   byId("title").textContent = next.title
   const link = byId("link")
-  link.className = next.ended ? "lost" : ""
+  link.className = next.ended ? "disconnected" : ""
   link.textContent = next.ended || (next.ready ? "ready" : "getting ready: this takes a minute the first time")
   if (view && next.ended) view.ended = next.ended
   const begins = view?.session !== next.session
@@ -194,4 +194,4 @@ function show(next) {
   }
 }
 for (const each of document.querySelectorAll("button")) each.disabled = true
-follow(show)
+subscribe(show)
