@@ -10,7 +10,15 @@ from padforge.benchmarks import harness
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import LEARN, VALIDATE, ColumnScale, Loss, Network, PressSets, first_weights
+from padforge.design.networks import (
+    TRAINING_SHARE,
+    VALIDATION_SHARE,
+    FailureSet,
+    Network,
+    RangeScaler,
+    SimulatedPresses,
+    initial_weights,
+)
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT
 
@@ -29,33 +37,36 @@ def trials() -> Iterator[harness.BenchTrial]:
     """
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
-            trial = PressSets.of(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
+            trial = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
             losses = failure_subsets(len(pad.knots), LOST, SETS)
             judge = partial(_judge, trial, losses)
-            yield harness.BenchTrial(case, "batched", 0, partial(trial.learn, losses, HIDDEN), judge, items=SETS)
+            yield harness.BenchTrial(case, "batched", 0, partial(trial.fit, losses, HIDDEN), judge, items=SETS)
             yield harness.BenchTrial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)
 
 
-def _judge(trial: PressSets, losses: Sequence[Loss], networks: Sequence[Network]) -> Mapping[str, float]:
-    errors = [trial.errors(network, loss).mean() for network, loss in zip(networks, losses, strict=True)]
+def _judge(trial: SimulatedPresses, losses: Sequence[FailureSet], networks: Sequence[Network]) -> Mapping[str, float]:
+    errors = [trial.test_errors(network, loss).mean() for network, loss in zip(networks, losses, strict=True)]
     return {"error": float(np.mean(errors))}
 
 
-def _learn_plain(trial: PressSets, losses: Sequence[Loss]) -> list[Network]:
-    kept = [np.setdiff1d(np.arange(trial.recorded.shape[1]), loss) for loss in losses]
+def _learn_plain(trial: SimulatedPresses, losses: Sequence[FailureSet]) -> list[Network]:
+    kept = [np.setdiff1d(np.arange(trial.train_signals.shape[1]), loss) for loss in losses]
     rngs = [np.random.default_rng([2, 0, len(loss), *loss]) for loss in losses]
-    return [fit_plain(trial.recorded[:, left], trial.learned, rng) for left, rng in zip(kept, rngs, strict=True)]
+    return [
+        fit_plain(trial.train_signals[:, left], trial.train_positions, rng)
+        for left, rng in zip(kept, rngs, strict=True)
+    ]
 
 
 def fit_plain(inputs: Array, targets: Array, rng: np.random.Generator) -> Network:
     """`levenberg_marquardt.fit` as textbooks have it: whole Jacobian, all weights at once, damping in tens."""
-    into, onto = ColumnScale.of(inputs), ColumnScale.of(targets)
+    into, onto = RangeScaler.fit(inputs), RangeScaler.fit(targets)
     order = rng.permutation(len(inputs))
-    learnt = round(LEARN * len(inputs))
-    learn, held = order[:learnt], order[learnt : learnt + round(VALIDATE * len(inputs))]
-    x, y = np.column_stack([into.there(inputs), np.ones(len(inputs))]), onto.there(targets)
+    learnt = round(TRAINING_SHARE * len(inputs))
+    learn, held = order[:learnt], order[learnt : learnt + round(VALIDATION_SHARE * len(inputs))]
+    x, y = np.column_stack([into.transform(inputs), np.ones(len(inputs))]), onto.transform(targets)
     outputs, inner = y.shape[1], HIDDEN * x.shape[1]
-    first = first_weights(into.half > 0, HIDDEN, rng)
+    first = initial_weights(into.half > 0, HIDDEN, rng)
     weights = np.concatenate([first.ravel(), rng.uniform(-0.5, 0.5, outputs * (HIDDEN + 1))])
 
     def parts(weights: Array) -> tuple[Array, Array]:

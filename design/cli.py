@@ -292,7 +292,6 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     padforge design score out/pad/morphology.json --twin out/pad/twin.json
     """
     from padforge.design.morphology import Morphology
-    from padforge.design.objectives.expected_error import error_terms, expected_errors
     from padforge.design.objectives.rules import check_rules
     from padforge.design.objectives.score import score as score_terms
     from padforge.design.optimize.twin_search import settings_for_twin
@@ -303,9 +302,14 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
         settings = settings_for_twin(settings, twin, pad)
     search, rules = settings.section(SearchSettings), settings.section(RulesSettings)
     size = settings.section(PadSettings, **pad.layout.settings)
-    asked = settings.section(Contact), search.max_failures
-    terms = error_terms(expected_errors(pad, settings.section(Contact), search, size), pad.unit_mm)
-    terms |= score_terms(pad, *asked, rules=rules, size=size)
+    terms = score_terms(
+        pad,
+        settings.section(Contact),
+        search.max_failures,
+        rules=rules,
+        size=size,
+        scatter=search.response_scatter,
+    )
     found = [asdict(violation) for violation in check_rules(pad, rules, size)]
     show_result({"terms": terms, "violations": found}, [], as_json=True)
 

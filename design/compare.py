@@ -24,7 +24,7 @@ from padforge.design.common.plotting import (
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError, short_repr
-from padforge.design.contact_comparison import beside_straight, contact_of, errors_by_contact
+from padforge.design.contact_comparison import beside_straight, design_contact, errors_by_contact
 from padforge.design.morphology import Morphology
 from padforge.design.optimize.search import SearchOptions
 from padforge.design.paths.curves import crossings, lengths
@@ -146,11 +146,11 @@ def compare(pads: Sequence[Variant], out: Path, run: SearchOptions, seed: int | 
 def _row(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
     settings = variant.spec.section(SearchSettings, seed=seed)
     size = variant.spec.section(PadSettings, **pad.layout.settings)
-    contact = contact_of(variant.spec, settings)
+    contact = design_contact(variant.spec, settings)
     with stage("compare"):
-        asked = {"believed": contact}, size, settings.response_scatter, settings.seed
+        asked = {"assumed": contact}, size, settings.response_scatter, settings.seed
         found = errors_by_contact(beside_straight(pad), *asked)
-    errors = {each.pad: [pad.unit_mm * error.mean for error in each.errors] for each in found}
+    errors = {each.pad: list(each.errors_mm) for each in found}
     return {
         "name": variant.name,
         "fibres": list(pad.layout.counts),

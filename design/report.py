@@ -8,18 +8,6 @@ from padforge.design.common.files import find_unchanged, read_json, reraise_as_i
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
-_TERMS = {
-    "information": "mutual information of places and signals, bits",
-    "idle_share": "share of presses in which a fibre is idle",
-    "sharpness": "mean second difference of the signals along a serpentine",
-    "published_entropy": "joint entropy of each family's signals, added up, bits, as published",
-    "published_sharpness": "sharpness, as published",
-    "published_disorder": "disorder, as published",
-    "published_objective": "objective, as published",
-    "published_joint_entropy": "joint entropy of all fibres' signals, bits; 49 presses limit it to log2 49 = 5.61,"
-    " which straight fibres and all published pads reach",
-}
-
 
 def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """The fibres of a `design.json` in `folder`: plan, rules with their verdicts, terms of the objective.
@@ -29,6 +17,8 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         InputError: the plan is no picture.
     """
     terms, broken = document["terms"], document["violations"]
+    descriptions = document.get("descriptions", {})
+    described = [[name, value, descriptions.get(name, "")] for name, value in terms.items()]
     settings = document["provenance"]["settings"]
     pad, enforced = settings["pad"], settings["rules"]["enforce"]
     layout = PadSettings(**pad).layout
@@ -64,7 +54,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
             paragraph(f"Checked on the exact curves: {holds}."),
             table(["rule", "limit", "verdict", "setting"], list(_rules(settings["rules"], broken))),
             *([table(["broken rule", "fibres", "place (mm)", "measured", "limit"], _places(broken))] if broken else []),
-            collapsible("All terms of the objective", [table(["term", "value", "what it is"], list(_terms(terms)))]),
+            collapsible("All terms of the objective", [table(["term", "value", "what it is"], described)]),
         ],
         [
             (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
@@ -183,17 +173,6 @@ def _places(broken: Sequence[Mapping[str, Any]]) -> list[list[object]]:
     ]
 
 
-def _terms(terms: Mapping[str, float]) -> Iterator[list[object]]:
-    for name, value in terms.items():
-        if "_mm_" in name:
-            measure = name.split("_mm_")[0].replace("_", " ")
-            yield [name, value, f"{measure} with {name[-1]} fibres failed, mm"]
-        elif name.startswith("penalty_"):
-            yield [name, value, f"how far {name.removeprefix('penalty_')} is broken, as the search has it"]
-        else:
-            yield [name, value, _TERMS.get(name, "")]
-
-
 def _inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
     for name, digest in inputs.items():
         if not isinstance(digest, str):
@@ -203,3 +182,36 @@ def _inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
             yield f"{name} {digest} ({here})"
         else:
             yield f"{name} {digest}"
+
+
+def contact_line(document: Mapping[str, Any]) -> str:
+    """Summarise a `contacts.json`: errors with all fibres under the assumed contact, and their range under others."""
+    parts = []
+    for pad in ("designed", "straight"):
+        assumed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
+        parts.append(f"{assumed:.2f} mm under the assumed contact, {min(others):.2f} to {max(others):.2f} mm otherwise")
+    return f"contact: mean error of a small network {parts[0]}; of straight fibres {parts[1]}"
+
+
+def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+    """Return how the simulated errors in a `contacts.json` depend on the contact model.
+
+    Args:
+        folder: of the document.
+        document: as padforge writes it.
+
+    Raises:
+        KeyError, TypeError, ValueError: the document is not as padforge writes it.
+    """
+    rows, scatter = document["rows"], document["scatter"]
+    levels = range(max(len(row["errors_mm"]) for row in rows))
+    lead = (
+        "The contact is assumed until a printed pad is identified. Here the pad, and straight fibres of the same pad,"
+        " are simulated under other contacts as well: mean error in mm of a small network, trained afresh under each"
+        f" on one reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
+        f" {float(scatter['floor']):.1%} of full scale. Where rows differ, simulated errors depend on the contact as"
+        " much as on the pad; where straight fibres are better, optimising has not paid off."
+    )
+    head = ["contact", "fibres", *(f"{n_failed} failed" for n_failed in levels)]
+    body = [[row["contact"], row["pad"], *(f"{error:.2f}" for error in row["errors_mm"])] for row in rows]
+    return [PageSection("Contact model", [paragraph(lead), table(head, body)])]

@@ -19,9 +19,10 @@ from padforge.design.common.files import (
 from padforge.design.common.plotting import save_figure
 from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
-from padforge.design.contact_comparison import contact_of
+from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation, check_rules
+from padforge.design.objectives.score import describe_terms
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
 from padforge.design.plan_drawing import draw_plan
@@ -79,16 +80,17 @@ def run_search(
     pad, path = asked.pad, out / "morphology.json"
     check_replaceable(path, asked.made_by, remade, force)
     with progress() as bar:
-        run = replace(run or SearchOptions(), report=progress_callback(bar), keep_in=out / "search")
+        run = replace(run or SearchOptions(), on_progress=progress_callback(bar), keep_in=out / "search")
         wanted = pad, asked.contact, asked.settings, asked.rules
         if twin is None:
             result = search(*wanted, origin=asked.begin, run=run)
         else:
-            usual = spec.section(SearchSettings, **overrides)
-            result = search_for_twin(*wanted, usual, origin=asked.begin, run=run)
+            default = spec.section(SearchSettings, **overrides)
+            result = search_for_twin(*wanted, default, origin=asked.begin, run=run)
     document = {
         "format": "padforge-design/2",
         "terms": result.terms,
+        "descriptions": describe_terms(result.terms),
         "candidate": result.candidate,
         "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],
@@ -136,7 +138,7 @@ def _request(spec: "Spec", overrides: dict[str, Any], origin: str | None = None,
         begin, inputs = Morphology.load(origin), [*inputs, Path(origin)]
         overrides = overrides | {"knots": overrides.get("knots") or (begin.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
-    contact = contact_of(spec, settings)
+    contact = design_contact(spec, settings)
     made_by = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))  # as they are read
     used = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     made_by["settings"] = {name: section.model_dump(mode="json") for name, section in used.items()}

@@ -213,7 +213,7 @@ def run_stages(run: Run) -> int:
     What an earlier run has finished of the same is kept if `run.resume`.
     """
     from padforge.design.common.files import sha256
-    from padforge.design.contact_comparison import contact_line
+    from padforge.design.report import contact_line
     from padforge.design.run import search_lines
     from padforge.fabricate.cli import mould_lines
     from padforge.sense.report.calibration_results import calibration_lines

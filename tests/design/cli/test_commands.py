@@ -13,11 +13,11 @@ from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
-from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
-from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
 from padforge.design.run import load_result, search_lines
-from padforge.design.settings import PadSettings, SearchSettings
+from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nmax_failures = 1\n"
@@ -51,6 +51,7 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     result = load_result(Path("out/pad"))
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
+    assert document["descriptions"].keys() == document["terms"].keys()
     assert document["candidate"] == result.candidate == "straight fibres"
     assert search_lines(result, Path("out/pad"))[1:] == told[1:]
     first, second = straight_mm[:2]
@@ -100,10 +101,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
 def judged(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
     asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
-    settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
-    return score(pad, contact, **asked) | error_terms(
-        expected_errors(pad, contact, settings, asked["size"]), pad.unit_mm
-    )
+    return score(pad, contact, **asked, scatter=Scatter(noise, 0.05, 0.5))
 
 
 @pytest.mark.slow
@@ -111,7 +109,7 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(here, twin):
     _, document = designed("--twin", twin, spec=QUICK_SEARCH)
     used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
     assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
-    assert document["candidate"] in ("twin", "from usual", "usual", "straight fibres")
+    assert document["candidate"] in ("twin", "from default", "default", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
     assert document["terms"] == pytest.approx(judged(pad, contact, used["search"]["noise"]), rel=1e-9)

@@ -5,13 +5,12 @@ import pytest
 
 from padforge.design.contact_comparison import ContactErrors
 from padforge.design.morphology import Morphology
-from padforge.design.networks import FailureError
 from padforge.design.optimize import twin_search
 from padforge.design.optimize.search import SearchOptions
 from padforge.design.optimize.twin_search import choose, search_for_twin
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
+PLAIN = {"default": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
 
 
 @pytest.mark.parametrize(
@@ -19,8 +18,8 @@ PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0
     [
         ([0.9, 0.9, 1.0, 1.5], "twin"),  # better everywhere
         ([0.92, 1.02, 1.0, 1.0], "twin"),  # within what networks tell
-        ([1.02, 0.5, 0.5, 0.5], "usual"),  # far better with fibres failed, but an eighth worse with all alive
-        ([2.0, 2.0, 2.0, 3.5], "usual"),
+        ([1.02, 0.5, 0.5, 0.5], "default"),  # far better with fibres failed, but an eighth worse with all alive
+        ([2.0, 2.0, 2.0, 3.5], "default"),
     ],
 )
 def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
@@ -28,7 +27,7 @@ def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
 
 
 def test_choose_takes_the_least_bad_where_each_is_worse_somewhere():
-    errors = {"usual": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
+    errors = {"default": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
     assert choose(errors) == "twin"
 
 
@@ -42,20 +41,20 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
     monkeypatch.setattr("padforge.design.optimize.gradient.REPAIR_STEPS", 20)
 
     def judged(pads, contacts, size, scatter, seed, subsets):
-        assert set(pads) == ({"usual", "straight fibres", "twin", "from usual"} if expected != "twin" else {"twin"})
+        assert set(pads) == ({"default", "straight fibres", "twin", "from default"} if expected != "twin" else {"twin"})
         for name in pads:
-            errors = [FailureError(k, 1, 1.0 if name == "straight fibres" else 2.0, 0.0, 2.0) for k in range(2)]
-            yield ContactErrors("", name, tuple(errors))
+            errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)
+            yield ContactErrors("", name, errors)
 
     monkeypatch.setattr(twin_search, "errors_by_contact", lambda *asked: list(judged(*asked)))
     quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
     pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []
-    run = SearchOptions(report=lambda name, done, total, objective: steps.append(name))
+    run = SearchOptions(on_progress=lambda name, done, total, objective: steps.append(name))
     found = search_for_twin(pad, contact, quick, RulesSettings(**rules), quick, run=run)
     assert found.candidate == expected
     assert bool(found.violations) == (expected == "twin")
     if expected == "straight fibres":
         assert found.morphology == Morphology.straight(pad.layout)
         assert found.terms["expected_error_mm_0"] == pytest.approx(found.straight["expected_error_mm_0"], rel=1e-6)
-    assert {name.split(",")[0] for name in steps} == {"usual", "twin", "from usual"}
+    assert {name.split(",")[0] for name in steps} == {"default", "twin", "from default"}
