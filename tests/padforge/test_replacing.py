@@ -161,7 +161,7 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "words",
     [
         *(f"design {name} pad/morphology.json" for name in ("show", "check", "score", "edit")),
-        "design --from pad/morphology.json --out other",
+        "design --start-from pad/morphology.json --out other",
         "fabricate check pad/morphology.json",
         "fabricate pad/morphology.json --out other",
         *(f"sense {name} --model pad pad/recording.csv" for name in ("locate", "evaluate", "health")),

@@ -17,9 +17,9 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.fabricate.checks import plan_checks
 from padforge.fabricate.settings import FabricationSettings
-from padforge.run import Run, check_ahead, sections
+from padforge.run import Run, check_run, section_models
 
-MODELS = sections()
+MODELS = section_models()
 DEFAULTS = commented_toml(MODELS).encode()
 KEYS = [(name, key) for name, model in MODELS.items() for key in model.model_fields]
 VALUES = (
@@ -127,7 +127,7 @@ def extremes(draw: st.DrawFn, *sections: str) -> Spec:
 def test_a_whole_run_with_extreme_settings_is_checked_or_refused_in_one_line(path: Path, spec: Spec) -> None:
     assert EXTREMES["pad", "grid"] == [4, 1, 256]
     try:
-        check_ahead(Run(spec, path.parent / "none"))
+        check_run(Run(spec, path.parent / "none"))
     except InputError as error:
         one_line(error)
 

@@ -16,7 +16,7 @@ from padforge.design.common.settings import commented_toml
 from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
 from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
-from padforge.design.run import load_result, search_lines
+from padforge.design.design_run import load_result, summary_lines
 from padforge.design.settings import PadSettings, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
@@ -51,11 +51,11 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
     assert document["found_by"] == result.found_by == "straight fibres"
-    assert search_lines(result, Path("out/pad"))[1:] == told[1:]
+    assert summary_lines(result, Path("out/pad"))[1:] == told[1:]
     first, second = (11.25 * value for value in straight[:2])
     assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 fibres failed")
     assert (told[3].startswith("  these are straight fibres"), told[4:]) == (True, ["  all rules hold"])
-    alike = search_lines(replace(result, found_by="start 1"), Path("out/pad"))
+    alike = summary_lines(replace(result, found_by="start 1"), Path("out/pad"))
     assert alike[3].startswith("  no better than straight fibres")
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
