@@ -69,7 +69,9 @@ def search_progress() -> "Iterator[OnProgress]":
 @click.option("--start-from", metavar="random|straight|FILE", help="Initial fibres (default: random).")
 @twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Device that evaluates the objective.")
-@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Stop with the best pad after S seconds.")
+@click.option(
+    "--time-budget", type=click.FloatRange(min=0), metavar="S", help="Stop with the best pad after S seconds."
+)
 @click.option("--resume", is_flag=True, help="Continue an interrupted search into the same folder.")
 @scheduler_option
 @seed_option

@@ -187,7 +187,7 @@ def press_shape(contact: Contact, unit_mm: float) -> PressShape:
         Chains and extents in the frame of each family, and the law of its weight.
     """
     length = _LENGTHS[contact.length]
-    if contact.reach:
+    if contact.sensitivity_profile:
         points = contact.profile_points(unit_mm)
         end, profile = points[-1][0], geometry.profile_of(points)
         return *geometry.frames(end, None), geometry.Law(end, geometry.PROFILE, length, profile)

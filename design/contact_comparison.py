@@ -17,13 +17,13 @@ from padforge.design.networks import FailureError, PressSets, fresh_presses, tra
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.paths.keep_outs import outside
-from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
+from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
 WIDTHS = (5.0, 6.2, 7.9)
-"""Standard deviations of the reaches, about Gaussian, that a press may have, mm; that of MEASURED_REACH second."""
+"""Standard deviations of the reaches, about Gaussian, that a press may have, mm; that of MEASURED_PROFILE second."""
 SIDE, TEST, HIDDEN = 32, 500, 20
 """Presses a side to learn from, and fresh ones; neurons of a network: the 50 published ones learn the scatter by heart,
 and err a tenth more in more time."""
@@ -42,8 +42,8 @@ class ContactErrors:
 
 def contacts_in_question(believed: Contact) -> dict[str, Contact]:
     """The contact believed and others that a pad may really meet, by what they are called; none twice."""
-    spread = [(width, tuple((width / WIDTHS[1] * d, weight) for d, weight in MEASURED_REACH)) for width in WIDTHS]
-    others = {f"reach of {width:g} mm": Contact(reach=reach) for width, reach in spread}
+    spread = [(width, tuple((width / WIDTHS[1] * d, weight) for d, weight in MEASURED_PROFILE)) for width in WIDTHS]
+    others = {f"reach of {width:g} mm": Contact(sensitivity_profile=reach) for width, reach in spread}
     others["published disc, K = 0.6"] = PUBLISHED_CONTACT
     return {"as believed": believed} | {name: other for name, other in others.items() if other != believed}
 

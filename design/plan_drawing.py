@@ -91,8 +91,8 @@ def draw_plan(
 def _contact_patch(contact: Contact, unit_mm: float) -> Circle | Polygon:
     """Return the outline of a contact, or the circle at half of the largest weight of a measured profile."""
     style = {"color": INK, "alpha": 0.15, "linewidth": 0}
-    if contact.reach:
-        return Circle((0, 0), _half_width_mm(contact.reach), **style)
+    if contact.sensitivity_profile:
+        return Circle((0, 0), _half_width_mm(contact.sensitivity_profile), **style)
     radius = contact.radius * unit_mm
     if contact.sides is None:
         return Circle((0, 0), radius, **style)

@@ -17,8 +17,8 @@ TERMS = {
     "published_sharpness": "published: sharpness",
     "published_disorder": "published: disorder",
     "published_objective": "published: objective",
-    "published_joint_entropy": "joint entropy of the signals of all fibres, bits; 49 presses limit it to log2 49 = 5.61,"
-    " which straight fibres and all published pads reach",
+    "published_joint_entropy": "joint entropy of the signals of all fibres, bits; 49 presses limit it to log2 49 ="
+    " 5.61, which straight fibres and all published pads reach",
 }
 Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
 """Name of a stage, its document, and the function that writes the sections on it."""

@@ -164,7 +164,7 @@ def _two(name: str, values: Sequence[Any]) -> tuple[Any, Any]:
 Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *null_as("circle")]
 
 
-MEASURED_REACH = (
+MEASURED_PROFILE = (
     *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
     *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
 )
@@ -182,76 +182,76 @@ def _points(value: object) -> object:
 
 
 class Contact(Settings):
-    """`[contact]`: what a press does to a fibre: by a reach that was measured, or as published by a shape around it.
+    """`[contact]`: the contact model of a press: a measured sensitivity profile, or the published shape.
 
-    The signal of a fibre is the integral of a weight over its length: that of `reach` by distance d to the press
-    centre; or, where `reach` is empty, `weight` inside a regular polygon or circle (paper, formulas (1), (2)), which is
-    meant as well where `radius`, `sides` or `weight` are given and `reach` is not. Shapes are in grid units, as
-    published; a press that was measured is as wide in mm on pads of any pitch.
+    The signal of a fibre is the line integral of a weight along it. With a `sensitivity_profile` the weight is a
+    function of the distance d to the press centre. With an empty one it is `weight` inside a regular polygon or circle
+    (paper, formulas (1) and (2)); stating `radius`, `sides` or `weight` without a profile selects that as well. Shapes
+    are in grid units, as published; a measured press has the same width in mm on pads of any pitch.
 
     Attributes:
-        radius: circumradius K of the shape, > 0.
-        sides: D >= 3, or None for a circle ("circle" in pad.toml).
-        weight: "uniform" (1), "inverse_square" (1 / (K + d^2)) or "inverse" (1 / max(d, K / 100), which is the
-            paper's 1 / d kept finite within a hundredth of the radius).
-        length: "manhattan" (|dx| + |dy|, as the published code has it, and the default of shapes) or "euclidean", the
-            default of a reach.
-        reach: points (distance in mm, weight) from distance 0 to where the weight is 0 and stays so, joined by a cubic
-            spline over d^2, which may leave their range by MAX_OVERSHOOT. A weight may be below 0. MEASURED_REACH if
-            nothing of the contact is given.
+        radius: circumradius K of the shape, > 0; grid units.
+        sides: number of sides D >= 3, or None for a circle ("circle" in pad.toml).
+        weight: "uniform" (1), "inverse_square" (1 / (K + d^2)) or "inverse" (1 / max(d, K / 100): the paper's 1 / d,
+            kept finite within a hundredth of the radius).
+        length: "manhattan" (|dx| + |dy|, as in the published code; default of shapes) or "euclidean" (default of a
+            profile).
+        sensitivity_profile: points (distance in mm, weight) from distance 0 to the distance from which the weight is 0,
+            interpolated by a cubic spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be
+            negative. MEASURED_PROFILE if nothing of the contact is stated.
     """
 
-    radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, where reach is []")
-    sides: Sides = Field(default=30, description='sides D of the object, or "circle", where reach is []')
+    radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
+    sides: Sides = Field(default=30, description='sides D of the object, or "circle", of a shape')
     weight: Literal["uniform", "inverse_square", "inverse"] = Field(
-        default="uniform", description="weight of a fibre element where reach is []: 1, 1/(K + d^2) or 1/d"
+        default="uniform", description="weight of a fibre element in a shape: 1, 1/(K + d^2) or 1/d"
     )
     length: Literal["manhattan", "euclidean"] = Field(
         default="euclidean", description="length of a fibre element: euclidean, or |dx| + |dy| as published"
     )
-    reach: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
-        default=MEASURED_REACH, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]]; [] for a shape"
+    sensitivity_profile: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
+        default=MEASURED_PROFILE, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]]; [] for a shape"
     )
 
     @model_validator(mode="before")
     @classmethod
-    def _of_one_kind(cls, given: object) -> object:
-        """What is left out, by what is given: a shape as published, or a reach."""
-        given = to_builtins(given)  # `Settings` does so later, and an array says not whether it is empty
-        if not isinstance(given, Mapping):
-            return given
-        reach = given.get("reach", () if _SHAPE & given.keys() else MEASURED_REACH)
-        shape = isinstance(reach, list | tuple) and not reach
-        return {"reach": reach, "length": "manhattan" if shape else "euclidean", **given}
+    def _infer_kind(cls, stated: object) -> object:
+        """Fill in profile and length from the keys that are stated."""
+        stated = to_builtins(stated)  # `Settings` does so later, and the truth value of an array is ambiguous
+        if not isinstance(stated, Mapping):
+            return stated
+        profile = stated.get("sensitivity_profile", () if _SHAPE & stated.keys() else MEASURED_PROFILE)
+        is_shape = isinstance(profile, list | tuple) and not profile
+        return {"sensitivity_profile": profile, "length": "manhattan" if is_shape else "euclidean", **stated}
 
-    @field_validator("reach")
+    @field_validator("sensitivity_profile")
     @classmethod
-    def _ends_in_nothing(cls, reach: tuple[Point, ...], info: ValidationInfo) -> tuple[Point, ...]:
-        if not reach:
-            return reach
+    def _check_profile(cls, profile: tuple[Point, ...], info: ValidationInfo) -> tuple[Point, ...]:
+        if not profile:
+            return profile
         for name, value in info.data.items():
-            # else a radius that is set beside the reach `padforge init` has written would change nothing
+            # else a radius set beside the profile that `padforge init` has written would have no effect
             if name in _SHAPE and value != cls.model_fields[name].default:
-                raise ValueError(f"{name} is {value}, which counts where reach is []")
-        distances, weights = zip(*reach, strict=True)
-        if len(reach) < 3 or distances[0] != 0 or any(a >= b for a, b in pairwise(distances)):
+                raise ValueError(f"{name} is {value}, which counts where sensitivity_profile is []")
+        distances, weights = zip(*profile, strict=True)
+        if len(profile) < 3 or distances[0] != 0 or any(a >= b for a, b in pairwise(distances)):
             raise ValueError("it must be of 3 points or more, whose distances ascend from 0")
         if weights[-1] != 0 or not any(weights):
             raise ValueError("the last weight must be 0, and some other one not")
-        if reach != MEASURED_REACH:  # so that the default needs no SciPy, which takes a while to load
-            _check_overshoot(reach)
-        return reach
+        if profile != MEASURED_PROFILE:  # so that the default does not import SciPy, which takes a while
+            _check_overshoot(profile)
+        return profile
 
     def profile_points(self, unit_mm: float) -> tuple[Point, ...]:
-        """Return the measured profile as the kernels take it, on a pad of some grid unit.
+        """Convert the sensitivity profile to grid units.
 
         Args:
-            unit_mm: the pad's grid unit, mm.
+            unit_mm: grid unit of the pad, mm.
 
         Returns:
-            Points (distance in grid units, weight) of `reach`.
+            Points (distance in grid units, weight).
         """
-        return tuple((distance_mm / unit_mm, weight) for distance_mm, weight in self.reach)
+        return tuple((distance_mm / unit_mm, weight) for distance_mm, weight in self.sensitivity_profile)
 
 
 def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":

@@ -106,7 +106,7 @@ def press_signals(
         (F, Q), with the default weight and length in grid units.
     """
     given, shape = (travel, cross, slope, presses, ends), press_shape(contact, unit_mm)
-    if contact.reach:
+    if contact.sensitivity_profile:
         spaced = shape, spacing_of(contact.profile_points(unit_mm))
         return MeasuredSignals.apply(*given, spaced)  # pyright: ignore[reportReturnType]
     return ExactSignals.apply(*given, shape)  # pyright: ignore[reportReturnType]

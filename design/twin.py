@@ -212,7 +212,7 @@ class Twin:
     def contact(self) -> Contact:
         """The measured contact."""
         points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
-        return Contact(reach=tuple(points), length="euclidean")
+        return Contact(sensitivity_profile=tuple(points), length="euclidean")
 
     def left_out(self) -> str | None:
         """Say what of the measured pad no other pad is designed for, or simulated with; None if there is nothing."""

@@ -353,9 +353,7 @@ def _record(run: Run, cache: StageCache, design: "SearchResult", pad_digest: Map
         "recording",
         run.cache_key("recording", {**pad_digest, **({plan.name: sha256(plan)} if plan else {})}),
         lambda: Recording.open(folder),
-        lambda: record_simulated(
-            run.spec, design.morphology, folder, run.overrides, [run.out / PAD], replacing=True
-        ),
+        lambda: record_simulated(run.spec, design.morphology, folder, run.overrides, [run.out / PAD], replacing=True),
         lambda recording: ["recording"],
     )
 

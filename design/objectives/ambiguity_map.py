@@ -40,7 +40,7 @@ def ambiguity_map(
 
 def _signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
     """(Q, F) as precise as a search needs them."""
-    if not contact.reach:
+    if not contact.sensitivity_profile:
         return signals(pad, presses, contact)
     travel, cross, ends, _ = fibre_axes(pad)
     slope = population_slopes(travel, cross)[0]

@@ -165,7 +165,7 @@ def all_terms(
     broken = penalties(travel, cross, size, rules)
     terms = ambiguity_terms(spread) | {"information": information(pad, contact), "idle_share": idle_share(found)}
     terms["sharpness"] = sharpness_of(pad, contact, size)
-    shape = PUBLISHED_CONTACT if contact.reach else contact
+    shape = PUBLISHED_CONTACT if contact.sensitivity_profile else contact
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
     terms |= {f"published_{name}": value for name, value in asdict(published_terms(pad, shape)[0]).items()}
     levels = quantize(signals_quantized(pad, published_presses(pad.layout), shape))

@@ -200,7 +200,7 @@ class GradientSearch:
         pad, search, rules = problem.pad, problem.search, problem.rules
         if state is None:
             self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
-            gentle = bool(problem.contacts[0].reach)
+            gentle = bool(problem.contacts[0].sensitivity_profile)
             course = first_course(pad, rules, search.knots, problem.origin, start, self.rng, gentle)
             self.fibres = Fibres.through(course, pad.layout, border_of(pad, rules))
             self._optimiser = self._adam()

@@ -9,7 +9,7 @@ from padforge import design
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
 from padforge.design.common.settings import commented_toml
 from padforge.design.objectives.published import information
-from padforge.design.settings import MEASURED_REACH, PUBLISHED_CONTACT, Layout, sensed_rectangle
+from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Layout, sensed_rectangle
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -51,13 +51,25 @@ REFUSED = [
     (PadSettings, {"bent_radius_mm": 0.5}, "bent_radius_mm.*: got 0.5"),
     (PadSettings, {"bent_radius_mm": "round"}, "bent_radius_mm.*: got 'round'"),
     (Contact, {"weight": "cubic"}, "weight: got 'cubic', .*inverse_square"),
-    (Contact, {"reach": [[0, 1], [1, 0]]}, "reach: got .*3 points or more"),
-    (Contact, {"reach": [[0, 1], [1, 0.5], [1, 0]]}, "reach: .*distances ascend from 0"),
-    (Contact, {"reach": [[0, 1], [1, 0.5], [2, 0.1]]}, "reach: .*last weight must be 0"),
+    (Contact, {"sensitivity_profile": [[0, 1], [1, 0]]}, "sensitivity_profile: got .*3 points or more"),
+    (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [1, 0]]}, "sensitivity_profile: .*distances ascend from 0"),
+    (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [2, 0.1]]}, "sensitivity_profile: .*last weight must be 0"),
     # a profile whose spline leaves its points
-    (Contact, {"reach": [[0, 1], [0.5, 0.8], [0.51, 0.6], [1.2, 0]]}, "between the points at 0 and 0.5 mm .* 0.65 to"),
-    (Contact, {"reach": [[0, 10], [9, 10], [10, 0]]}, "between the points at 0 and 9 mm .* 20.5, allowed is 8"),
-    (Contact, {"reach": [[0, -1], [0.2, 1], [1, 0]]}, "between the points at 0.2 and 1 mm .* 7.48, allowed is"),
+    (
+        Contact,
+        {"sensitivity_profile": [[0, 1], [0.5, 0.8], [0.51, 0.6], [1.2, 0]]},
+        "between the points at 0 and 0.5 mm .* 0.65 to",
+    ),
+    (
+        Contact,
+        {"sensitivity_profile": [[0, 10], [9, 10], [10, 0]]},
+        "between the points at 0 and 9 mm .* 20.5, allowed is 8",
+    ),
+    (
+        Contact,
+        {"sensitivity_profile": [[0, -1], [0.2, 1], [1, 0]]},
+        "between the points at 0.2 and 1 mm .* 7.48, allowed is",
+    ),
     (SearchSettings, {"method": "luck"}, "method: got 'luck', .*descent"),
 ]
 
@@ -105,9 +117,9 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     assert (pad.grid, pad.horizontals, pad.verticals, pad.pitch_mm) == (4, None, None, 11.25)
     assert (pad.deep_family, pad.leads, pad.sensed_mm) == ("horizontal", "edges", "beyond")
     assert (pad.keep_out_mm, pad.bent_radius_mm) == ((), None)
-    published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "reach": ()}
+    published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "sensitivity_profile": ()}
     assert PUBLISHED_CONTACT.model_dump() == published
-    assert Contact().model_dump() == published | {"length": "euclidean", "reach": MEASURED_REACH}
+    assert Contact().model_dump() == published | {"length": "euclidean", "sensitivity_profile": MEASURED_PROFILE}
     assert (rules.enforce, rules.min_bend_radius_mm, rules.min_gap_mm, rules.border_mm) == (True, 1.0, 0.8, 2.0)
     assert (rules.same_family_crossings, rules.max_crossings, rules.min_crossing_angle_deg) == (0, None, 0.0)
     assert (rules.max_common_track_mm, rules.keep_out_mm, rules.max_length_mm) == (2.0, 1.5, 500.0)
@@ -159,20 +171,20 @@ def test_a_rectangle_is_what_was_stated_and_its_middle_is_pressed():
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
 
 
-def test_a_contact_given_by_its_shape_is_of_the_published_kind_and_has_no_reach_beside_it():
+def test_a_contact_given_by_its_shape_is_of_the_published_kind_and_has_no_profile():
     """As it was before contacts were measured, and where it is written out, whatever it is, it reads back so."""
     ways = (
-        ({}, MEASURED_REACH, "euclidean"),
-        ({"length": "manhattan"}, MEASURED_REACH, "manhattan"),
-        ({"reach": [[0, 1], [0.5, 0.25], [1, 0]]}, ((0, 1), (0.5, 0.25), (1, 0)), "euclidean"),
+        ({}, MEASURED_PROFILE, "euclidean"),
+        ({"length": "manhattan"}, MEASURED_PROFILE, "manhattan"),
+        ({"sensitivity_profile": [[0, 1], [0.5, 0.25], [1, 0]]}, ((0, 1), (0.5, 0.25), (1, 0)), "euclidean"),
         ({"radius": 0.6}, (), "manhattan"),
         ({"sides": "circle"}, (), "manhattan"),
         ({"weight": "inverse", "length": "euclidean"}, (), "euclidean"),
-        ({"reach": []}, (), "manhattan"),
+        ({"sensitivity_profile": []}, (), "manhattan"),
     )
-    for given, reach, length in ways:
-        contact = Spec({"contact": given}).section(Contact)
-        assert (contact.reach, contact.length) == (reach, length), given
+    for stated, profile, length in ways:
+        contact = Spec({"contact": stated}).section(Contact)
+        assert (contact.sensitivity_profile, contact.length) == (profile, length), stated
         assert Contact.model_validate_json(contact.model_dump_json()) == contact
         assert Contact.model_validate(contact.model_dump()) == contact
         search = SearchSettings(contacts=(contact, Contact(radius=0.9)))
@@ -182,23 +194,27 @@ def test_a_contact_given_by_its_shape_is_of_the_published_kind_and_has_no_reach_
         )
     stated = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
     for shape in ({"radius": 0.9}, {"sides": "circle"}, {"weight": "inverse"}):
-        with pytest.raises(InputError, match=r"\[contact\] reach: .*which counts where reach is \[\]"):
+        with pytest.raises(
+            InputError, match=r"\[contact\] sensitivity_profile: .*which counts where sensitivity_profile is \[\]"
+        ):
             Spec({"contact": stated | shape}).section(Contact)
-        assert Spec({"contact": stated | shape | {"reach": []}}).section(Contact).reach == ()
+        assert (
+            Spec({"contact": stated | shape | {"sensitivity_profile": []}}).section(Contact).sensitivity_profile == ()
+        )
 
 
 def test_the_measured_profile_is_about_a_gaussian_and_one_with_a_skirt_below_0_is_a_contact():
     distance = [d for d, _ in Contact().profile_points(11.25)]
     assert distance == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.65]  # to the bit
-    assert [d for d, _ in Contact().profile_points(5.0)] == [d / 5 for d, _ in MEASURED_REACH]
-    for d, weight in MEASURED_REACH:
+    assert [d for d, _ in Contact().profile_points(5.0)] == [d / 5 for d, _ in MEASURED_PROFILE]
+    for d, weight in MEASURED_PROFILE:
         assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
     for points in (5, 13, 40):
         for skirt in (0.0, 0.3):
             distance = np.linspace(0, 18, points)
             weight = np.exp(-0.5 * (distance / 5) ** 2) - skirt * np.exp(-0.5 * ((distance - 13) / 2.5) ** 2)
-            reach = np.column_stack([distance, np.append(weight[:-1], 0)])
-            assert len(Contact(reach=reach).reach) == points  # pyright: ignore[reportArgumentType]
+            profile = np.column_stack([distance, np.append(weight[:-1], 0)])
+            assert len(Contact(sensitivity_profile=profile).sensitivity_profile) == points  # pyright: ignore[reportArgumentType]
 
 
 HOLE = [[0, 0], [4, 0], [0, 4]]
@@ -211,7 +227,11 @@ HOLE = [[0, 0], [4, 0], [0, 4]]
         (PadSettings, {"pitch_mm": np.array([8, 15.0])}, {"pitch_mm": (8, 15.0)}),
         (PadSettings, {"keep_out_mm": [np.array(HOLE)]}, {"keep_out_mm": [HOLE]}),
         (Contact, {"radius": np.float64(0.9), "sides": np.int32(4)}, {"radius": 0.9, "sides": 4}),
-        (Contact, {"reach": np.array([[0, 1], [5, 0.5], [12, 0]])}, {"reach": ((0, 1), (5, 0.5), (12, 0))}),
+        (
+            Contact,
+            {"sensitivity_profile": np.array([[0, 1], [5, 0.5], [12, 0]])},
+            {"sensitivity_profile": ((0, 1), (5, 0.5), (12, 0))},
+        ),
         (SearchSettings, {"lost": np.array([0.5, 0.5]), "seed": np.uint32(7)}, {"lost": (0.5, 0.5), "seed": 7}),
         (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
         (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
@@ -224,7 +244,8 @@ def test_numbers_of_numpy_are_numbers(model, given, plain):
 
 @pytest.mark.parametrize("shape", [(2**9, 2**9), (2**40, 2), (2**18, 0)])
 @pytest.mark.parametrize(
-    ("model", "key"), [(PadSettings, "pitch_mm"), (PadSettings, "keep_out_mm"), (Contact, "reach"), (Contact, "radius")]
+    ("model", "key"),
+    [(PadSettings, "pitch_mm"), (PadSettings, "keep_out_mm"), (Contact, "sensitivity_profile"), (Contact, "radius")],
 )
 def test_arrays_larger_than_any_setting_are_refused_before_they_are_lists(model, key, shape):
     """A broadcast array takes no memory; as a list it would take all there is."""

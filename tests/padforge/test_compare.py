@@ -34,7 +34,7 @@ def test_values_in_turn_are_designed_each_in_its_folder(tmp_path):
     folders = sorted(path.name for path in (tmp_path / "c").iterdir() if path.is_dir())
     assert folders == ["grid-1-pitch_mm-8-x-12", "grid-1-pitch_mm-9"]
     assert "grid 1, pitch_mm 8 x 12" in result.out
-    assert "1 lost (mm)" in result.out
+    assert "1 failed (mm)" in result.out
     pad = Morphology.load(tmp_path / "c" / folders[0] / "morphology.json")
     assert (pad.layout.counts, pad.pitch_mm) == ((1, 1), (8.0, 12.0))
 
@@ -44,7 +44,7 @@ def test_no_two_pads_share_a_folder_and_none_leaves_that_of_the_comparison(tmp_p
         Morphology.straight(1).save(tmp_path / name)
     result = called("design", "compare", "a b.json", "a-b.json", cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "a-b: one of this name" in result.err
+    assert "a-b: two pads have this name" in result.err
     assert comparison.Variant("..", Spec({})).folder == "pad"
 
 
@@ -56,7 +56,7 @@ def test_folders_are_such_as_every_system_takes_and_tells_apart(tmp_path):
         Morphology.straight(1).save(tmp_path / name)
     result = called("design", "compare", "one.json", "ONE.json", cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "one: one of this name" in result.err
+    assert "one: two pads have this name" in result.err
 
 
 def test_ctrl_c_ends_the_comparison_and_not_one_search_alone(tmp_path, monkeypatch):
@@ -66,7 +66,7 @@ def test_ctrl_c_ends_the_comparison_and_not_one_search_alone(tmp_path, monkeypat
         begun.append(folder)
         return {}, SimpleNamespace(stopped="interrupted")
 
-    monkeypatch.setattr(comparison, "run_search", interrupted)
+    monkeypatch.setattr(comparison, "run_design", interrupted)
     result = called("design", "compare", "--vary", "pad.grid=1,2", cwd=tmp_path)
     assert (result.code, len(begun)) == (130, 1)
 
@@ -74,13 +74,13 @@ def test_ctrl_c_ends_the_comparison_and_not_one_search_alone(tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ((), "these are 1 pads to compare"),
+        ((), "there are 1 pads to compare"),
         (("--vary", "grid=3"), "SECTION.KEY=VALUE"),
-        (("--vary", "pad.grid=3,"), "these are 1 pads"),
-        (("--vary", "pad.grid=three,4"), "none of TOML"),
+        (("--vary", "pad.grid=3,"), "there are 1 pads"),
+        (("--vary", "pad.grid=three,4"), "not TOML"),
         (("--vary", "pad.grid=0,4"), "greater than or equal to 1"),
         (("--vary", "pads.grid=3,4"), "pads"),
-        (("--vary", "pad.grid=3,3"), "one of this name"),
+        (("--vary", "pad.grid=3,3"), "two pads have this name"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_before_a_search_begins(tmp_path, given, said):

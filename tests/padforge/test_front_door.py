@@ -52,7 +52,9 @@ def test_init_writes_the_world_of_the_paper_if_asked(tmp_path: Path) -> None:
     assert called("init", "--preset", "published", cwd=tmp_path).code == 0
     spec = Spec.load(tmp_path / "pad.toml")
     assert spec.section(PadSettings) == PadSettings(sensed_mm="fibres")
-    assert spec.section(Contact) == Contact(radius=0.6, sides=30, weight="uniform", length="manhattan", reach=())
+    assert spec.section(Contact) == Contact(
+        radius=0.6, sides=30, weight="uniform", length="manhattan", sensitivity_profile=()
+    )
     assert spec.section(SearchSettings) == SearchSettings(noise=0.005, scatter=0.0)
     assert spec.section(RulesSettings) == RulesSettings(max_common_track_mm=None)
     assert called("init", "other.toml", "--preset", "mine", cwd=tmp_path).code == 2

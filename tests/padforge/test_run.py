@@ -20,7 +20,7 @@ from padforge.design.common.files import sha256
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
 
-ALL = "fibres, mould, recording, contacts, calibration"
+ALL = "design, mould, recording, contacts, calibration"
 VOLATILE = ("design.json", "run.json", "report.html")
 """With seconds in them, and digests of these."""
 
@@ -33,8 +33,8 @@ def resumed(folder: Path, *more: str) -> str:
     """Go on; what is said to be kept of the earlier run."""
     ended = called("run", "--resume", *more, cwd=folder)
     assert ended.code == 0, ended
-    kept = [line for line in ended.err.splitlines() if "kept as an earlier run has made it" in line]
-    return kept[0].partition("made it: ")[2] if kept else ""
+    kept = [line for line in ended.err.splitlines() if "reused from an earlier run" in line]
+    return kept[0].partition("earlier run: ")[2] if kept else ""
 
 
 def breaks(*_: object, **__: object) -> None:
@@ -94,7 +94,7 @@ def test_of_a_finished_run_nothing_is_done_anew(folder: Path) -> None:
 
 def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing of an earlier run counts as finished once it has begun."""
-    monkeypatch.setattr(padforge.run, "_designed", breaks)
+    monkeypatch.setattr(padforge.run, "_design", breaks)
     assert called("run", cwd=folder).code == 130
     assert not (folder / "out" / "pad" / "run.json").exists()
 
@@ -102,9 +102,9 @@ def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("old", "new", "more", "kept", "others"),
     [
-        ("epochs = 4", "epochs = 5", (), "fibres, mould, recording, contacts", set()),
-        ("presses = 80", "presses = 90", (), "fibres, mould, contacts", {"recording"}),
-        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "fibres, recording, contacts, calibration", {"mould.stl"}),
+        ("epochs = 4", "epochs = 5", (), "design, mould, recording, contacts", set()),
+        ("presses = 80", "presses = 90", (), "design, mould, contacts", {"recording"}),
+        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "design, recording, contacts, calibration", {"mould.stl"}),
         pytest.param("", "", ("--seed", "1"), "", {"recording"}, marks=pytest.mark.slow),
     ],
 )
@@ -123,7 +123,7 @@ def test_a_file_that_is_gone_or_another_one_is_made_anew(folder: Path) -> None:
     (folder / "out" / "pad" / "mould.stl").unlink()
     (folder / "out" / "pad" / "localizer.safetensors").write_bytes(b"torn")
     (folder / "out" / "pad" / "recording" / "readings.bin").write_bytes(b"")
-    assert resumed(folder) == "fibres, contacts"
+    assert resumed(folder) == "design, contacts"
     assert digests(folder) == before
 
 
@@ -136,7 +136,7 @@ def test_a_broken_off_calibration_is_all_that_is_done_again(
     with monkeypatch.context() as patch:
         patch.setattr(padforge.sense.cli.calibration, "run_calibration", breaks)
         assert called("run", cwd=tmp_path).code == 130
-    assert resumed(tmp_path) == "fibres, mould, recording, contacts"
+    assert resumed(tmp_path) == "design, mould, recording, contacts"
     assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
 
 
@@ -238,10 +238,10 @@ def test_a_time_budget_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(given) == 1
     assert 0 <= given[0] < 8
     again = called(*words, "--resume", cwd=tmp_path)
-    assert f"made it: {ALL}" in again.err, again
+    assert f"earlier run: {ALL}" in again.err, again
 
 
-@pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/1"}', '{"format": "padforge-run/1", "stages": 3}'])
+@pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/2"}', '{"format": "padforge-run/2", "stages": 3}'])
 def test_a_note_that_is_none_of_padforge_is_named(folder: Path, content: str) -> None:
     (folder / "out" / "pad" / "run.json").write_text(content)
     assert "run.json: " in refused("run", "--resume", cwd=folder)

@@ -13,10 +13,10 @@ from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
+from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
 from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
-from padforge.design.design_run import load_result, summary_lines
 from padforge.design.settings import PadSettings, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
@@ -53,10 +53,10 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     assert document["found_by"] == result.found_by == "straight fibres"
     assert summary_lines(result, Path("out/pad"))[1:] == told[1:]
     first, second = (11.25 * value for value in straight[:2])
-    assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 fibres failed")
-    assert (told[3].startswith("  these are straight fibres"), told[4:]) == (True, ["  all rules hold"])
+    assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
+    assert (told[3].startswith("  the search found no better pad"), told[4:]) == (True, ["  all rules hold"])
     alike = summary_lines(replace(result, found_by="start 1"), Path("out/pad"))
-    assert alike[3].startswith("  no better than straight fibres")
+    assert alike[3].startswith("  not significantly better than straight fibres")
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
         Path("out/pad/design.json").write_text(json.dumps(document | change))
@@ -88,7 +88,7 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
     assert (used.noise, used.scatter, used.scatter_common) == (pytest.approx(0.8 * 0.02 / (0.1 * scale)), 0.05, 0.5)
     assert (used.knots, pad.grid, pad.pitch_mm, pad.sensed_mm) == (2, 2, 10, (18, 30))
     wider = settings_for_twin(Spec({"pad": {"pitch_mm": 20.0}}), twin)
-    assert wider.section(Contact).reach[-1] == (15, 0)
+    assert wider.section(Contact).sensitivity_profile[-1] == (15, 0)
     assert (wider.section(PadSettings).pitch_mm, wider.section(PadSettings).sensed_mm) == (20, (18, 31.5))
     Morphology.straight(2, 10.0).save(here / "pad.json")
     scored = CliRunner().invoke(design, ["score", "pad.json", "--twin", str(twin)], catch_exceptions=False)

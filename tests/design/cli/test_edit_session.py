@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
 from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
-from padforge.design.editor.edits import Answers
+from padforge.design.editor.edits import PathEvaluator
 from padforge.design.editor.session import EditSession
 from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
 
@@ -20,8 +20,8 @@ def session(tmp_path, pad=None, **size):
         source = tmp_path / "pad.json"
         pad.save(source)
         size = dict(pad.layout.settings)
-    judged = Answers(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(lost=1))
-    begun = EditSession(judged, source, tmp_path / "out.json", shown.append)
+    evaluator = PathEvaluator(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(lost=1))
+    begun = EditSession(evaluator, source, tmp_path / "out.json", shown.append)
     begun.begin()
     return begun, shown
 
@@ -41,8 +41,9 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     view = shown[-1]
     size = PadSettings().of(pad.layout)
     assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
-    assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size), abs=3e-4)
-    assert np.mean(view["map"], axis=1) == pytest.approx(view["ambiguity"], abs=1e-4)
+    ambiguity = np.array(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size))
+    assert view["ambiguity_mm"] == pytest.approx(pad.unit_mm * ambiguity, abs=3e-3)
+    assert np.mean(view["ambiguity_map_mm"], axis=1) == pytest.approx(view["ambiguity_mm"], abs=1e-4)
     assert np.array(view["fibres"][2]["knots"]) == pytest.approx(pad.to_mm(pad.knots[2]), abs=1e-4)
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
 
@@ -75,7 +76,7 @@ def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
     begun, shown = session(tmp_path, Morphology.random(2, 5, 3))
     before = shown[-1]
     more = ask(begun, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
-    fibre, knot = more["at"]
+    fibre, knot = more["selected"]
     assert (fibre, len(more["fibres"][1]["knots"])) == (1, 8)
     assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
     for each in (0, 2, 3):
@@ -93,7 +94,7 @@ def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
     ask(begun, do="add", fibre=1)
     move(begun, 1, 1, -10.0, 2.0)
     saved = begun.save(b"{}")
-    assert (saved["unsaved"], saved["told"]) == (False, f"saved to {tmp_path / 'out.json'}")
+    assert (saved["unsaved"], saved["message"]) == (False, f"saved to {tmp_path / 'out.json'}")
     pad = Morphology.load(tmp_path / "out.json")
     assert pad.to_mm(pad.knots[0])[1] == pytest.approx(saved["fibres"][0]["knots"][1], abs=1e-4)
     assert saved["fibres"][0]["knots"][1][1] == 2.0
@@ -126,9 +127,9 @@ def test_what_cannot_be_done_is_told_and_changes_nothing(tmp_path):
     assert len(shown) == 2
     assert ask(begun, do="undo")["fibres"] == shown[1]["fibres"]
     begun, _ = session(tmp_path, Morphology.straight(1))
-    assert ask(begun, do="add", fibre=1)["at"] == (0, 1)
+    assert ask(begun, do="add", fibre=1)["selected"] == (0, 1)
     ask(begun, do="remove", fibre=1, knot=1)
-    with pytest.raises(InputError, match="no knot"):
+    with pytest.raises(InputError, match="no inner knot"):
         ask(begun, do="remove", fibre=1, knot=1)
     most = Morphology.random(1, 64, 0)
     full, _ = session(tmp_path, most)
@@ -162,7 +163,7 @@ def test_a_pad_that_a_mould_was_made_from_stays(tmp_path):
     begun.save(b"{}")  # as it is
     before = (tmp_path / "out.json").read_bytes()
     ask(begun, do="add", fibre=1)
-    assert begun.save(b"{}")["told"] == f"saved to {tmp_path / 'out-2.json'}"
+    assert begun.save(b"{}")["message"] == f"saved to {tmp_path / 'out-2.json'}"
     assert (tmp_path / "out.json").read_bytes() == before
     with pytest.raises(InputError, match=r"out.json: fabrication.json was made from it"):
         session(tmp_path)

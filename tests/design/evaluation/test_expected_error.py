@@ -306,7 +306,7 @@ def test_longer_fibres_of_the_same_signal_err_more():
         knots[fibre, :, along] = [0, 0.1, 0.2, 0.3, 1.5, 2.7, 2.8, 2.9, 3]
         knots[fibre, [1, 7], 1 - along] += 0.6
     longer = Morphology.of_layout(knots, size.layout)
-    narrow = Contact(reach=((0, 1), (1, 0.8), (2, 0.4), (3, 0.1), (4, 0)))
+    narrow = Contact(sensitivity_profile=((0, 1), (1, 0.8), (2, 0.4), (3, 0.1), (4, 0)))
     search = SearchSettings(lost=1)
     a, b = (expected_errors(pad, narrow, search, size) for pad in (straight, longer))
     assert np.all(np.array(b) > a)

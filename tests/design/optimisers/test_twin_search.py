@@ -49,7 +49,7 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
 
     monkeypatch.setattr(twin_search, "errors_by_contact", lambda *asked: list(judged(*asked)))
     quick = SearchSettings(knots=3, starts=1, steps=2, lost=1)
-    pad, contact = PadSettings(grid=1), Contact(reach=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
+    pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []
     run = SearchOptions(report=lambda name, done, total, objective: steps.append(name))
     found = search_for_twin(pad, contact, quick, RulesSettings(**rules), quick, run=run)

@@ -31,7 +31,7 @@ REACHES = {
 
 def contact_of(reach, length: Length = "euclidean"):
     """The contact on pads of the default pitch."""
-    return Contact(reach=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
+    return Contact(sensitivity_profile=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
 
 
 def pads():
@@ -123,7 +123,7 @@ def test_signals_of_any_reach_on_wild_pads_lie_within_the_whole_fibre_at_its_hea
     waves = np.cos(np.pi * rng.uniform(0, 2) * distance / end_mm) * (1 - distance / end_mm) ** 2
     weight = rng.choice([-1e3, -1.0, 1e-3, 1.0]) * waves
     for length in LENGTHS:
-        contact = Contact(reach=np.column_stack([distance, weight]).tolist(), length=length)
+        contact = Contact(sensitivity_profile=np.column_stack([distance, weight]).tolist(), length=length)
         found = signals(pad, wild_presses(pad, seed), contact)
         spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
         heaviest = np.abs(spline(np.linspace(0, end_mm, 2000) ** 2)).max()

@@ -22,9 +22,9 @@ CONTACTS = [
     Contact(sides=None, weight="inverse_square", length="euclidean"),
     Contact(weight="inverse"),
     Contact(sides=None, weight="inverse", length="euclidean"),
-    Contact(reach=REACH),
-    Contact(reach=REACH, length="euclidean"),
-    Contact(reach=((0.0, -0.3), (2.3, -0.5), (4.0, -0.35), (5.6, 0.1), (6.8, 0.2), (10.1, 0.0))),
+    Contact(sensitivity_profile=REACH),
+    Contact(sensitivity_profile=REACH, length="euclidean"),
+    Contact(sensitivity_profile=((0.0, -0.3), (2.3, -0.5), (4.0, -0.35), (5.6, 0.1), (6.8, 0.2), (10.1, 0.0))),
 ]
 
 
@@ -60,7 +60,9 @@ def taylor_ratio(contact, seed):
     return left[0] / left[1]
 
 
-@pytest.mark.parametrize("contact", CONTACTS, ids=lambda c: f"{len(c.reach) or c.sides}-{c.weight}-{c.length}")
+@pytest.mark.parametrize(
+    "contact", CONTACTS, ids=lambda c: f"{len(c.sensitivity_profile) or c.sides}-{c.weight}-{c.length}"
+)
 def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(contact):
     assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
 

@@ -42,7 +42,7 @@ def test_a_file_brings_a_twin_back(twin, tmp_path):
         for name in ("channels", "frame", "noise", "sensed_mm", "presses", "readings", "scatter", "morphology"):
             assert getattr(back, name) == getattr(each, name)
         assert back.contact() == each.contact()
-        assert back.contact().reach == tuple(zip(each.distance_mm, each.weight, strict=True))
+        assert back.contact().sensitivity_profile == tuple(zip(each.distance_mm, each.weight, strict=True))
         assert back.contact().length == "euclidean"
         assert back.laid_stretch(PLACES) == pytest.approx(each.laid_stretch(PLACES), abs=1e-3)
     assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/2"

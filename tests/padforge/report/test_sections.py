@@ -99,7 +99,7 @@ def test_straight_fibres_stand_beside_the_design(pad: Path) -> None:
 
 
 def error_rows(text: str) -> list[list[str]]:
-    table = text.partition("Errors by lost fibres")[2].partition("</table>")[0]
+    table = text.partition("Errors by failed fibres")[2].partition("</table>")[0]
     return [re.findall(r"<td.*?>(.*?)</td>", row) for row in table.split("<tr>")[2:]]
 
 
@@ -137,7 +137,7 @@ def test_provenance_says_which_inputs_are_the_ones_here(pad: Path) -> None:
         write_report(pad)
     text = (pad / "report.html").read_text()
     assert "(not the one here)" in text
-    assert text.index("Does not belong together") < text.index("Design rules"), "first thing on the page"
+    assert text.index("Files of different pads") < text.index("Design rules"), "first thing on the page"
 
 
 def test_plans_of_another_pad_are_told(pad: Path) -> None:
@@ -162,7 +162,7 @@ def test_errors_on_another_recording_are_told(pad: Path) -> None:
         written(pad / "calibration.json", document)
         with pytest.raises(Fault, match=r"calibration .* is of another recording") if strange else nullcontext():
             write_report(pad)
-    assert "Does not belong together" in (pad / "report.html").read_text()
+    assert "Files of different pads" in (pad / "report.html").read_text()
     (pad / "recording" / "readings.bin").unlink()
     write_report(pad)
 

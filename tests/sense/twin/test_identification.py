@@ -49,7 +49,7 @@ def require_printed(found: Identification, printed: Twin) -> None:
     assert twin.frame.mirrored
     assert twin.frame.turn_deg == pytest.approx(printed.frame.turn_deg, abs=4)
     assert twin.frame.shift_mm == pytest.approx(printed.frame.shift_mm, abs=1.0)
-    told, true = twin.contact().reach, printed.contact().reach
+    told, true = twin.contact().sensitivity_profile, printed.contact().sensitivity_profile
     at = np.linspace(0, 13.5, 7)
     assert np.interp(at, *np.array(told).T) == pytest.approx(np.interp(at, *np.array(true).T), abs=0.15)
     assert found.explained.mean() > 0.95

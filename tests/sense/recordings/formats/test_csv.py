@@ -207,6 +207,6 @@ def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path, monkeypatch: py
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
     with pytest.raises(InputError, match="line 9002 holds no numbers"):
         import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
-    monkeypatch.setattr(csv_table, "MOST_VALUES", 100)
+    monkeypatch.setattr(csv_table, "MAX_VALUES", 100)
     with pytest.raises(InputError, match="more than 100 values"):
         import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
