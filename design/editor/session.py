@@ -189,8 +189,8 @@ class EditSession:
             InputError: the file cannot be written.
         """
         with self._lock:
-            in_use = self.unsaved and not self._force and find_dependents(self.out)
-            if self.out.is_file() and (in_use or not self._out_is_ours):
+            replaces = self._out_is_ours and (self._force or not self.unsaved or not find_dependents(self.out))
+            if self.out.is_file() and not replaces:
                 self.out = free_name(self.out)
             pad = self._evaluator.to_morphology(self._history.paths)
             Morphology.of_layout(pad.knots, pad.layout, self._provenance).save(self.out)
