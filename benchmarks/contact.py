@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.contact import quantized_and_samples, signals_and_spans, signals_sparse
+from padforge.design.contact import quantized_signals_and_samples, signals_and_spans, signals_sparse
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
@@ -129,7 +129,7 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTr
     for samples in SAMPLES:
         plain = partial(plain_signals, pad, presses, contact, samples)
         scan = partial(scanned_signals, pad.knots, presses, contact.radius, contact.sides or 0, samples)
-        cull = partial(quantized_and_samples, pad, presses, contact, samples)
+        cull = partial(quantized_signals_and_samples, pad, presses, contact, samples)
         yield BenchTrial(case, "plain", samples, plain, evaluate)
         yield BenchTrial(case, "scanned", samples, scan, evaluate)
         yield BenchTrial(

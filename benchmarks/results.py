@@ -129,7 +129,9 @@ def _medians(rows: Sequence[Row]) -> list[Row]:
         groups.setdefault((row["case"], row["way"], row["size"]), []).append(row)
     medians = []
     for (case, way, size), group in groups.items():
-        values = {name: [row[name] for row in group if row[name] is not None] for name in ("error", "seconds", "visited")}
+        values = {
+            name: [row[name] for row in group if row[name] is not None] for name in ("error", "seconds", "visited")
+        }
         medians.append(
             {"case": case, "way": way, "size": size}
             | {name: median(column) if column else None for name, column in values.items()}

@@ -124,7 +124,7 @@ def design(
     with locked_folder(out), cluster(scheduler) as executor, search_progress() as on_progress:
         options = SearchOptions(on_progress, resume=resume, time_budget=time_budget, executor=executor)
         document, result = run_design(load_spec(spec), out, overrides, start_from, options, twin, force=force)
-    if twin is not None and (omitted := Twin.load(twin).left_out()):
+    if twin is not None and (omitted := Twin.load(twin).ignored_effects()):
         click.echo(f"{twin}: {omitted}", err=True)
     show_result(document, summary_lines(result, out), as_json)
     context.exit(INTERRUPTED if result.stopped == "interrupted" else int(bool(result.violations)))
@@ -207,8 +207,8 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
         settings = settings_for_twin(settings, twin, pad)
     contact, search = settings.section(Contact), settings.section(SearchSettings)
     rules, pad_settings = settings.section(RulesSettings), settings.section(PadSettings, **pad.layout.settings)
-    terms = error_terms(expected_errors(pad, contact, search, pad_settings))
-    terms |= score_terms(pad, contact, search.lost, rules=rules, size=pad_settings)
+    terms = error_terms(expected_errors(pad, contact, search, pad_settings), pad.unit_mm)
+    terms |= score_terms(pad, contact, search.max_failures, rules=rules, size=pad_settings)
     violations = [asdict(violation) for violation in check_rules(pad, rules, pad_settings)]
     show_result({"terms": terms, "violations": violations}, [], as_json=True)
 
@@ -313,7 +313,7 @@ def import_(
     origin["settings"] = {"pad": pad_settings.model_dump(mode="json"), "tolerance_mm": tolerance_mm}
     path = (out or pad_folder(plan)) / "morphology.json"
     with atomic_files(path.parent) as folder:
-        Morphology.of_layout(result.pad.knots, pad_settings.layout, origin).save(folder / path.name)
+        Morphology.from_layout(result.pad.knots, pad_settings.layout, origin).save(folder / path.name)
         check_replaceable(path, folder / path.name, force=force)
     violations = check_rules(result.pad, rules, pad_settings)
     knots = result.pad.knots.shape[1] - 2

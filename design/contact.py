@@ -16,18 +16,27 @@ from padforge.design.kernels import geometry
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.kernels.published import quantized_signals
-from padforge.design.morphology import FARTHEST, LEAST_SPAN, Array, Ints, Morphology, axes, kernel_ends, layout_of
+from padforge.design.morphology import (
+    MAX_COORDINATE,
+    MIN_SPAN,
+    Array,
+    Ints,
+    Morphology,
+    check_layout,
+    fibre_ends,
+    split_axes,
+)
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-MOST_SAMPLES = 2**20
+MAX_SAMPLES = 2**20
 """Most points a fibre is sampled at."""
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
-PressShape = tuple[tuple[Array, Array], Array, geometry.Law]
+PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 
 
 def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None) -> Array:
@@ -72,15 +81,15 @@ def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> A
 def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
     """`signals`, and the number of spans that were looked at for them."""
     travel, cross, ends, batch = fibre_axes(pad)
-    flat, places = as_presses(presses, several=True)
+    flat, places = check_presses(presses, several=True)
     fibres = travel.shape[1]
-    require_room(len(travel) * len(flat) * fibres)
+    check_memory(len(travel) * len(flat) * fibres)
     out = np.zeros(len(travel) * len(flat) * fibres)
     visited = _run_exact(travel, cross, ends, flat, press_shape(contact, grid_unit_mm(pad)), _NONE, _NONE, out)
     return _summed(out, (*batch, *places, fibres)), visited
 
 
-def require_room(values: int) -> None:
+def check_memory(values: int) -> None:
     """Refuse more signals than fit into memory."""
     if values > MAX_VALUES:
         raise InputError(f"these are {values} signals, allowed at once are {MAX_VALUES}; signals_sparse takes less")
@@ -102,10 +111,10 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
     contact = or_default("contact", contact, Contact)
     travel, cross, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
-    places, strays = as_presses(presses)[0], geometry.max_offsets(cross, ends)
+    places, strays = check_presses(presses)[0], geometry.max_offsets(cross, ends)
     shape = press_shape(contact, pad.unit_mm)
     starts = geometry.count_touched(strays[0], places, shape[1], ends)
-    require_room(int(starts[-1]))
+    check_memory(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
     _run_exact(travel, cross, ends, places, shape, starts, fibre, signal)
     found = csr_array((signal, fibre, starts), shape=(len(places), len(pad.knots)))
@@ -134,11 +143,11 @@ def _run_exact(
 
     visited = sum(map_chunks(work, len(travel) * len(places), grain=2000))
     if profiling.is_profiling():
-        note_reach(travel, strays, ends, places, shape[1], visited)
+        record_visits(travel, strays, ends, places, shape[1], visited)
     return visited
 
 
-def note_reach(travel: Array, strays: Array, ends: geometry.Ends, places: Array, reach: Array, visited: int) -> None:
+def record_visits(travel: Array, strays: Array, ends: geometry.Ends, places: Array, reach: Array, visited: int) -> None:
     """Tell the profile how many fibres and spans were looked at, press by press."""
     pads, fibres, knots = travel.shape
     within = sum(int(geometry.count_touched(each, places, reach, ends)[-1]) for each in strays)
@@ -157,16 +166,16 @@ def fibre_axes(
     Raises:
         InputError: knots that are no (..., F, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
     """
-    knots = pad.knots if isinstance(pad, Morphology) else check_array("knots", pad, FARTHEST)
+    knots = pad.knots if isinstance(pad, Morphology) else check_array("knots", pad, MAX_COORDINATE)
     layout = pad.layout if isinstance(pad, Morphology) else layout
     fibres = knots.shape[-3] if knots.ndim >= 3 else 0
     if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
         raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
-    ends = kernel_ends(layout_of(fibres, layout))
+    ends = fibre_ends(check_layout(fibres, layout))
     # in C order, else the kernels would be compiled anew for the order of a caller's array, which takes many seconds
-    travel, cross = axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
-    if not isinstance(pad, Morphology) and not (np.diff(travel) >= LEAST_SPAN).all():
-        raise InputError(f"knots do not ascend by {LEAST_SPAN:g} or more along the travel axis")
+    travel, cross = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
+    if not isinstance(pad, Morphology) and not (np.diff(travel) >= MIN_SPAN).all():
+        raise InputError(f"knots do not ascend by {MIN_SPAN:g} or more along the travel axis")
     return travel, cross, ends, knots.shape[:-3]
 
 
@@ -189,9 +198,9 @@ def press_shape(contact: Contact, unit_mm: float) -> PressShape:
     length = _LENGTHS[contact.length]
     if contact.sensitivity_profile:
         points = contact.profile_points(unit_mm)
-        end, profile = points[-1][0], geometry.profile_of(points)
-        return *geometry.frames(end, None), geometry.Law(end, geometry.PROFILE, length, profile)
-    return *geometry.frames(contact.radius, contact.sides), geometry.Law(
+        end, profile = points[-1][0], geometry.profile_coefficients(points)
+        return *geometry.frames(end, None), geometry.WeightLaw(end, geometry.PROFILE, length, profile)
+    return *geometry.frames(contact.radius, contact.sides), geometry.WeightLaw(
         contact.radius, _WEIGHTS[contact.weight], length
     )
 
@@ -213,18 +222,20 @@ def signals_quantized(
     Raises:
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
-    return quantized_and_samples(pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT), samples)[0]
+    return quantized_signals_and_samples(
+        pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT), samples
+    )[0]
 
 
-def quantized_and_samples(
+def quantized_signals_and_samples(
     pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int
 ) -> tuple[Array, int]:
     """`signals_quantized`, and the number of samples that were looked at for them."""
     travel, cross, ends, batch = fibre_axes(pad)
     shape = press_shape(contact, grid_unit_mm(pad))
-    samples = as_samples(samples, travel.shape[1])
-    places, shape_of_presses = as_presses(presses, several=True)
-    require_room(len(travel) * len(places) * travel.shape[1])
+    samples = check_samples(samples, travel.shape[1])
+    places, shape_of_presses = check_presses(presses, several=True)
+    check_memory(len(travel) * len(places) * travel.shape[1])
     out = np.zeros((len(travel), len(places), travel.shape[1]))
 
     def work(begin: int, end: int) -> int:
@@ -234,18 +245,18 @@ def quantized_and_samples(
     return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
 
 
-def as_samples(samples: int, fibres: int) -> int:
+def check_samples(samples: int, fibres: int) -> int:
     """Points a fibre is sampled at, as far as they may be so many."""
-    return check_int("samples", samples, 2, min(MOST_SAMPLES, MAX_VALUES // max(fibres, 1)))
+    return check_int("samples", samples, 2, min(MAX_SAMPLES, MAX_VALUES // max(fibres, 1)))
 
 
-def as_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
+def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
     """`presses` as contiguous, finite (Q C, 2) grid units, and (Q, C): C is 1 for (Q, 2).
 
     Raises:
         InputError: presses that are no (Q, 2), or (Q, C, 2) where `several` are allowed at once, or not finite.
     """
-    places = check_array("presses", presses, FARTHEST)
+    places = check_array("presses", presses, MAX_COORDINATE)
     if places.shape == (0,):
         places = places.reshape(0, 2)
     if places.ndim not in ((2, 3) if several else (2,)) or places.shape[-1] != 2:
@@ -265,13 +276,13 @@ def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, see
         (Q, 2) presses; x runs forth on even rows and back on odd ones, so that neighbours in order are neighbours
         in place.
     """
-    rows = lattice(rectangle, side).reshape(side, side, 2)
+    rows = grid_positions(rectangle, side).reshape(side, side, 2)
     rows[1::2] = rows[1::2, ::-1]
     places = rows.reshape(-1, 2)
     return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter
 
 
-def lattice(rectangle: Rectangle, side: int) -> Array:
+def grid_positions(rectangle: Rectangle, side: int) -> Array:
     """(side^2, 2) places, side x side of them evenly from corner to corner of a rectangle, row by row from below."""
     x, y = (np.linspace(low, high, side) for low, high in zip(*rectangle, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

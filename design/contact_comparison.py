@@ -16,7 +16,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import FailureError, PressSets, fresh_presses, training_presses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import outside
+from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
@@ -90,10 +90,10 @@ def _sets(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter
 
     def responses(positions: Array) -> Array:
         found = relative_stretch(pad, positions, contact) / scale
-        return found * scatter.gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
+        return found * scatter.sample_gains(found.shape, rng) + scatter.floor * rng.standard_normal(found.shape)
 
     learned, fresh = (
-        positions[outside(positions, size)]
+        positions[is_outside(positions, size)]
         for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, TEST, seed))
     )
     return PressSets(learned, responses(learned), fresh, responses(fresh), seed)
@@ -104,7 +104,7 @@ FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:
     """What is designed for: the contact that `spec` states, or the usual one of such a search."""
-    return spec.section(Contact) if spec.given(Contact) else settings.usual_contact
+    return spec.section(Contact) if spec.given(Contact) else settings.default_contact
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

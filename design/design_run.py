@@ -28,7 +28,7 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
-FORMAT = "padforge-design/1"
+FORMAT = "padforge-design/2"
 SIGNIFICANT = 0.05
 """Relative difference of expected errors from which trained networks agree which pad is better."""
 MAX_VIOLATIONS = 10
@@ -79,7 +79,7 @@ def run_design(
     document = {
         "format": FORMAT,
         "terms": result.terms,
-        "found_by": result.found_by,
+        "candidate": result.candidate,
         "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],
         "history": result.history,
@@ -88,7 +88,7 @@ def run_design(
         "provenance": request.provenance,
     }
     with stage("figures"), atomic_files(out) as folder:
-        Morphology.of_layout(result.morphology.knots, request.pad.layout, request.provenance).save(folder / path.name)
+        Morphology.from_layout(result.morphology.knots, request.pad.layout, request.provenance).save(folder / path.name)
         # checked again: an interrupted search with the same settings may end with another pad
         check_replaceable(path, folder / path.name, regenerated, force)
         document["morphology_sha256"] = sha256(folder / path.name)
@@ -171,7 +171,7 @@ def load_result(out: Path) -> SearchResult | None:
             Morphology.load(morphology),
             {name: float(value) for name, value in document["terms"].items()},
             violations,
-            str(document["found_by"]),
+            str(document["candidate"]),
             {name: float(value) for name, value in document["straight"].items()},
             bool(document["provenance"]["settings"]["rules"]["enforce"]),
             document["history"],
@@ -200,16 +200,15 @@ def summary_lines(result: SearchResult, out: Path) -> list[str]:
 
 
 def _error_lines(result: SearchResult) -> list[str]:
-    unit_mm = result.morphology.unit_mm
     designed, straight = (
-        [unit_mm * value for term, value in terms.items() if term.startswith("expected_error")]
+        [value for term, value in terms.items() if term.startswith("expected_error")]
         for terms in (result.terms, result.straight)
     )
     lines = [
         f"  expected error {format_errors(designed)} mm with {format_errors(range(len(designed)))} failed fibres",
         f"  straight fibres {format_errors(straight)} mm",
     ]
-    if result.found_by == "straight fibres":
+    if result.candidate == "straight fibres":
         return [*lines, "  the search found no better pad than straight fibres; try more steps or time"]
     similar = [n for n, (a, b) in enumerate(zip(designed, straight, strict=True)) if a > (1 - SIGNIFICANT) * b]
     if similar:

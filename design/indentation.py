@@ -24,10 +24,10 @@ from numpy.typing import ArrayLike
 
 from padforge.design.common.parallel import map_chunks
 from padforge.design.common.validation import InputError, check_array, check_float, check_type, short_repr
-from padforge.design.contact import as_presses, fibre_axes, require_room
+from padforge.design.contact import check_memory, check_presses, fibre_axes
 from padforge.design.kernels.indentation import CONE, FLAT, SPHERE, lengthenings
 from padforge.design.kernels.pchip import population_slopes
-from padforge.design.morphology import FARTHEST, Array, Morphology
+from padforge.design.morphology import MAX_COORDINATE, Array, Morphology
 
 Shape = Literal["sphere", "cone", "flat"]
 
@@ -35,7 +35,7 @@ REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
 """E* of EcoFlex 00-20, kPa: 55 kPa is its modulus at 100 % strain (maker's data sheet), and it is incompressible."""
 NEGLIGIBLE = 1e-7
 """Error of a piece of fibre that does not matter, of the lengthening right at the press."""
-SHALLOWEST = 1e-9
+MIN_DEPTH = 1e-9
 """Depth below which a press lengthens nothing, grid units: its error could no longer be told from rounding."""
 _SHAPES = {"sphere": SPHERE, "cone": CONE, "flat": FLAT}
 
@@ -74,7 +74,7 @@ class Indenter:
 
     def deflection(self, r: ArrayLike, depth: float) -> Array:
         """How far down the surface goes at distances `r` from the axis, of the shape of `r`; all in grid units."""
-        r, depth = check_array("r", r, FARTHEST), check_float("depth", depth, 0, FARTHEST)
+        r, depth = check_array("r", r, MAX_COORDINATE), check_float("depth", depth, 0, MAX_COORDINATE)
         a = float(self.contact_radius(depth))
         if a == 0:
             return np.zeros(r.shape)
@@ -113,7 +113,7 @@ class Indenter:
             InputError: a depth that is not finite, below 0, or deeper than the sphere's radius.
         """
         d = check_array("depths", depths)
-        deepest = self.radius if self.shape == "sphere" else FARTHEST
+        deepest = self.radius if self.shape == "sphere" else MAX_COORDINATE
         wrong = d[(d < 0) | (d > deepest)]
         if wrong.size:
             allowed = f"0 to the sphere's radius, {deepest:g}" if self.shape == "sphere" else f"0 to {deepest:g}"
@@ -137,15 +137,15 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
     Raises:
         InputError: presses or depths of the wrong shape, not finite, or deeper than the indenter allows.
     """
-    places, _ = as_presses(presses)
+    places, _ = check_presses(presses)
     deep = check_array("depths", depths)
     if deep.shape not in ((), (len(places),)):
         raise InputError(f"depths have shape {deep.shape}, expected ({len(places)},), one for every press")
     deep = np.broadcast_to(deep, len(places))
-    a = np.where(deep < SHALLOWEST, 0, check_type("indenter", indenter, Indenter).contact_radius(deep))
+    a = np.where(deep < MIN_DEPTH, 0, check_type("indenter", indenter, Indenter).contact_radius(deep))
     steepness = _steepness(indenter, deep, a)
     travel, cross, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
-    require_room(len(places) * travel.shape[1])
+    check_memory(len(places) * travel.shape[1])
     slope = population_slopes(travel, cross)[0]
     out = np.zeros((len(places), travel.shape[1]))
     floor = NEGLIGIBLE * deep * np.minimum(1, steepness)

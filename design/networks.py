@@ -17,7 +17,7 @@ from padforge.design.common.validation import InputError, check_int, check_type,
 from padforge.design.contact import serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.settings import MOST_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
 
 if TYPE_CHECKING:
     pass
@@ -470,11 +470,12 @@ class FailureError:
     """Localisation error with some fibres lost, in grid units, over the sets of fibres that may be lost.
 
     Attributes:
-        lost: how many fibres. subsets: how many sets of them were lost in turn.
+        n_failed: number of failed fibres.
+        subsets: number of sets of failed fibres.
         mean, std, max: of the sets' mean Euclidean distances.
     """
 
-    lost: int
+    n_failed: int
     subsets: int
     mean: float
     std: float
@@ -484,7 +485,7 @@ class FailureError:
 def localisation_error(
     pad: Morphology,
     contact: Contact | None = None,
-    lost: Sequence[int] = (0, 1, 2, 3),
+    n_failed: Sequence[int] = (0, 1, 2, 3),
     seed: int = 0,
     hidden: int = 50,
     presses: int = 1024,
@@ -498,7 +499,7 @@ def localisation_error(
 
     Args:
         contact: PUBLISHED_CONTACT if None.
-        lost: numbers of lost fibres; those that would leave no fibre are left out.
+        n_failed: numbers of failed fibres; those that would leave no fibre are left out.
         seed: of the jitter, the test presses, the splits and the networks' first weights.
         hidden: neurons of a network.
         presses: to train on, a square number: a serpentine over 1..M (over 0.5..1.5 for a grid of 1), as published;
@@ -516,9 +517,9 @@ def localisation_error(
     test, hidden = check_int("test", test, 1, MOST_PRESSES), check_int("hidden", hidden, 1, 1000)
     seed, contact = check_int("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact, PUBLISHED_CONTACT)
     fibres = len(check_type("pad", pad, Morphology).knots)
-    if not isinstance(lost, Sequence) or isinstance(lost, str):
-        raise InputError(f"lost is {short_repr(lost)}, expected numbers of lost fibres")
-    levels = [number for number in lost if check_int("lost", number, 0, 2 * MOST_FIBRES) < fibres]
+    if not isinstance(n_failed, Sequence) or isinstance(n_failed, str):
+        raise InputError(f"n_failed is {short_repr(n_failed)}, expected numbers of failed fibres")
+    levels = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MAX_FIBRES) < fibres]
     sets = [math.comb(fibres, number) for number in levels]
     if subsets is not None:
         sets = [min(all_of_them, check_int("subsets", subsets, 1, MOST_NETWORKS)) for all_of_them in sets]

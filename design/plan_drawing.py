@@ -11,8 +11,7 @@ from padforge.design.common.validation import InputError, check_array, check_typ
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
 from padforge.design.paths.curves import crossings, flatten
-from padforge.design.settings import Contact
-from padforge.design.settings import Polygon as Corners
+from padforge.design.settings import Contact, Corners
 
 TOLERANCE = 1e-3
 """Deviation of drawn curves from exact ones, grid units."""

@@ -42,7 +42,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     low, high = sensed_rectangle(layout)
     size = " x ".join(f"{round((b - a) * layout.unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
     errors = [
-        [name[-1], *(_in_mm(errors, name, layout.unit_mm) for errors in (terms, document.get("straight", {})))]
+        [name[-1], *(_format_mm(errors, name) for errors in (terms, document.get("straight", {})))]
         for name in sorted(terms)
         if name.startswith("expected_error")
     ]
@@ -79,8 +79,8 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     return [PageSection("Fibres", body, key_figures)]
 
 
-def _in_mm(terms: Mapping[str, Any], name: str, unit_mm: float) -> str:
-    return f"{float(terms[name]) * unit_mm:#.3g}" if name in terms else "-"
+def _format_mm(terms: Mapping[str, Any], name: str) -> str:
+    return f"{float(terms[name]):#.3g}" if name in terms else "-"
 
 
 def _rule_rows(rules: Mapping[str, Any], violations: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
@@ -101,8 +101,8 @@ def _violation_row(violation: Mapping[str, Any]) -> list[object]:
 def _term_rows(terms: Mapping[str, float]) -> list[list[object]]:
     meanings = dict(TERMS)
     for name in terms:
-        if "_lost_" in name:
-            meanings[name] = f"{name.split('_lost_')[0].replace('_', ' ')} with {name[-1]} failed fibres, grid units"
+        if "_mm_" in name:
+            meanings[name] = f"{name.split('_mm_')[0].replace('_', ' ')} with {name[-1]} failed fibres, mm"
         elif name.startswith("penalty_"):
             meanings[name] = f"penalty for breaking {name.removeprefix('penalty_')}, as in the search"
     return [[name, value, meanings.get(name, "")] for name, value in terms.items()]
@@ -130,7 +130,7 @@ def stage_sections(
     mismatches: list[str] = []
     for name, path, write_sections in stages:
         if path.exists():
-            document = read_json(path, f"padforge-{name}/1")
+            document = read_json(path, f"padforge-{name}/{2 if name == 'design' else 1}")
             with reraise_as_input_error(path):
                 mismatches += _find_mismatches(folder, name, document, recording)
                 sections += write_sections(folder, document)

@@ -1,7 +1,7 @@
 """The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -18,28 +18,30 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 DEFAULT_PITCH_MM = 11.25
-"""Of the built pad."""
-MOST_FIBRES = 1024
-"""Most fibres of a family, of a pad that is made of tiles too."""
+"""Pitch of the built pad."""
+MAX_FIBRES = 1024
+"""Fibres of one family, also of a pad made of tiles."""
 
 Pair = tuple[float, float]
 Counts = int | tuple[int, int]
 """M horizontals and M verticals, or (horizontals, verticals)."""
 Pitch = float | Pair
-"""Distance of neighbouring fibre ends, mm: both ways, or along x and along y."""
+"""Distance of neighbouring fibre ends, mm: in both directions, or along x and along y."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """H horizontal and V vertical fibres, whose ends lie evenly along the edges of a rectangle.
+    """H horizontal and V vertical fibres whose ends are evenly spaced along the edges of a rectangle.
 
-    Horizontal fibre i runs along x at the height of i pitches along y, i = 1..H, vertical fibre i along y at i pitches
-    along x, i = 1..V. The pad is V + 1 pitches wide and H + 1 high. Places are in grid units, which are equally long
-    both ways: the pitch, or the geometric mean of two, so that a pad turned by 90 degrees answers alike.
+    Horizontal fibre i runs along x at a height of i pitches along y, i = 1..H; vertical fibre i runs along y at i
+    pitches along x, i = 1..V. The pad is V + 1 pitches wide and H + 1 high. Positions are in grid units, equally long
+    in both directions: the pitch, or the geometric mean of two, so that a pad turned by 90 degrees responds alike.
 
     Attributes:
-        horizontals, verticals: H and V, 0 to MOST_FIBRES each, one fibre or more in all.
-        pitch_x_mm: distance of neighbouring verticals' ends. pitch_y_mm: of horizontals'. Both 0.1 to 1000 mm.
+        horizontals: H, 0 to MAX_FIBRES; one fibre or more in all.
+        verticals: V, 0 to MAX_FIBRES.
+        pitch_x_mm: distance of the ends of neighbouring verticals, 0.1 to 1000 mm.
+        pitch_y_mm: distance of the ends of neighbouring horizontals, 0.1 to 1000 mm.
 
     Raises:
         InputError: no fibre, too many, or a pitch out of range.
@@ -52,30 +54,34 @@ class Layout:
 
     def __post_init__(self) -> None:
         for name in ("horizontals", "verticals"):
-            object.__setattr__(self, name, check_int(name, getattr(self, name), 0, MOST_FIBRES))
+            object.__setattr__(self, name, check_int(name, getattr(self, name), 0, MAX_FIBRES))
         for name in ("pitch_x_mm", "pitch_y_mm"):
             object.__setattr__(self, name, check_float(name.removesuffix("_mm"), getattr(self, name), 0.1, 1000))
         if not self.fibres:
             raise InputError("a pad of 0 horizontals and 0 verticals has no fibre, allowed is 1 or more in all")
 
     @classmethod
-    def of(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
-        """From what is short: M or (H, V), and one pitch or (along x, along y); a layout is itself.
+    def create(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
+        """Create a layout from its short form.
+
+        Args:
+            fibres: M, (H, V), or a layout, which is returned as it is.
+            pitch_mm: one pitch, or (along x, along y), mm.
 
         Raises:
             InputError: anything else, or what the class refuses.
         """
         if isinstance(fibres, Layout):
             return fibres
-        if isinstance(fibres, tuple | list):
-            horizontals, verticals = _two("fibres", fibres)
-        else:
-            horizontals = verticals = check_int("grid", fibres, 1, MOST_FIBRES)
-        if isinstance(pitch_mm, tuple | list):
-            along_x, along_y = _two("pitch_mm", pitch_mm)
-        else:
-            along_x = along_y = check_float("pitch_mm", pitch_mm, 0.1, 1000)
-        return cls(horizontals, verticals, along_x, along_y)
+        if not isinstance(fibres, tuple | list):
+            fibres = (check_int("grid", fibres, 1, MAX_FIBRES),) * 2
+        pitches = (
+            pitch_mm if isinstance(pitch_mm, tuple | list) else (check_float("pitch_mm", pitch_mm, 0.1, 1000),) * 2
+        )
+        for name, values in (("fibres", fibres), ("pitch_mm", pitches)):
+            if len(values) != 2:
+                raise InputError(f"{name} is {short_repr(values)}, expected one number or two")
+        return cls(*fibres, *pitches)
 
     @property
     def fibres(self) -> int:
@@ -89,37 +95,37 @@ class Layout:
 
     @property
     def families(self) -> tuple[slice, slice]:
-        """The rows of the horizontals and of the verticals among all fibres."""
+        """Rows of the horizontals and of the verticals among all fibres."""
         return slice(0, self.horizontals), slice(self.horizontals, self.fibres)
 
     def family(self, fibre: int) -> int:
-        """Of the fibre of that index: 0 of a horizontal, 1 of a vertical. It is the axis that it travels along."""
+        """Family of a fibre by its index: 0 horizontal, 1 vertical. It is also the axis that the fibre runs along."""
         return int(fibre >= self.horizontals)
 
     @property
     def is_square(self) -> bool:
-        """Whether it is of as many fibres both ways, of one pitch."""
+        """Whether there are as many horizontals as verticals, of one pitch."""
         return self.horizontals == self.verticals and self.pitch_x_mm == self.pitch_y_mm
 
     @property
     def pitch_mm(self) -> Pitch:
-        """The pitch where there is one, else (along x, along y)."""
+        """One pitch where both are equal, else (along x, along y)."""
         return self.pitch_x_mm if self.pitch_x_mm == self.pitch_y_mm else (self.pitch_x_mm, self.pitch_y_mm)
 
     @cached_property
     def unit_mm(self) -> float:
-        """A grid unit, mm."""
-        one = self.pitch_x_mm == self.pitch_y_mm
-        return self.pitch_x_mm if one else math.sqrt(self.pitch_x_mm * self.pitch_y_mm)
+        """Grid unit, mm."""
+        is_one = self.pitch_x_mm == self.pitch_y_mm  # no rounding of the root then
+        return self.pitch_x_mm if is_one else math.sqrt(self.pitch_x_mm * self.pitch_y_mm)
 
     @cached_property
     def spacing(self) -> Pair:
-        """The pitches along x and along y, grid units."""
+        """Pitches along x and along y, grid units."""
         return self.pitch_x_mm / self.unit_mm, self.pitch_y_mm / self.unit_mm
 
     @cached_property
     def extent(self) -> Pair:
-        """Width and height of the pad, grid units: places on it are between (0, 0) and these."""
+        """Width and height of the pad, grid units; its corners are (0, 0) and this point."""
         return (self.verticals + 1) * self.spacing[0], (self.horizontals + 1) * self.spacing[1]
 
     @property
@@ -129,56 +135,45 @@ class Layout:
 
     @cached_property
     def levels(self) -> "NDArray[np.float64]":
-        """(F,) cross coordinate at which each fibre ends, grid units."""
-        import numpy as np  # settings alone take none
+        """Coordinate across its family at which each fibre ends; shape (F,), grid units."""
+        import numpy as np  # reading settings does not need NumPy
 
         rows = np.concatenate([np.arange(1.0, count + 1) for count in self.counts])
-        found = rows * np.repeat(self.spacing[::-1], self.counts)
-        found.setflags(write=False)
-        return found
+        levels = rows * np.repeat(self.spacing[::-1], self.counts)
+        levels.setflags(write=False)
+        return levels
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """It as keys of `[pad]`."""
+        """The layout as keys of `[pad]`."""
         counts: dict[str, Any] = {"horizontals": self.horizontals, "verticals": self.verticals}
         if self.horizontals == self.verticals:
             counts = {"grid": self.horizontals, "horizontals": "grid", "verticals": "grid"}
         return {**counts, "pitch_mm": self.pitch_mm}
 
     def __str__(self) -> str:
-        """It in words: `4 + 4 fibres, pitch 11.25 mm`."""
-        pitch = (
-            f"{self.pitch_x_mm:g}"
-            if self.pitch_x_mm == self.pitch_y_mm
-            else (f"{self.pitch_x_mm:g} and {self.pitch_y_mm:g}")
-        )
-        return f"{self.horizontals} + {self.verticals} fibres, pitch {pitch} mm"
-
-
-def _two(name: str, values: Sequence[Any]) -> tuple[Any, Any]:
-    if len(values) != 2:
-        raise InputError(f"{name} is {short_repr(values)}, expected one number or two")
-    return values[0], values[1]
-
-
-Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *null_as("circle")]
+        """Describe the layout: `4 + 4 fibres, pitch 11.25 mm`."""
+        pitches = dict.fromkeys((f"{self.pitch_x_mm:g}", f"{self.pitch_y_mm:g}"))
+        return f"{self.horizontals} + {self.verticals} fibres, pitch {' and '.join(pitches)} mm"
 
 
 MEASURED_PROFILE = (
     *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
     *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
 )
-"""How the built pad answers: about a Gaussian of standard deviation 6.2 mm, with a smooth end in place of its tails."""
+"""Profile measured on the built pad: a Gaussian of standard deviation 6.2 mm, with a smooth end instead of tails."""
 MAX_OVERSHOOT = 0.15
-"""By which a spline may leave the range of the two points it runs between, share of the largest weight: smooth profiles
-stay far below it, one that leaves its points would count for what nobody has measured."""
+"""Largest excursion of a spline from the range of the two points it connects, as a share of the largest weight. Smooth
+profiles stay far below; beyond it a signal would depend on weights that nobody measured."""
 
 Point = tuple[Annotated[float, Field(ge=0, le=1e4)], Annotated[float, Field(ge=-1e3, le=1e3)]]
+Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *null_as("circle")]
+_SHAPE = {"radius", "sides", "weight"}
 
 
-def _points(value: object) -> object:
-    """Lists, as files have them, as the tuples that a frozen model holds."""
-    return tuple(as_tuple(point) for point in value) if isinstance(value, list | tuple) else value
+def _as_tuples(value: object) -> object:
+    """Convert lists of lists, as files have them, to the tuples of a frozen model."""
+    return tuple(as_tuple(item) for item in value) if isinstance(value, list | tuple) else value
 
 
 class Contact(Settings):
@@ -209,7 +204,7 @@ class Contact(Settings):
     length: Literal["manhattan", "euclidean"] = Field(
         default="euclidean", description="length of a fibre element: euclidean, or |dx| + |dy| as published"
     )
-    sensitivity_profile: Annotated[tuple[Point, ...], BeforeValidator(_points), Field(max_length=64)] = Field(
+    sensitivity_profile: Annotated[tuple[Point, ...], BeforeValidator(_as_tuples), Field(max_length=64)] = Field(
         default=MEASURED_PROFILE, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]]; [] for a shape"
     )
 
@@ -255,14 +250,14 @@ class Contact(Settings):
 
 
 def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":
-    """Fit the cubic spline of a measured profile over the squared distance, so that it is smooth at the centre as well.
+    """Fit a cubic spline of a profile over the squared distance, which makes it smooth at the centre.
 
-    It meets 0 without a kink at its end.
+    It ends at weight 0 without a kink.
 
     Args:
         points: (distance, weight), the last of weight 0.
     """
-    import numpy as np  # settings alone take none
+    import numpy as np
     from scipy.interpolate import CubicSpline
 
     distance, weight = np.array(points).T
@@ -270,7 +265,7 @@ def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":
 
 
 def _check_overshoot(points: tuple[Point, ...]) -> None:
-    """Refuse points between which their spline swings far beyond them."""
+    """Refuse points between which their spline leaves their range by more than MAX_OVERSHOOT."""
     spline = profile_spline(points)
     slack = MAX_OVERSHOOT * max(abs(weight) for _, weight in points)
     extremes = [square for square in spline.derivative().roots(extrapolate=False).tolist() if math.isfinite(square)]
@@ -284,16 +279,13 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
                 )
 
 
-_SHAPE = {"radius", "sides", "weight"}
-
 PUBLISHED_CONTACT = Contact(radius=0.6)
-"""The paper's: a polygon of 30 sides, Manhattan lengths. Functions that restate the paper take it for None."""
-
+"""Contact of the paper: a polygon of 30 sides, Manhattan lengths. Default of functions that reproduce the paper."""
 
 TRACK_WIDTH_MM = 0.4
-"""Width of a track where the mould does not say another."""
+"""Default width of a track."""
 MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
-"""Least limit on what two tracks have in common: two that cross straight and at a right angle have two widths."""
+"""Smallest limit on the common length of two tracks: two straight ones at a right angle have two widths in common."""
 
 MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
@@ -335,55 +327,61 @@ class RulesSettings(Settings):
     max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
 
 
-Share = Annotated[float, Field(ge=0, le=1e6)]
-
-Lost = Annotated[
-    Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Share, ...], Field(min_length=1, max_length=9)],
+Weight = Annotated[float, Field(ge=0, le=1e6)]
+MaxFailures = Annotated[
+    Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Weight, ...], Field(min_length=1, max_length=9)],
     BeforeValidator(as_tuple),
 ]
 
-
 WEIGHTS = (1.0, 1e-7, 5e-6)
-"""Published alpha, beta and gamma: of entropy, sharpness and disorder (formula (5))."""
+"""Published alpha, beta and gamma: weights of entropy, sharpness and disorder (formula (5))."""
 SIDE = 7
-"""The published search presses 7 x 7 places."""
+"""Presses per row and column in the published search."""
 LEVELS = 4096
 """Levels of the published 12-bit converter."""
-MOST_LEVELS = 2**24
+MAX_LEVELS = 2**24
 
 
 class Scatter(NamedTuple):
-    """How the response of a fibre scatters from press to press at the same position.
+    """Scatter of a fibre's response from press to press at one position.
 
     Attributes:
-        floor: standard deviation of what does not depend on the response, of a straight fibre's full scale, > 0.
-        share: standard deviation of what is proportional to the response, share of it.
-        common: share of the latter's variance that all fibres have in common.
+        floor: standard deviation of the additive part, as a share of a straight fibre's full scale, > 0.
+        share: standard deviation of the part proportional to the response, as a share of it.
+        common: share of the proportional part's variance that all fibres have in common.
     """
 
     floor: float
     share: float = 0.0
     common: float = 0.0
 
-    def gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
-        """Draw by what each response (presses, fibres) is more or less than usual, about 1."""
-        own, common = rng.standard_normal(shape), rng.standard_normal((shape[0], 1))
-        return 1 + self.share * (math.sqrt(1 - self.common) * own + math.sqrt(self.common) * common)
+    def sample_gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
+        """Sample the factor, about 1, on each response.
+
+        Args:
+            shape: (presses, fibres).
+            rng: source of random numbers.
+        """
+        individual, common = rng.standard_normal(shape), rng.standard_normal((shape[0], 1))
+        return 1 + self.share * (math.sqrt(1 - self.common) * individual + math.sqrt(self.common) * common)
 
     def scaled(self, factor: float) -> "Scatter":
-        """Return the same scatter, louder by a factor."""
+        """Return the scatter with its standard deviations multiplied by a factor."""
         return Scatter(self.floor * factor, self.share * factor, self.common)
 
 
 class SearchSettings(Settings):
-    """`[search]`: how the fibres are found.
+    """`[search]`: how the fibres are optimised.
 
     Attributes:
-        noise, scatter, scatter_common: the defaults are what the responses of a built pad scatter by.
-        lost: how many fibres may fail; or the loss distribution, weights of 0, 1, 2, ... lost fibres.
-        weights, presses, levels: of the published objective, alpha, beta and gamma; the side of its square of presses;
-            and the levels that signals are rounded up to.
-        contacts: further contacts the pad must serve as well as that of `[contact]`, such as `{radius = 0.9}`.
+        max_failures: number of fibres that may fail, or the weights of 0, 1, 2, ... failed fibres.
+        noise: additive scatter; this and the next two default to the scatter measured on a built pad.
+        scatter: scatter proportional to the response.
+        scatter_common: share of that scatter's variance that all fibres have in common.
+        weights: alpha, beta and gamma of the published objective.
+        presses: side of its square of presses.
+        levels: number of levels that its signals are rounded up to.
+        contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
     """
 
     method: Literal["descent", "genetic"] = Field(
@@ -394,13 +392,13 @@ class SearchSettings(Settings):
     steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
-    weights: Annotated[tuple[Share, Share, Share], BeforeValidator(as_tuple)] = Field(
+    weights: Annotated[tuple[Weight, Weight, Weight], BeforeValidator(as_tuple)] = Field(
         default=WEIGHTS, description="weights of entropy, sharpness and disorder in the genetic search"
     )
     presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
-    levels: int = Field(default=LEVELS, ge=1, le=MOST_LEVELS, description="levels of a signal in the genetic search")
+    levels: int = Field(default=LEVELS, ge=1, le=MAX_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
-    lost: Lost = Field(
+    max_failures: MaxFailures = Field(
         default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
     )
     noise: float = Field(
@@ -422,18 +420,18 @@ class SearchSettings(Settings):
     device: Literal["cpu", "cuda"] = Field(default="cpu", description="where presses are told apart")
 
     @property
-    def usual_contact(self) -> Contact:
-        """What is designed for where nothing else is asked: the measured contact, by the published method its own."""
+    def default_contact(self) -> Contact:
+        """Contact designed for if none is stated: the measured one, or the paper's for the paper's own method."""
         return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
 
     @property
     def response_scatter(self) -> Scatter:
-        """How responses scatter that are designed for."""
+        """Scatter of responses that is designed for."""
         return Scatter(self.noise, self.scatter, self.scatter_common)
 
-    @field_validator("lost", "weights")
+    @field_validator("max_failures", "weights")
     @classmethod
-    def _some_weight(cls, weights: int | tuple[float, ...]) -> int | tuple[float, ...]:
+    def _check_weights(cls, weights: int | tuple[float, ...]) -> int | tuple[float, ...]:
         if isinstance(weights, tuple) and sum(weights) == 0:
             raise ValueError("one of the weights must be above 0")
         return weights
@@ -444,16 +442,26 @@ Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
 Rectangle = tuple[tuple[float, float], tuple[float, float]]
 """Low and high corner, grid units."""
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-Polygon = tuple[tuple[Coordinate, Coordinate], ...]
-"""Its corners, mm from the middle of the pad."""
+Corners = tuple[tuple[Coordinate, Coordinate], ...]
+"""Corners of a polygon, mm from the middle of the pad."""
+BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
+Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
+PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
 
 def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
-    """Low and high corner, in grid units, of what is pressed on a pad.
+    """Return the rectangle of a pad that is pressed.
 
-    Of V verticals the outermost lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. "beyond" is
-    0.5 to V + 0.5 pitches, half a pitch beyond the outermost; "fibres" is 1 to V, as published. It is never less than
-    half the pad: 0.5 to 1.5 for V = 1, 0.25 to 0.75 for V = 0. A size lies about the middle.
+    Of V verticals the outermost lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
+    is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0.
+
+    Args:
+        layout: positions of the fibre ends.
+        sensed_mm: "beyond" for 0.5 to V + 0.5 pitches, half a pitch beyond the outermost fibres; "fibres" for 1 to V,
+            as published; or (width, height) about the middle, mm.
+
+    Returns:
+        Low and high corner, grid units.
     """
     sides = []
     for axis, count in enumerate((layout.verticals, layout.horizontals)):
@@ -468,54 +476,40 @@ def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
 
 
 def between_fibres(layout: Layout) -> Rectangle:
-    """What is pressed as published: between the outermost fibres, grid units."""
+    """Return the rectangle pressed in the paper, between the outermost fibres; grid units."""
     return sensed_rectangle(layout, "fibres")
 
 
-def _side_lengths(value: object) -> object:
+def _check_sensed(value: object) -> object:
     if isinstance(value, str) and value not in ("beyond", "fibres"):
         raise ValueError('allowed are [width, height], "beyond" and "fibres"')
     return as_tuple(value)
 
 
-BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
-Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
-PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
-
-
-def _pitches(value: object) -> object:
+def _check_pitches(value: object) -> object:
     value = as_tuple(value)
-    each = value if isinstance(value, tuple) else (value,)
-    if any(isinstance(pitch, int | float) and (pitch < 0.1 or pitch > 1000) for pitch in each):
+    pitches = value if isinstance(value, tuple) else (value,)
+    if any(isinstance(pitch, int | float) and (pitch < 0.1 or pitch > 1000) for pitch in pitches):
         raise ValueError("allowed is 0.1 to 1000, or [along x, along y] of these")
     if isinstance(value, tuple) and len(value) != 2:
         raise ValueError("allowed is a number or two, [along x, along y]")
     return value
 
 
-def _polygons(value: object) -> object:
-    """Lists, as files have them, as the tuples that a frozen model holds."""
-    if not isinstance(value, list | tuple):
-        return value
-    return tuple(
-        tuple(as_tuple(corner) for corner in polygon) if isinstance(polygon, list | tuple) else polygon
-        for polygon in value
-    )
-
-
 class PadSettings(Settings):
-    """`[pad]`: what the pad is, and which part of it is pressed.
+    """`[pad]`: the pad, and the part of it that is pressed.
 
     Attributes:
-        horizontals, verticals: of either family, where `grid` says nothing of it; None: as `grid`. 0 leaves it out: the
-            pad is then a strip one pitch wide, and the fibres of the other family run across it, one pitch long.
-        pitch_mm: of neighbouring fibre ends, both ways, or (along x, along y).
-        leads: "one side": the lower edge, as a connector wants; they come down beside the pad, nested.
-        sensed_mm: (width, height), at most the pad's own; "beyond": half a pitch beyond the outermost fibres, or
-            "fibres": between them, as published. Designs are for presses there; `sensed_rectangle` says where that is.
-        keep_out_mm: polygons, of 3 corners or more, that no fibre enters: holes, screws, a connector. Each has an area
-            and no crossing of its own sides, and lies on the pad at least in part.
-        bent_radius_mm: None for a pad that stays flat. It is cast flat either way.
+        horizontals: number of horizontals; `grid` if None. With 0 the pad is a strip one pitch wide, and the fibres of
+            the other family run across it, one pitch long.
+        verticals: number of verticals, in the same way.
+        pitch_mm: distance of neighbouring fibre ends, in both directions, or (along x, along y).
+        leads: "one side" is the lower edge, for a connector; leads come down beside the pad, nested.
+        sensed_mm: (width, height), at most the pad's; "beyond", half a pitch beyond the outermost fibres; or "fibres",
+            between them, as published (`sensed_rectangle`). Designs are for presses there.
+        keep_out_mm: polygons of 3 corners or more that no fibre enters: holes, screws, a connector. Each has an area,
+            does not cross itself, and lies on the pad at least in part.
+        bent_radius_mm: radius of the cylinder it is worn on; None for a flat pad. It is cast flat in either case.
     """
 
     MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
@@ -529,7 +523,7 @@ class PadSettings(Settings):
         default=None,
         description='fibres along y, or as "grid"; 0: a strip along y, its fibres run across, one pitch long',
     )
-    pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_pitches)] = Field(
+    pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_check_pitches)] = Field(
         default=DEFAULT_PITCH_MM, description="distance of neighbouring fibre ends, mm, or [along x, along y]"
     )
     deep_family: Literal["horizontal", "vertical"] = Field(
@@ -538,62 +532,64 @@ class PadSettings(Settings):
     leads: Literal["edges", "one side"] = Field(
         default="edges", description='ends of fibres leave on all four "edges", or all of them on "one side", the lower'
     )
-    sensed_mm: Annotated[Sensed, BeforeValidator(_side_lengths)] = Field(
+    sensed_mm: Annotated[Sensed, BeforeValidator(_check_sensed)] = Field(
         default="beyond",
         description='pressed [width, height] about the middle, mm; "beyond" the outermost fibres by half a pitch, or '
         'between "fibres"',
     )
-    keep_out_mm: Annotated[tuple[Polygon, ...], BeforeValidator(_polygons), Field(max_length=64)] = Field(
-        default=(), description="polygons [[x, y], ...] from the middle, mm, that no fibre enters"
-    )
+    keep_out_mm: Annotated[
+        tuple[Annotated[Corners, BeforeValidator(_as_tuples)], ...], BeforeValidator(as_tuple), Field(max_length=64)
+    ] = Field(default=(), description="polygons [[x, y], ...] from the middle, mm, that no fibre enters")
     bent_radius_mm: BentRadius = Field(
         default=None, description='radius of the cylinder about y that the pad is worn on, mm, or "flat"'
     )
 
     @property
     def layout(self) -> Layout:
-        """Where its fibres end."""
+        """Positions of the fibre ends."""
         horizontals = self.grid if self.horizontals is None else self.horizontals
         verticals = self.grid if self.verticals is None else self.verticals
-        return Layout.of((horizontals, verticals), self.pitch_mm)
+        return Layout.create((horizontals, verticals), self.pitch_mm)
 
     @property
     def sensed(self) -> Rectangle:
-        """`sensed_rectangle` of this pad."""
+        """`sensed_rectangle` of this pad, grid units."""
         return sensed_rectangle(self.layout, self.sensed_mm)
 
-    def of(self, layout: Layout) -> "PadSettings":
-        """These settings of a pad of that layout.
+    def for_layout(self, layout: Layout) -> "PadSettings":
+        """Return these settings for a pad of another layout.
 
         Raises:
-            InputError: what they ask for is not on that pad.
+            InputError: a setting that does not fit that pad.
         """
         return type(self)(**{**self.model_dump(), **layout.settings})
 
     @model_validator(mode="after")
-    def _of_some_fibres(self) -> "PadSettings":
+    def _check_fibres(self) -> "PadSettings":
         if self.horizontals == 0 and self.verticals == 0:
             raise ValueError("horizontals and verticals are both 0, allowed is one fibre or more in all")
         return self
 
     @field_validator("sensed_mm")
     @classmethod
-    def _on_the_pad(cls, sensed_mm: Sensed, info: ValidationInfo) -> Sensed:
-        layout = _stated_layout(info.data)
+    def _check_size(cls, sensed_mm: Sensed, info: ValidationInfo) -> Sensed:
+        layout = _validated_layout(info.data)
         if isinstance(sensed_mm, tuple) and layout is not None:
-            for name, side, most in zip(("wide", "high"), sensed_mm, layout.size_mm, strict=True):
-                if side > most * (1 + 1e-9):
+            for name, side, limit in zip(("wide", "high"), sensed_mm, layout.size_mm, strict=True):
+                if side > limit * (1 + 1e-9):
                     width, height = layout.size_mm
-                    size = f"{width:g} mm wide and high" if width == height else f"{most:g} mm {name}"
+                    size = f"{width:g} mm wide and high" if width == height else f"{limit:g} mm {name}"
                     raise ValueError(f"the pad itself is {size}")
         return sensed_mm
 
     @field_validator("keep_out_mm")
     @classmethod
-    def _proper_polygons(cls, keep_out_mm: tuple[Polygon, ...], info: ValidationInfo) -> tuple[Polygon, ...]:
+    def _check_polygons(cls, keep_out_mm: tuple[Corners, ...], info: ValidationInfo) -> tuple[Corners, ...]:
+        if not keep_out_mm:
+            return keep_out_mm
         import shapely  # takes a while, and few pads have keep-outs
 
-        layout = _stated_layout(info.data)
+        layout = _validated_layout(info.data)
         for number, corners in enumerate(keep_out_mm, 1):
             if not 3 <= len(corners) <= 1000:
                 raise ValueError(f"polygon {number} has {len(corners)} corners, allowed are 3 to 1000")
@@ -609,12 +605,12 @@ class PadSettings(Settings):
         return keep_out_mm
 
 
-def _stated_layout(stated: Mapping[str, Any]) -> Layout | None:
-    """Of the keys of `[pad]` that hold, None if one of them is missing for it does not."""
-    if not {"grid", "horizontals", "verticals", "pitch_mm"} <= stated.keys():
+def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:
+    """Layout of the fields of `[pad]` validated so far; None where one of them is missing because it was refused."""
+    if not {"grid", "horizontals", "verticals", "pitch_mm"} <= fields.keys():
         return None
-    counts = [stated["grid"] if stated[name] is None else stated[name] for name in ("horizontals", "verticals")]
-    return Layout.of((counts[0], counts[1]), stated["pitch_mm"]) if any(counts) else None
+    counts = [fields["grid"] if fields[name] is None else fields[name] for name in ("horizontals", "verticals")]
+    return Layout.create((counts[0], counts[1]), fields["pitch_mm"]) if any(counts) else None
 
 
 PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
@@ -624,4 +620,4 @@ PUBLISHED: Mapping[str, Settings] = {
     "search": PUBLISHED_SEARCH,
     "rules": RulesSettings(max_common_track_mm=None),
 }
-"""The world of the paper, by section, as far as it is another than the default."""
+"""Settings of the paper, by section, where they differ from the defaults."""

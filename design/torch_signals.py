@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padforge.design.common import profiling
-from padforge.design.contact import note_reach, press_shape
+from padforge.design.contact import press_shape, record_visits
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
-from padforge.design.kernels.geometry import Ends, Law, max_offsets
-from padforge.design.kernels.measured_signals import element_signals, elements_gradient, fibre_elements, spacing_of
+from padforge.design.kernels.geometry import Ends, WeightLaw, max_offsets
+from padforge.design.kernels.measured_signals import element_signals, element_spacing, elements_gradient, fibre_elements
 from padforge.design.settings import Contact
 
 Array = NDArray[np.float64]
-PressShape = tuple[tuple[Array, Array], Array, Law]
+PressShape = tuple[tuple[Array, Array], Array, WeightLaw]
 """Chains, extents and law of a press, as `press_shape` gives them."""
 
 
@@ -107,7 +107,7 @@ def press_signals(
     """
     given, shape = (travel, cross, slope, presses, ends), press_shape(contact, unit_mm)
     if contact.sensitivity_profile:
-        spaced = shape, spacing_of(contact.profile_points(unit_mm))
+        spaced = shape, element_spacing(contact.profile_points(unit_mm))
         return MeasuredSignals.apply(*given, spaced)  # pyright: ignore[reportReturnType]
     return ExactSignals.apply(*given, shape)  # pyright: ignore[reportReturnType]
 
@@ -127,7 +127,7 @@ class ExactSignals(torch.autograd.Function):
         begin, end = 0, len(presses)
         visited = exact_signals(t[None], v[None], d[None], strays, ends, presses, *shape, begin, end, none, none, out)
         if profiling.is_profiling():
-            note_reach(t[None], strays, ends, presses, shape[1], visited)
+            record_visits(t[None], strays, ends, presses, shape[1], visited)
         return torch.from_numpy(out.reshape(-1, len(t)).T)
 
     @staticmethod
@@ -159,7 +159,7 @@ class MeasuredSignals(torch.autograd.Function):
         out = np.empty((len(presses), len(t)))
         looked_at = element_signals(t, v, elements, presses, law.radius, law.profile, out)
         if profiling.is_profiling():
-            note_reach(t[None], max_offsets(v[None], ends), ends, presses, extents, looked_at)
+            record_visits(t[None], max_offsets(v[None], ends), ends, presses, extents, looked_at)
         return torch.from_numpy(out.T)
 
     @staticmethod

@@ -22,21 +22,21 @@ from padforge.design.common.validation import (
     short_repr,
 )
 from padforge.design.common.validation import check_path as as_path
-from padforge.design.contact import as_presses
-from padforge.design.kernels.geometry import profile_of, profile_weights
+from padforge.design.contact import check_presses
+from padforge.design.kernels.geometry import profile_coefficients, profile_weights
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact
 
-FORMAT = "padforge-twin/2"
-MOST_VOLTS, MOST_MM = 1e3, 1e4
-MOST_LOOKS = 1e3
-MOST_CHANNELS = 1024
-LONGEST = 0.02
+FORMAT = "padforge-twin/3"
+MAX_VOLTS, MAX_MM = 1e3, 1e4
+MAX_INFORMATION_GAIN = 1e3
+MAX_CHANNELS = 1024
+MAX_ELEMENT_LENGTH = 0.02
 """Longest element by which a laid fibre is summed, grid units."""
-EVEN = 0.02
+UNIFORM_SENSITIVITY_STD = 0.02
 """Standard deviation of the logarithm of a fibre's sensitivity that is none."""
-MOST_ELEMENTS = 2**23
+MAX_ELEMENTS = 2**23
 """Of all fibres: 256 + 256 of them, as many as a recording may have, are 6.6 million."""
 
 
@@ -57,7 +57,7 @@ class PlanTransform:
     def __post_init__(self) -> None:
         check_type("mirrored", self.mirrored, bool)
         object.__setattr__(self, "turn_deg", check_float("turn_deg", self.turn_deg, -360, 360))
-        shift = check_array("shift_mm", self.shift_mm, MOST_MM)
+        shift = check_array("shift_mm", self.shift_mm, MAX_MM)
         if shift.shape != (2,):
             raise InputError(f"shift_mm is {short_repr(self.shift_mm)}, expected two numbers")
         object.__setattr__(self, "shift_mm", tuple(shift.tolist()))
@@ -93,11 +93,11 @@ class TwinChannel:
     explained: float
 
     def __post_init__(self) -> None:
-        check_int("channel", self.channel, 0, MOST_CHANNELS)
+        check_int("channel", self.channel, 0, MAX_CHANNELS)
         if self.fibre is not None:
-            check_int("fibre", self.fibre, 0, MOST_CHANNELS)
-        for name, least in (("gain_v", -MOST_VOLTS), ("noise_v", 0.0)):
-            object.__setattr__(self, name, check_float(name, getattr(self, name), least, MOST_VOLTS))
+            check_int("fibre", self.fibre, 0, MAX_CHANNELS)
+        for name, least in (("gain_v", -MAX_VOLTS), ("noise_v", 0.0)):
+            object.__setattr__(self, name, check_float(name, getattr(self, name), least, MAX_VOLTS))
         object.__setattr__(self, "explained", check_float("explained", self.explained, -1e9, 1))
 
 
@@ -128,19 +128,19 @@ class TwinReadings:
         noise_mv: white noise of a reading. drift_mv: spread of the drifting rest; both standard deviations.
         hysteresis: share of its answer that a press leaves behind, the other way round. hysteresis_s: in which time
             that goes.
-        looks: all readings of a press together tell of its place (Fisher's information) so many times as much as the
-            twin's responses do with their `noise_v`; 1 or more.
+        information_gain: Fisher information on the position in all readings of a press, as a multiple of that in the
+            twin's responses with their `noise_v`; 1 or more.
     """
 
     noise_mv: float
     drift_mv: float
     hysteresis: float
     hysteresis_s: float
-    looks: float = 1.0
+    information_gain: float = 1.0
 
     def __post_init__(self) -> None:
         limits = (("noise_mv", 0, 1e3), ("drift_mv", 0, 1e3), ("hysteresis", 0, 0.99), ("hysteresis_s", 0.01, 1e4))
-        for name, least, most in (*limits, ("looks", 1, MOST_LOOKS)):
+        for name, least, most in (*limits, ("information_gain", 1, MAX_INFORMATION_GAIN)):
             object.__setattr__(self, name, check_float(name, getattr(self, name), least, most))
 
 
@@ -151,9 +151,9 @@ class Twin:
     Attributes:
         morphology: as it was planned. channels: one for each channel of the recording. frame: how it lay.
         distance_mm, weight: (n,) how a fibre element answers a press at that distance, 1 at its largest, 0 at the end.
-        laid_mm: for each fibre of the plan its course as laid, (P, 2) mm on the plan from its middle; None where no
+        as_built_mm: for each fibre of the plan its course as laid, (P, 2) mm on the plan from its middle; None where no
             channel reads it.
-        angle_weight: (n,) what is added to `weight` times cos 2 phi, phi the angle between the fibre and the way to
+        angular_weight: (n,) what is added to `weight` times cos 2 phi, phi the angle between the fibre and the way to
             the press; None where the answer does not depend on it.
         sensitivity: for each fibre how much a piece of it counts, (P - 1,) about 1; None where all count alike.
         noise: standard deviation of a response that neither place nor history explains, share of full scale.
@@ -170,11 +170,11 @@ class Twin:
     frame: PlanTransform
     distance_mm: Array
     weight: Array
-    laid_mm: tuple[Array | None, ...]
+    as_built_mm: tuple[Array | None, ...]
     noise: float
     sensed_mm: tuple[float, float]
     presses: int
-    angle_weight: Array | None = None
+    angular_weight: Array | None = None
     sensitivity: tuple[Array | None, ...] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
     readings: TwinReadings | None = None
@@ -183,25 +183,25 @@ class Twin:
     def __post_init__(self) -> None:
         fibres = len(check_type("morphology", self.morphology, Morphology).knots)
         _refuse_wiring([channel.fibre for channel in self.channels if channel.fibre is not None], fibres)
-        for name in ("distance_mm", "weight", *(["angle_weight"] if self.angle_weight is not None else [])):
-            object.__setattr__(self, name, check_array(name, getattr(self, name), MOST_MM))
+        for name in ("distance_mm", "weight", *(["angular_weight"] if self.angular_weight is not None else [])):
+            object.__setattr__(self, name, check_array(name, getattr(self, name), MAX_MM))
             if getattr(self, name).shape != (len(self.distance_mm),):
                 raise InputError(f"{name} of reach must be a row of {len(self.distance_mm)} numbers, as distance_mm is")
-        laid = tuple(None if line is None else check_array("laid_mm", line, MOST_MM) for line in self.laid_mm)
+        laid = tuple(None if line is None else check_array("as_built_mm", line, MAX_MM) for line in self.as_built_mm)
         if len(laid) != fibres or any(line is not None and line.shape[1:] != (2,) for line in laid):
-            raise InputError(f"laid_mm must have a row of points or null for each of the {fibres} fibres")
+            raise InputError(f"as_built_mm must have a row of points or null for each of the {fibres} fibres")
         length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in laid if line is not None)
-        if length > (most := MOST_ELEMENTS * LONGEST * self.morphology.unit_mm):
-            raise InputError(f"laid_mm are {length:.3g} mm long in all, allowed are {most:.3g}")
-        object.__setattr__(self, "laid_mm", laid)
+        if length > (most := MAX_ELEMENTS * MAX_ELEMENT_LENGTH * self.morphology.unit_mm):
+            raise InputError(f"as_built_mm are {length:.3g} mm long in all, allowed are {most:.3g}")
+        object.__setattr__(self, "as_built_mm", laid)
         if self.sensitivity is not None:
-            found = tuple(None if row is None else check_array("sensitivity", row, MOST_MM) for row in self.sensitivity)
+            found = tuple(None if row is None else check_array("sensitivity", row, MAX_MM) for row in self.sensitivity)
             pieces = [None if line is None else (len(line) - 1,) for line in laid]
             if [None if row is None else row.shape for row in found] != pieces:
-                raise InputError("sensitivity must have a number for each piece of each course in laid_mm")
+                raise InputError("sensitivity must have a number for each piece of each course in as_built_mm")
             object.__setattr__(self, "sensitivity", found)
         object.__setattr__(self, "noise", check_float("noise", self.noise, 1e-9, 10))
-        sensed = check_array("sensed_mm", self.sensed_mm, MOST_MM)
+        sensed = check_array("sensed_mm", self.sensed_mm, MAX_MM)
         if sensed.shape != (2,) or sensed.min() <= 0:
             raise InputError(f"sensed_mm is {short_repr(self.sensed_mm)}, expected width and height above 0")
         object.__setattr__(self, "sensed_mm", tuple(sensed.tolist()))
@@ -214,30 +214,30 @@ class Twin:
         points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
         return Contact(sensitivity_profile=tuple(points), length="euclidean")
 
-    def left_out(self) -> str | None:
+    def ignored_effects(self) -> str | None:
         """Say what of the measured pad no other pad is designed for, or simulated with; None if there is nothing."""
-        parts = ["that the angle between fibre and press counts"] if self.angle_weight is not None else []
+        parts = ["that the angle between fibre and press counts"] if self.angular_weight is not None else []
         uneven = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
-        if uneven and max(uneven) > EVEN:
+        if uneven and max(uneven) > UNIFORM_SENSITIVITY_STD:
             parts.append(f"that fibres answer unevenly along themselves (by {np.mean(uneven):.0%})")
         return f"left out of another pad than the one measured: {' and '.join(parts)}" if parts else None
 
-    def laid_stretch(self, places_mm: ArrayLike) -> Array:
+    def as_built_stretch(self, places_mm: ArrayLike) -> Array:
         """(Q, F) relative stretch of the fibres as laid by presses at (Q, 2) mm as the arm counts.
 
         It is their signal over the length of the fibre on the plan; 0 for a fibre that no channel reads. Summed over
         elements of at most LONGEST, within some 1e-4 of the integral.
         """
-        if (pressed_mm := check_array("places_mm", places_mm, MOST_MM)).shape[1:] != (2,):
+        if (pressed_mm := check_array("places_mm", places_mm, MAX_MM)).shape[1:] != (2,):
             raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
-        places, _ = as_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
+        places, _ = check_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
         reach = self.contact().profile_points(self.morphology.unit_mm)
-        profiles = [profile_of(reach)]
-        if self.angle_weight is not None:
-            points = zip((d for d, _ in reach), self.angle_weight.tolist(), strict=True)
-            profiles.append(profile_of(tuple(points)))
-        out = np.zeros((len(places), len(self.laid_mm)))
-        for fibre, line in enumerate(self.laid_mm):
+        profiles = [profile_coefficients(reach)]
+        if self.angular_weight is not None:
+            points = zip((d for d, _ in reach), self.angular_weight.tolist(), strict=True)
+            profiles.append(profile_coefficients(tuple(points)))
+        out = np.zeros((len(places), len(self.as_built_mm)))
+        for fibre, line in enumerate(self.as_built_mm):
             if line is not None:
                 counts = None if self.sensitivity is None else self.sensitivity[fibre]
                 elements = _elements(self.morphology.to_grid(line), counts)
@@ -254,18 +254,18 @@ class Twin:
         """
         document = read_json(path := as_path("path", path), FORMAT)
         try:
-            reach = document["reach"]
+            profile = document["sensitivity_profile"]
             return cls(
-                Morphology.of_document(document["morphology"]),
+                Morphology.from_dict(document["morphology"]),
                 tuple(TwinChannel(**channel) for channel in document["channels"]),
                 PlanTransform(**document["frame"]),
-                reach["distance_mm"],
-                reach["weight"],
-                tuple(document["laid_mm"]),
+                profile["distance_mm"],
+                profile["weight"],
+                tuple(document["as_built_mm"]),
                 document["noise"],
                 document["sensed_mm"],
                 document["presses"],
-                reach.get("angle_weight"),
+                profile.get("angular_weight"),
                 None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
                 document.get("provenance", {}),
                 TwinReadings(**document["readings"]) if document.get("readings") else None,
@@ -281,12 +281,12 @@ class Twin:
         pad = self.morphology
         document = {
             "format": FORMAT,
-            "morphology": pad.document(),
+            "morphology": pad.to_dict(),
             "channels": [asdict(channel) for channel in self.channels],
             "frame": asdict(self.frame),
-            "reach": {"distance_mm": self.distance_mm.tolist(), "weight": self.weight.tolist()}
-            | ({} if self.angle_weight is None else {"angle_weight": self.angle_weight.tolist()}),
-            "laid_mm": _rounded(self.laid_mm),
+            "sensitivity_profile": {"distance_mm": self.distance_mm.tolist(), "weight": self.weight.tolist()}
+            | ({} if self.angular_weight is None else {"angular_weight": self.angular_weight.tolist()}),
+            "as_built_mm": _rounded(self.as_built_mm),
             "sensitivity": None if self.sensitivity is None else _rounded(self.sensitivity),
             "noise": self.noise,
             "scatter": asdict(self.scatter),
@@ -316,7 +316,7 @@ def _elements(line: Array, counts: Array | None) -> tuple[Array, Array, Array]:
     """
     along = np.diff(line, axis=0)
     size = np.hypot(*along.T)
-    parts = np.maximum(np.ceil(size / LONGEST), 1).astype(int)
+    parts = np.maximum(np.ceil(size / MAX_ELEMENT_LENGTH), 1).astype(int)
     which = np.repeat(np.arange(len(parts)), parts)
     share = (np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[which]
     tangents = along / np.maximum(size, 1e-12)[:, None]

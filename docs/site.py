@@ -54,7 +54,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def commands() -> str:
     """The page of all commands, which mkdocs-click fills in."""
-    options = {"module": "padforge", "command": "cli", "prog_name": "padforge", "depth": 1, "style": "table"}
+    options = {"module": "padforge.cli", "command": "cli", "prog_name": "padforge", "depth": 1, "style": "table"}
     return "# Commands\n\n::: mkdocs-click\n" + "".join(f"    :{name}: {value}\n" for name, value in options.items())
 
 
@@ -67,4 +67,4 @@ def names(package: str) -> Iterator[str]:
     """Full names of what a package hands out, by the file that says so."""
     for node in ast.parse((ROOT / package / "__init__.pyi").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ImportFrom):
-            yield from (f"{package}.{node.module}.{alias.name}" for alias in node.names)
+            yield from (f"padforge.{package}.{node.module}.{alias.name}" for alias in node.names)

@@ -32,7 +32,7 @@ grid = 2
 knots = 2
 starts = 2
 steps = 30
-lost = 1
+max_failures = 1
 [rules]
 enforce = false
 [rig]
@@ -143,7 +143,7 @@ def require_whole(folder: Path, old: dict[str, str], new: dict[str, str], real_t
             told.add("new" if part == after else "old")
     design = folder / "pad" / "design.json"
     if design.exists():
-        digest = read_json(design, "padforge-design/1")["morphology_sha256"]
+        digest = read_json(design, "padforge-design/2")["morphology_sha256"]
         assert digest == sha256(folder / "pad" / "morphology.json")
     recording = folder / "pad" / "recording"
     if (recording / "start.json").exists() and not real_time:

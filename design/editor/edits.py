@@ -13,7 +13,7 @@ from padforge.design.objectives.ambiguity_map import ambiguity_map
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import AMBIGUITY_NOISE, free_presses
 from padforge.design.paths.curves import beziers
-from padforge.design.paths.fitting import with_spares
+from padforge.design.paths.fitting import add_spare_knots
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
 
 MIN_DISTANCE = 1e-3
@@ -108,7 +108,7 @@ class PathEvaluator:
     def to_morphology(self, paths: Paths) -> Morphology:
         """Return the pad of these paths, with as many knots on every fibre as on the one with most."""
         layout = self.pad_settings.layout
-        return Morphology.of_layout(with_spares(paths, layout), layout)
+        return Morphology.from_layout(add_spare_knots(paths, layout), layout)
 
     def evaluate(self, paths: Paths) -> dict[str, Any]:
         """Return knots, curves, broken rules and ambiguities of the paths as JSON, mm from the centre of the pad."""
@@ -154,7 +154,7 @@ class PathEvaluator:
 
     def _ambiguity_mm(self, pad: Morphology) -> Array:
         noise = AMBIGUITY_NOISE
-        return pad.unit_mm * ambiguity_map(pad, self._presses, self.contact, self.search.lost, noise)
+        return pad.unit_mm * ambiguity_map(pad, self._presses, self.contact, self.search.max_failures, noise)
 
 
 def _lattice_step(values: Array) -> float:

@@ -13,8 +13,8 @@ import numpy as np
 
 from padforge.design.common.files import check_replaceable, find_dependents, provenance
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
-from padforge.design.morphology import FARTHEST, Morphology
-from padforge.design.paths.fitting import without_spares
+from padforge.design.morphology import MAX_COORDINATE, Morphology
+from padforge.design.paths.fitting import remove_spare_knots
 
 from .edits import PathEvaluator, Paths, insert_knot, move_knot, replace_path, straight_paths
 
@@ -110,7 +110,7 @@ class EditSession:
         self._provenance["settings"] = {"pad": evaluator.pad_settings.model_dump(mode="json")}
         check_replaceable(out, self._provenance, force=force)
         layout = evaluator.pad_settings.layout
-        paths = straight_paths(layout) if source is None else without_spares(Morphology.load(source).knots, layout)
+        paths = straight_paths(layout) if source is None else remove_spare_knots(Morphology.load(source).knots, layout)
         self._history = EditHistory(tuple(paths))
         self._lock, self._number, self._id = Lock(), 0, secrets.token_hex(8)
         self._title = f"{source or 'straight fibres'}, {layout}"
@@ -193,7 +193,7 @@ class EditSession:
             if self.out.is_file() and not replaces:
                 self.out = free_name(self.out)
             pad = self._evaluator.to_morphology(self._history.paths)
-            Morphology.of_layout(pad.knots, pad.layout, self._provenance).save(self.out)
+            Morphology.from_layout(pad.knots, pad.layout, self._provenance).save(self.out)
             self._out_is_ours = True
             self._history.mark_saved()
             self._saved_message = f"saved to {self.out}"
@@ -233,7 +233,7 @@ class EditSession:
     def _position(self, edit: Mapping[str, Any]) -> list[float]:
         """Return the position of an edit, grid units from the lower left corner of the pad."""
         layout = self._evaluator.pad_settings.layout
-        position_mm = (check_float(name, edit.get(name), -FARTHEST, FARTHEST) for name in ("x_mm", "y_mm"))
+        position_mm = (check_float(name, edit.get(name), -MAX_COORDINATE, MAX_COORDINATE) for name in ("x_mm", "y_mm"))
         return [value / layout.unit_mm + extent / 2 for value, extent in zip(position_mm, layout.extent, strict=True)]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-FARTHEST = 20.0
+MAX_NEG_LOG_LIKELIHOOD = 20.0
 """A press that far off in -log of the likelihood (2e-9 of that of the place itself) is not taken for another one."""
 _IN_FACTORS = 300.0
 """Up to here exp(-sum) is the product of the terms' own, without any that is beyond what numbers hold."""
@@ -36,7 +36,7 @@ def ambiguity_by_place(signals: Any, presses: Any, lost: Any) -> Any:
                 for k in range(most):  # the largest stand first
                     if square > largest[k]:
                         square, largest[k] = largest[k], square
-            if total - largest.sum() > FARTHEST:  # whatever is lost
+            if total - largest.sum() > MAX_NEG_LOG_LIKELIHOOD:  # whatever is lost
                 continue
             if total < _IN_FACTORS:
                 factor[:fibres] = np.exp(apart[:fibres])

@@ -32,7 +32,7 @@ class Ends(NamedTuple):
     apart_x: float
 
 
-class Law(NamedTuple):
+class WeightLaw(NamedTuple):
     """What a fibre element in a press counts.
 
     Attributes:
@@ -49,7 +49,7 @@ class Law(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def weigh(square: float, law: Any) -> float:
-    """Weight of a fibre element at squared distance `square` from the press centre, by a `Law`."""
+    """Weight of a fibre element at squared distance `square` from the press centre, by a `WeightLaw`."""
     radius, weight, profile = law.radius, law.weight, law.profile
     if weight == UNIFORM:
         return 1.0
@@ -63,14 +63,14 @@ def weigh(square: float, law: Any) -> float:
 
 
 @lru_cache(maxsize=64)
-def profile_of(reach: tuple[tuple[float, float], ...]) -> Array:
+def profile_coefficients(reach: tuple[tuple[float, float], ...]) -> Array:
     """The profile (B, 5) of `weigh` through points (distance, weight), the last of weight 0: their `profile_spline`."""
     spline = profile_spline(reach)
     return np.ascontiguousarray(np.column_stack([spline.x[:-1], spline.c[::-1].T]))  # one order: compiled once
 
 
 def profile_weights(profile: Array, end: float, distance: Array) -> Array:
-    """What a profile, as `profile_of` gives it, weighs at distances of any shape; 0 from `end` on."""
+    """What a profile, as `profile_coefficients` gives it, weighs at distances of any shape; 0 from `end` on."""
     square = distance**2
     piece = np.searchsorted(profile[:, 0], square, side="right") - 1
     x, c0, c1, c2, c3 = profile[piece].T
@@ -374,7 +374,7 @@ def roots_in_unit(p: Any, degree: Any, tolerance: float, out: Any, count: Any, w
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def lying_beside(
+def sum_overlaps(
     place: Any, slope: Any, arc: Any, fibres: Any, beside: Any, middles: Any, half: float, width: float, gradient: Any
 ) -> float:
     """Return by how much places `half` before and behind middles are nearer than `width`, summed, as shares of it.

@@ -26,9 +26,9 @@ from padforge.design.kernels.exact_signals import (
 SPHERE, CONE, FLAT = 0, 1, 2
 PRECISION = 1e-6
 """Estimated relative error at which a piece is taken."""
-LONG = 4.0
+MAX_PIECE_LENGTH = 4.0
 """Length of a piece, of its distance from the centre plus the contact radius, above which it is halved unseen."""
-NOTCH = 2e-5
+NOTCH_WIDTH = 2e-5
 """Width of the notch in the density, of the contact radius, that may be stepped over."""
 
 
@@ -76,12 +76,12 @@ def _is_long(span: Any, s0: float, s1: float, from_edge: bool, a: float, shape: 
     dt, dv = max(min(t0, t1), -max(t0, t1), 0.0), max(min(v0, v1), -max(v0, v1), 0.0)
     gap = math.sqrt(dt * dt + dv * dv)
     if shape == CONE and gap < a:
-        scale = gap + NOTCH * a
+        scale = gap + NOTCH_WIDTH * a
     elif shape == FLAT and not from_edge:
-        scale = math.sqrt(max(gap - a, 0.0) * (gap + a)) + NOTCH * a
+        scale = math.sqrt(max(gap - a, 0.0) * (gap + a)) + NOTCH_WIDTH * a
     else:
         scale = gap + a
-    return abs(t1 - t0) + abs(v1 - v0) > LONG * scale
+    return abs(t1 - t0) + abs(v1 - v0) > MAX_PIECE_LENGTH * scale
 
 
 @njit(cache=True, error_model="numpy")

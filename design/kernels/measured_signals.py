@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from padforge.design.kernels.exact_gradient import variations
-from padforge.design.kernels.geometry import MANHATTAN, profile_of, profile_weights
+from padforge.design.kernels.geometry import MANHATTAN, profile_coefficients, profile_weights
 from padforge.design.kernels.pchip import extremes
 
 Array = NDArray[np.float64]
@@ -23,9 +23,9 @@ PRECISION = 5e-5
 """Of signals here, as a share of the largest one: far within what was measured."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not follow how a span bends
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
-FINER = 24
+MAX_REFINEMENTS = 24
 """Times at most that elements are laid closer by a fifth, from a quarter of the reach on: a steep one asks for it."""
-MOST_PIECES = 512
+MAX_PIECES = 512
 """Of a span, so that memory is bounded: only a reach that is hundreds of times shorter than a span would take more."""
 
 
@@ -49,9 +49,9 @@ class Elements(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def spacing_of(reach: tuple[tuple[float, float], ...]) -> float:
+def element_spacing(reach: tuple[tuple[float, float], ...]) -> float:
     """How far apart elements may be, grid units: so that a straight fibre at any distance signals to PRECISION."""
-    profile, end = profile_of(reach), reach[-1][0]
+    profile, end = profile_coefficients(reach), reach[-1][0]
     heights, shifts = end * np.arange(32)[:, None, None] / 32, np.arange(16)[:, None] / 16
 
     def straight(spacing: float) -> Array:
@@ -63,7 +63,7 @@ def spacing_of(reach: tuple[tuple[float, float], ...]) -> float:
         return profile_weights(profile, end, np.hypot(at, heights)) @ lengths
 
     spacing = end / 4
-    for _ in range(FINER):
+    for _ in range(MAX_REFINEMENTS):
         found = straight(spacing)
         right = found.mean(axis=1, keepdims=True)  # far more precise than any of them
         if np.abs(found - right).max() <= PRECISION * np.abs(right).max():
@@ -77,7 +77,7 @@ def _pieces(h: float, rise: float, d0: float, d1: float, spacing: float) -> int:
     """In how many equal pieces a span is cut so that their elements lie `spacing` apart or closer, on average."""
     # the rate at which a span rises is a quadratic, which keeps within its Bezier points
     steepest = max(abs(h * d0), abs(h * d1), abs(3 * rise - h * (d0 + d1)))
-    return math.ceil(min(math.hypot(h, steepest) / (len(_NODES) * spacing), 1.0 * MOST_PIECES))
+    return math.ceil(min(math.hypot(h, steepest) / (len(_NODES) * spacing), 1.0 * MAX_PIECES))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -88,7 +88,7 @@ def fibre_elements(
 
     Args:
         travel, cross, slope: (F, n) knots and slopes. horizontals: how many of them. presses: (Q, 2), at least one.
-        end: of the reach. spacing: of `spacing_of`.
+        end: of the reach. spacing: of `element_spacing`.
         length: MANHATTAN or EUCLIDEAN.
     """
     fibres, n = travel.shape

@@ -35,10 +35,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padforge.design.common.parallel import one_torch_thread
-from padforge.design.contact import lattice, relative_stretch
+from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, loss_shares
-from padforge.design.paths.keep_outs import outside
+from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import (
     Contact,
     Layout,
@@ -108,7 +108,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         Means over sets of failed fibres, grid units.
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
-    levels = range(min(len(loss_shares(search.lost)), fibres))
+    levels = range(min(len(loss_shares(search.max_failures)), fibres))
     windows = judged_windows(size.sensed)
     masks = [failure_masks(fibres, k, max(MAX_SETS * LATTICES // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
@@ -137,9 +137,9 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     return np.mean(errors, axis=0).tolist()
 
 
-def error_terms(errors: Sequence[float]) -> dict[str, float]:
-    """Return `expected_errors` by name."""
-    return {f"expected_error_lost_{lost}": value for lost, value in enumerate(errors)}
+def error_terms(errors: Sequence[float], unit_mm: float) -> dict[str, float]:
+    """Return `expected_errors`, in grid units of `unit_mm`, by name in mm."""
+    return {f"expected_error_mm_{n_failed}": unit_mm * error for n_failed, error in enumerate(errors)}
 
 
 def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> float:
@@ -147,7 +147,7 @@ def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> 
     low, high = np.array(sensed_rectangle(layout, sensed_mm))
     size = np.minimum(high - low, WINDOW)
     corner = low + (high - low - size) / 2
-    presses = lattice((tuple(corner.tolist()), tuple((corner + size).tolist())), FULL_SCALE_SIDE)
+    presses = grid_positions((tuple(corner.tolist()), tuple((corner + size).tolist())), FULL_SCALE_SIDE)
     largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
     if (size < high - low).any():  # fibres beside the presses are as those of their family among them
         for rows in layout.families:
@@ -197,8 +197,8 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
         far = least + (most - least) * (grid + rng.random(2)) / counts
         if len(far) > MAX_FAR:
             far = far[rng.choice(len(far), MAX_FAR, replace=False)]
-        far = far[((far < low - BESIDE) | (far > high + BESIDE)).any(axis=1) & outside(far, size)]
-    return PressWindow(positions, (high - low) / side, outside(positions, size), far)
+        far = far[((far < low - BESIDE) | (far > high + BESIDE)).any(axis=1) & is_outside(far, size)]
+    return PressWindow(positions, (high - low) / side, is_outside(positions, size), far)
 
 
 def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:

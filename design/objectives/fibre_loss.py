@@ -30,9 +30,9 @@ def failure_masks(fibres: int, lost: int, most: int) -> Array:
     return kept
 
 
-def loss_shares(lost: int | tuple[float, ...]) -> tuple[float, ...]:
+def loss_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
     """P(k), k = 0, 1, ...: half for none and equal up to a number of lost fibres, or the given weights, of sum 1."""
-    weights = (max(lost, 1.0), *(1.0,) * lost) if isinstance(lost, int) else lost
+    weights = (max(max_failures, 1.0), *(1.0,) * max_failures) if isinstance(max_failures, int) else max_failures
     return tuple(weight / sum(weights) for weight in weights)
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from padforge.design.common.validation import InputError
-from padforge.design.kernels.geometry import lying_beside
+from padforge.design.kernels.geometry import sum_overlaps
 from padforge.design.paths.curves import common_stretches
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
@@ -182,7 +182,7 @@ def _common_tracks(fibres: SampledCurves, width: float, length: float, layout: L
         long = shared.length > length
         middle = (shared.begin[long] + shared.end[long]) / 2
         pairs = one.start + shared.line[long], other.start + shared.other[long]
-        total += lying_beside(place, slope, arc, *pairs, middle, length / 2, width, gradient)
+        total += sum_overlaps(place, slope, arc, *pairs, middle, length / 2, width, gradient)
     weight = COMMON * length / 4 / len(arc) / fibres.travelled.item()  # the mean of two places, along either fibre
     value = weight * (total - (gradient * place).sum())
     return (torch.from_numpy(weight * gradient) * fibres.place).sum() + value

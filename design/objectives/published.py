@@ -10,8 +10,8 @@ from padforge.design.common.parallel import map_chunks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_array, check_int, check_type
 from padforge.design.contact import (
-    as_presses,
-    as_samples,
+    check_presses,
+    check_samples,
     fibre_axes,
     grid_unit_mm,
     press_shape,
@@ -24,7 +24,7 @@ from padforge.design.kernels.published import published_terms as terms_kernel
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import (
     LEVELS,
-    MOST_LEVELS,
+    MAX_LEVELS,
     PUBLISHED_CONTACT,
     SIDE,
     WEIGHTS,
@@ -174,7 +174,7 @@ class PublishedTerms:
 @lru_cache(maxsize=16)
 def published_presses(fibres: Counts | Layout, side: int = SIDE) -> NDArray[np.float64]:
     """The (side^2, 2) presses the published search samples: a serpentine over 1..M, jittered by U(0, 2/49)."""
-    places = serpentine_presses(between_fibres(Layout.of(fibres)), side, jitter=2 / 49)
+    places = serpentine_presses(between_fibres(Layout.create(fibres)), side, jitter=2 / 49)
     places.setflags(write=False)
     return places
 
@@ -200,12 +200,12 @@ def published_terms(
     """
     alpha, beta, gamma = _weights(weights)
     travel, cross, ends, _ = fibre_axes(pads, layout)
-    samples, levels = as_samples(samples, travel.shape[1]), check_int("levels", levels, 1, MOST_LEVELS)
+    samples, levels = check_samples(samples, travel.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)
     if presses is None:
         layout = pads.layout if isinstance(pads, Morphology) else layout
         places = published_presses(layout or ends.horizontals).copy()  # not read-only: kernels would be compiled anew
     else:
-        places = as_presses(presses)[0]
+        places = check_presses(presses)[0]
     contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
     shape = press_shape(contact, grid_unit_mm(pads, layout))
     found = np.zeros((len(travel), 3))

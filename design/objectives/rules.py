@@ -12,7 +12,7 @@ import shapely
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.bends import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, traced_curve
+from padforge.design.paths.bends import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, trace_curve
 from padforge.design.paths.curves import (
     Crossing,
     beziers,
@@ -90,7 +90,7 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
     """
     pad, rules = check_type("pad", pad, Morphology), check_type("rules", rules, RulesSettings)
     lines = [pad.to_mm(points) for points in flatten(pad, _TOLERANCE_MM / pad.unit_mm)]
-    size = or_default("size", size, PadSettings).of(pad.layout)
+    size = or_default("size", size, PadSettings).for_layout(pad.layout)
     return [
         *tight_bends(pad, rules.min_bend_radius_mm, size.bent_radius_mm),
         *_gaps(lines, pad.layout, rules.min_gap_mm),
@@ -128,7 +128,7 @@ def _least_bend(
     """`bend_radius` in mm of one fibre, of its Bezier spans in grid units, and where it is, grid units."""
     # An end of the window that falls between two points is off by less than the turn from one to the other.
     curve = np.frombuffer(spans).reshape(-1, 4, 2), np.frombuffer(slopes).reshape(-1, 3)
-    points, headings = traced_curve(*curve, step=max(window / limit / 200, _FINEST_TURN))
+    points, headings = trace_curve(*curve, step=max(window / limit / 200, _FINEST_TURN))
     points, headings = _with_leads(points * unit_mm, headings, np.eye(2)[family] * window)
     across = family * np.pi / 2
     rolled = 0.0 if bent_radius_mm is None else rolled_turns(points, headings - across, bent_radius_mm)

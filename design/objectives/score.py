@@ -8,7 +8,7 @@ from torch import Tensor
 
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_type
-from padforge.design.contact import lattice, relative_stretch, serpentine_presses, signals, signals_quantized
+from padforge.design.contact import grid_positions, relative_stretch, serpentine_presses, signals, signals_quantized
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, loss_shares
 from padforge.design.objectives.published import (
@@ -19,7 +19,7 @@ from padforge.design.objectives.published import (
     published_terms,
     quantize,
 )
-from padforge.design.paths.keep_outs import outside
+from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, SearchSettings
 
 
@@ -63,12 +63,13 @@ MOST_PAIRS = 2**29
 
 
 def ambiguities(
-    pad: Morphology, contact: Contact, lost: int | tuple[float, ...], noise: float, size: PadSettings
+    pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
     """Localisation ambiguity (formula of `ambiguity`) with 0, 1, ... fibres lost, grid units, on a grid of presses.
 
     Args:
-        lost: how many fibres may fail at most, or weights of 0, 1, ... lost. noise: of a signal, share of full scale.
+        max_failures: how many fibres may fail at most, or weights of 0, 1, ... failed.
+        noise: of a signal, share of full scale.
         size: says what is pressed.
     """
     import torch
@@ -80,7 +81,7 @@ def ambiguities(
     places = torch.tensor(presses, dtype=torch.float32)
     fibres = len(pad.knots)
     spread = []
-    for k in range(min(len(loss_shares(lost)), fibres)):
+    for k in range(min(len(loss_shares(max_failures)), fibres)):
         kept = torch.tensor(failure_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)[:, touched]
         equal = torch.full((len(kept),), 1 / len(kept))
         spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
@@ -93,29 +94,29 @@ def free_presses(size: PadSettings) -> Array:
     Raises:
         InputError: there is none.
     """
-    presses = lattice(size.sensed, SIDE)
-    presses = presses[outside(presses, size)]
+    presses = grid_positions(size.sensed, SIDE)
+    presses = presses[is_outside(presses, size)]
     if not len(presses):
         raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
     return presses
 
 
-def ambiguity_terms(spread: Sequence[float]) -> dict[str, float]:
-    """`ambiguities` by name, as `score` has them."""
-    return {f"ambiguity_lost_{lost}": value for lost, value in enumerate(spread)}
+def ambiguity_terms(values: Sequence[float], unit_mm: float) -> dict[str, float]:
+    """Return `ambiguities`, in grid units of `unit_mm`, by name in mm, as `score` has them."""
+    return {f"ambiguity_mm_{n_failed}": unit_mm * value for n_failed, value in enumerate(values)}
 
 
 def score(
     pad: Morphology,
     contact: Contact | None = None,
-    lost: int | tuple[float, ...] = 3,
+    max_failures: int | tuple[float, ...] = 3,
     noise: float = AMBIGUITY_NOISE,
     rules: RulesSettings | None = None,
     size: PadSettings | None = None,
 ) -> dict[str, float]:
     """Every term of a pad, by name.
 
-    `ambiguity_lost_k` is the expected localisation error in grid units over losses of k fibres under the given noise
+    `ambiguity_mm_k` is the expected localisation error in mm over failures of k fibres under the given noise
     (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
     far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
     (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
@@ -131,12 +132,12 @@ def score(
     from .penalties import PER_SPAN
 
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
-    size = or_default("size", size, PadSettings).of(check_type("pad", pad, Morphology).layout)
-    asked = SearchSettings(lost=lost, noise=noise)
+    size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
+    asked = SearchSettings(max_failures=max_failures, noise=noise)
     pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
     if pairs > MOST_PAIRS:
         raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
-    return all_terms(pad, ambiguities(pad, contact, asked.lost, asked.noise, size), contact, rules, size)
+    return all_terms(pad, ambiguities(pad, contact, asked.max_failures, asked.noise, size), contact, rules, size)
 
 
 def sharpness_of(pad: Morphology, contact: Contact, size: PadSettings) -> float:
@@ -163,7 +164,10 @@ def all_terms(
     found = signals(pad, _serpentine(size), contact)
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     broken = penalties(travel, cross, size, rules)
-    terms = ambiguity_terms(spread) | {"information": information(pad, contact), "idle_share": idle_share(found)}
+    terms = ambiguity_terms(spread, pad.unit_mm) | {
+        "information": information(pad, contact),
+        "idle_share": idle_share(found),
+    }
     terms["sharpness"] = sharpness_of(pad, contact, size)
     shape = PUBLISHED_CONTACT if contact.sensitivity_profile else contact
     terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}

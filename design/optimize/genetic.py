@@ -13,7 +13,7 @@ from pymoo.core.termination import NoTermination
 from pymoo.operators.sampling.rnd import FloatRandomSampling
 
 from padforge.design.common.checkpoints import State
-from padforge.design.morphology import MARGIN, Array, Morphology, assemble
+from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.objectives.published import published_presses, published_terms
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
@@ -71,7 +71,7 @@ class GeneticSearch:
         """The best pad so far; there is one once the first generation is done."""
         # Survivors are the best of parents and offspring, so the best pad ever is among them.
         x, objective = self._algorithm.pop.get("X", "F")
-        return Morphology.of_layout(self._problem.fibres(x[objective.argmin()][None])[0], self._problem.layout)
+        return Morphology.from_layout(self._problem.fibres(x[objective.argmin()][None])[0], self._problem.layout)
 
     def state(self) -> State:
         """All that the next generations depend on, as arrays.
@@ -117,7 +117,7 @@ class _PublishedProblem(PymooProblem):
 
     def fibres(self, x: Array) -> Array:
         """(P, F, N+2, 2) knots of a generation x (P, 2FN)."""
-        return assemble(x.reshape(-1, *self.shape), self.layout)
+        return assemble_knots(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
         terms = published_terms(

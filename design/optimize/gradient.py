@@ -16,7 +16,7 @@ from torch import Tensor
 
 from padforge.design.common.checkpoints import State
 from padforge.design.contact import serpentine_presses
-from padforge.design.morphology import MARGIN, Array, Morphology, assemble, axes, kernel_ends
+from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
 from padforge.design.objectives.expected_error import (
     SEARCHED,
     aggregate_failures,
@@ -32,7 +32,7 @@ from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.score import sharpness
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
-from padforge.design.paths.keep_outs import passing, straight_course
+from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 from padforge.design.torch_signals import arc_lengths, pchip_slopes, press_signals
 
@@ -56,7 +56,7 @@ class Fibres:
     def __init__(self, layout: Layout, spans: Tensor, cross: Tensor, floor: float, border: float) -> None:
         self.layout, self.floor, self.border = layout, floor, border
         self.spans, self.cross = (x.detach().clone().requires_grad_() for x in (spans, cross))
-        self.ends = kernel_ends(layout)
+        self.ends = fibre_ends(layout)
         along, across = _sides(layout)
         self._along, self._across, self._level = (
             torch.tensor(each)[:, None] for each in (along, across, layout.levels)
@@ -65,7 +65,7 @@ class Fibres:
     @classmethod
     def through(cls, knots: Array, layout: Layout, border: float) -> "Fibres":
         """Variables of the fibres through knots (F, N+2, 2); knots within `border` of the border are moved off."""
-        travel, across = (axis[0] for axis in axes(knots[None], layout.horizontals))
+        travel, across = (axis[0] for axis in split_axes(knots[None], layout.horizontals))
         width = np.diff(travel, axis=1)
         floor = min(0.1 * min(layout.extent) / (knots.shape[1] - 1), 0.5 * float(width.min()))
         unit = np.clip((across[:, 1:-1] - border) / (_sides(layout)[1][:, None] - 2 * border), 0.005, 0.995)
@@ -87,7 +87,7 @@ class Fibres:
             travel, cross = (x.numpy() for x in self.axes())
         inner = np.stack([travel, cross], axis=-1)[:, 1:-1]
         inner[self.layout.horizontals :] = inner[self.layout.horizontals :, :, ::-1]
-        return assemble(inner, self.layout)
+        return assemble_knots(inner, self.layout)
 
 
 def _sides(layout: Layout) -> tuple[Array, Array]:
@@ -128,12 +128,12 @@ def first_course(
     """
     layout = pad.layout
     if origin is None and (start == OTHER_START) == gentle:
-        return passing(_zigzag(layout, rules, knots, rng), pad, rules)
-    refined = straight_course(pad, rules, knots) if origin is None else refine(origin.knots, knots, layout)
+        return pass_keep_outs(_zigzag(layout, rules, knots, rng), pad, rules)
+    refined = straight_paths(pad, rules, knots) if origin is None else refine(origin.knots, knots, layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
         return refined
     inner = refined[:, 1:-1] + MOVED * rng.standard_normal(refined[:, 1:-1].shape)
-    return assemble(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
+    return assemble_knots(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
 
 
 def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
@@ -168,7 +168,7 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
         )
         fibres.append(np.stack([travel, cross] if axis == 0 else [cross, travel], axis=-1))
     inner = np.clip(np.concatenate(fibres), 0.02, np.array(layout.extent) - 0.02)
-    return refine(assemble(inner, layout), knots, layout)
+    return refine(assemble_knots(inner, layout), knots, layout)
 
 
 LOUDER = 2.0  # scatter of the first step as a multiple of the last one's
@@ -224,7 +224,7 @@ class GradientSearch:
 
     def morphology(self) -> Morphology:
         """The fibres as they are."""
-        return Morphology.of_layout(self.fibres.knots(), self.fibres.layout)
+        return Morphology.from_layout(self.fibres.knots(), self.fibres.layout)
 
     def state(self) -> State:
         """Everything the rest of the search depends on, as arrays."""
@@ -322,7 +322,7 @@ class GradientSearch:
         presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
         while not presses.free.any():  # it lies in a keep-out
             presses = window_presses(pad, drawn_window(pad.sensed, self.rng), SEARCHED, self.rng)
-        shares = loss_shares(search.lost)
+        shares = loss_shares(search.max_failures)
         masks, _ = sample_failures(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
         masks, scatter = masks.float(), search.response_scatter.scaled(louder)

@@ -13,7 +13,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.objectives.fibre_loss import loss_shares
 from padforge.design.objectives.rules import Violation, check_rules
 from padforge.design.objectives.score import free_presses
-from padforge.design.paths.keep_outs import require_free_ends
+from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 RESERVE = 0.15  # share of a time budget kept for repairing
@@ -117,7 +117,7 @@ def build_problem(
     fibres = pad.layout.fibres
     free_presses(pad)
     if rules.enforce:
-        require_free_ends(pad, rules)
+        check_fibre_ends(pad, rules)
         if pad.bent_radius_mm is not None and pad.bent_radius_mm < rules.min_bend_radius_mm:
             raise InputError(
                 f"[pad] bent_radius_mm is {pad.bent_radius_mm:g}, allowed is at least {rules.min_bend_radius_mm:g}, "
@@ -131,8 +131,8 @@ def build_problem(
                 f"population is {settings.population}: that takes {room} numbers for {fibres} fibres of "
                 f"{settings.knots} knots, allowed are {MAX_VALUES // 4}"
             )
-    if not any(loss_shares(settings.lost)[:fibres]):
-        raise InputError(f"lost is {settings.lost}, allowed is what leaves some of the {fibres} fibres")
+    if not any(loss_shares(settings.max_failures)[:fibres]):
+        raise InputError(f"max_failures is {settings.max_failures}, allowed is what leaves some of the {fibres} fibres")
     if origin is not None:
         check_type("origin", origin, Morphology)
         knots = origin.knots.shape[1] - 2

@@ -28,7 +28,7 @@ from padforge.design.objectives.fibre_loss import loss_shares
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import AMBIGUITY_NOISE, all_terms, ambiguities, ambiguity_terms, sharpness_of
 from padforge.design.optimize.problem import SearchProblem, Stop, build_problem, stopped_by_interrupt
-from padforge.design.paths.keep_outs import straight_course
+from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class SearchResult:
             count as found, but by the published method.
         terms: every term of `score` for it, and its expected errors.
         violations: the rules it breaks; empty where rules are not enforced.
-        found_by: where it is from: "start 2", "genetic", "straight fibres", or "origin", the pad it was to start from.
+        candidate: where it is from: "start 2", "genetic", "straight fibres", or "origin", the pad it was to start from.
         straight: expected errors and ambiguities of straight fibres on the same pad, by name, to set beside its own.
         history: one entry per noted step: {"run", "step", "objective"}.
         enforced: whether it was to keep to the rules.
@@ -137,7 +137,7 @@ class SearchResult:
     morphology: Morphology
     terms: dict[str, float]
     violations: list[Violation]
-    found_by: str
+    candidate: str
     straight: dict[str, float]
     enforced: bool = True
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -170,7 +170,7 @@ def search(
     """
     begin = time.perf_counter()
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
-    contact = or_default("contact", contact, Contact, settings.usual_contact)
+    contact = or_default("contact", contact, Contact, settings.default_contact)
     problem = build_problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
     run = SearchOptions() if run is None else check_type("run", run, SearchOptions)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
@@ -196,7 +196,7 @@ def search(
 
 def score_result(
     morphology: Morphology,
-    found_by: str,
+    candidate: str,
     pad: PadSettings,
     contact: Contact,
     settings: SearchSettings,
@@ -206,17 +206,17 @@ def score_result(
 
     Args:
         morphology: the pad.
-        found_by: where it is from.
+        candidate: where it is from.
         pad, contact, settings, rules: as `search` takes them.
     """
     problem = build_problem(pad, contact, settings, rules, None)
     straight = _Candidate("straight fibres", _straight(problem, Stop(time.perf_counter(), None)), problem)
-    return _scored(_Candidate(found_by, morphology, problem), straight, problem)
+    return _scored(_Candidate(candidate, morphology, problem), straight, problem)
 
 
 def _scored(best: "_Candidate", straight: "_Candidate", problem: SearchProblem) -> SearchResult:
     terms = best.errors() | all_terms(best.pad, best.ambiguities(), problem.contacts[0], problem.rules, problem.pad)
-    beside = straight.errors() | ambiguity_terms(straight.ambiguities())
+    beside = straight.errors() | ambiguity_terms(straight.ambiguities(), straight.pad.unit_mm)
     return SearchResult(best.pad, terms, best.broken, best.name, beside, problem.rules.enforce)
 
 
@@ -266,7 +266,7 @@ class _Candidate:
         """Least for the best pad: fewest broken rules first, then the least of what is minimised."""
         search, total = self._problem.search, 0.0
         for contact, errors in zip(self._problem.contacts, self._errors, strict=True):
-            shares = loss_shares(search.lost)[: len(errors)]
+            shares = loss_shares(search.max_failures)[: len(errors)]
             total += float(np.exp(np.log(errors) @ shares / sum(shares)))
             if search.sharpness > 0:
                 total += search.sharpness * sharpness_of(self.pad, contact, self._problem.pad)
@@ -275,17 +275,17 @@ class _Candidate:
     def ambiguities(self) -> list[float]:
         """With 0, 1, ... lost, under the first contact."""
         problem = self._problem
-        return ambiguities(self.pad, problem.contacts[0], problem.search.lost, AMBIGUITY_NOISE, problem.pad)
+        return ambiguities(self.pad, problem.contacts[0], problem.search.max_failures, AMBIGUITY_NOISE, problem.pad)
 
     def errors(self) -> dict[str, float]:
         """With 0, 1, ... lost, under the first contact, by name."""
-        return error_terms(self._errors[0])
+        return error_terms(self._errors[0], self.pad.unit_mm)
 
 
 def _straight(problem: SearchProblem, stop: Stop) -> Morphology:
     """Straight fibres with as many knots as those that are searched, but for bows around keep-outs, as mended."""
     size, search = problem.pad, problem.search
-    pad = Morphology.of_layout(straight_course(size, problem.rules, search.knots), size.layout)
+    pad = Morphology.from_layout(straight_paths(size, problem.rules, search.knots), size.layout)
     if not size.keep_out_mm or not problem.broken(pad):
         return pad
     from_it = replace(problem, search=search.model_copy(update={"method": "descent"}), origin=pad)

@@ -102,7 +102,7 @@ def search_for_twin(
         run: whom it tells, what it keeps and how long it may take.
 
     Returns:
-        Its `found_by` is "twin", "from usual", "usual" or "straight fibres". A search that is stopped ends with the
+        Its `candidate` is "twin", "from usual", "usual" or "straight fibres". A search that is stopped ends with the
         best so far of what was begun.
     """
     run = run or SearchOptions()

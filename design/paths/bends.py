@@ -30,7 +30,7 @@ def extreme_headings(slopes: Array) -> Array:
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
 
-def traced_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
+def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
     """Points (n, 2) of one fibre and its exact headings (n,) there; from one to the next it turns by at most `step`.
 
     Such points also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.design.kernels.geometry import near_intervals
 from padforge.design.kernels.pchip import pchip_slopes
-from padforge.design.morphology import Array, Morphology, assemble
+from padforge.design.morphology import Array, Morphology, assemble_knots
 from padforge.design.settings import Layout
 
-MOST_POINTS = 10**7
+MAX_POINTS = 10**7
 """Most points the curves of a pad are flattened to."""
 
 
@@ -73,8 +73,8 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     curves = beziers(check_type("pad", pad, Morphology))
     second = np.linalg.norm(np.diff(curves, 2, axis=2), axis=3).max(axis=2)
     counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
-    if counts.sum() > MOST_POINTS:
-        raise InputError(f"tolerance is {tolerance:g}: that takes {counts.sum()} points, allowed are {MOST_POINTS}")
+    if counts.sum() > MAX_POINTS:
+        raise InputError(f"tolerance is {tolerance:g}: that takes {counts.sum()} points, allowed are {MAX_POINTS}")
     steps = counts.ravel()
     starts = np.cumsum(steps) - steps  # a pad's spans at once: many take no longer than a few
     u = (np.arange(steps.sum()) - np.repeat(starts, steps)) / np.repeat(steps, steps)
@@ -173,7 +173,7 @@ def refine(knots: Array, count: int, layout: Layout) -> Array:
             travel = np.insert(travel, longest + 1, travel[longest : longest + 2].mean())
         cross = curve(travel)
         fibres.append(np.stack([travel, cross] if axis == 0 else [cross, travel], axis=-1))
-    return assemble(np.array(fibres)[:, 1:-1], layout)
+    return assemble_knots(np.array(fibres)[:, 1:-1], layout)
 
 
 _TOUCHING = 1e-6

@@ -21,7 +21,7 @@ _LEVEL = 1e-9
 """Heights that differ by less are one: a file in pitches is right to rounding."""
 
 
-def with_spares(courses: Sequence[Array], layout: Layout) -> Array:
+def add_spare_knots(courses: Sequence[Array], layout: Layout) -> Array:
     """(F, n, 2) knots of all fibres, n of the one that has most; those of others are filled up with spare ones.
 
     Args:
@@ -31,7 +31,7 @@ def with_spares(courses: Sequence[Array], layout: Layout) -> Array:
     return np.stack([_filled(course, layout.family(fibre), most - len(course)) for fibre, course in enumerate(courses)])
 
 
-def without_spares(knots: Array, layout: Layout) -> list[Array]:
+def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
     """Of every fibre its knots (n, 2) but the spare ones, of knots (F, n, 2)."""
     courses = []
     for fibre, line in enumerate(knots):
@@ -105,7 +105,7 @@ _NEAREST = 2e-3
 """Least distance of knots along the curve, of its length."""
 
 
-def fitted_knots(points: Array, tolerance: float, most: int = 64) -> Array:
+def fit_knots(points: Array, tolerance: float, most: int = 64) -> Array:
     """(n, 2) knots of a PCHIP curve through `points` that keeps within `tolerance` of it, from its first to its last.
 
     What is missed is measured along the normal of the curve.

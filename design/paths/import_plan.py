@@ -11,13 +11,13 @@ from padforge.design.common.validation import InputError, check_float
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import flatten
 from padforge.design.paths.drawing_files import DrawnCurve, DrawnPlan, read_dxf, read_svg
-from padforge.design.paths.fitting import fitted_knots, with_spares
+from padforge.design.paths.fitting import add_spare_knots, fit_knots
 from padforge.design.settings import Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
-MOST_KNOTS = 64
+MAX_KNOTS = 64
 """Inner knots of a fibre at most, as of [search] knots."""
-MOST_TIMES = 8
+MAX_CURVES_PER_FIBRE = 8
 """Curves for every fibre at most: others are told one by one."""
 _BACK_MM = 2e-4
 """A curve may go back by so much: files round."""
@@ -91,7 +91,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
         strokes = drawing.fibres
         if not strokes:
             raise InputError("there is no open curve in it")
-        if len(strokes) > MOST_TIMES * layout.fibres:
+        if len(strokes) > MAX_CURVES_PER_FIBRE * layout.fibres:
             raise InputError(
                 f"it has {len(strokes)} open curves, expected {layout.fibres}, one a fibre; put these into a layer or"
                 " group whose name begins with fibre"
@@ -101,7 +101,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
         knots = _fitted(courses, layout, tolerance_mm)
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    pad = Morphology.of_layout(knots, layout)
+    pad = Morphology.from_layout(knots, layout)
     off = [
         _apart(line, course, layout)
         for line, course in zip(flatten(pad, _FLAT_MM / layout.unit_mm), courses, strict=True)
@@ -109,7 +109,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
     for course, (off_mm, place) in zip(courses, off, strict=True):
         if off_mm > max(tolerance_mm, course.error_mm) * 1.05:
             raise InputError(
-                f"{path}: {course.name}: {MOST_KNOTS} knots keep within {off_mm:.3g} mm of it, at {place}; allowed is"
+                f"{path}: {course.name}: {MAX_KNOTS} knots keep within {off_mm:.3g} mm of it, at {place}; allowed is"
                 f" {tolerance_mm:g} mm (--tolerance-mm)"
             )
     told = (ImportedFibre(course.name, course.error_mm, at[0]) for course, at in zip(courses, off, strict=True))
@@ -237,12 +237,12 @@ def _fitted(courses: Sequence[_Course], layout: Layout, tolerance_mm: float) -> 
         middle = np.array(layout.extent) / 2
         line[[0, -1], 1] = (layout.levels[fibre] - middle[1 - family]) * layout.unit_mm
         # what is missed is measured where samples are, and along normals
-        found = fitted_knots(line, _AIM * tolerance_mm, MOST_KNOTS)
+        found = fit_knots(line, _AIM * tolerance_mm, MAX_KNOTS)
         knots = (found if family == 0 else found[:, ::-1]) / layout.unit_mm + middle
         knots[[0, -1], family] = 0, layout.extent[family]
         knots[[0, -1], 1 - family] = layout.levels[fibre]
         fitted.append(np.clip(knots, 0, layout.extent))
-    return with_spares(fitted, layout)
+    return add_spare_knots(fitted, layout)
 
 
 def _apart(line: Array, course: _Course, layout: Layout) -> tuple[float, str]:

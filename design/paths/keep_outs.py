@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from shapely import Polygon
 
 from padforge.design.common.validation import InputError
-from padforge.design.morphology import MARGIN, Array, Morphology, assemble
+from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PadSettings, RulesSettings
 
@@ -17,7 +17,7 @@ def keep_outs(pad: PadSettings) -> list[Polygon]:
     return [Polygon(np.array(corners) / scale + middle) for corners in pad.keep_out_mm]
 
 
-def require_free_ends(pad: PadSettings, rules: RulesSettings) -> None:
+def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
     """Refuse keep-outs that come too near to the ends of fibres, which cannot move.
 
     Raises:
@@ -38,7 +38,7 @@ def require_free_ends(pad: PadSettings, rules: RulesSettings) -> None:
                     )
 
 
-def outside(places: NDArray[np.float64], pad: PadSettings) -> NDArray[np.bool_]:
+def is_outside(places: NDArray[np.float64], pad: PadSettings) -> NDArray[np.bool_]:
     """(Q,) which of the places (Q, 2), in grid units, lie in no keep-out."""
     free = np.ones(len(places), bool)
     for polygon in keep_outs(pad):
@@ -98,7 +98,7 @@ def _passages(pad: PadSettings, rules: RulesSettings, family: int) -> list[_Pass
     return [_Passage(box, family, pad, rules) for box in boxes]
 
 
-def passing(knots: Array, pad: PadSettings, rules: RulesSettings) -> Array:
+def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Array:
     """Knots (F, N+2, 2) of the same course, but for where it leads by a keep-out: fibres take their lanes there."""
     layout = pad.layout
     found = knots.copy()
@@ -111,7 +111,7 @@ def passing(knots: Array, pad: PadSettings, rules: RulesSettings) -> Array:
     return found
 
 
-def straight_course(pad: PadSettings, rules: RulesSettings, count: int) -> Array:
+def straight_paths(pad: PadSettings, rules: RulesSettings, count: int) -> Array:
     """Knots (F, `count` + 2, 2) of straight fibres, which bow around keep-outs where the rules ask for it."""
     layout = pad.layout
     marks = []
@@ -120,11 +120,11 @@ def straight_course(pad: PadSettings, rules: RulesSettings, count: int) -> Array
         marks.append(np.unique(np.clip(found, 2 * MARGIN, extent - 2 * MARGIN)))
     fewest = max(len(each) for each in marks)
     if fewest > count:
-        return passing(refine(Morphology.straight(layout).knots, count, layout), pad, rules)
+        return pass_keep_outs(refine(Morphology.straight(layout).knots, count, layout), pad, rules)
     inner = np.empty((layout.fibres, fewest, 2))
     for family, rows in enumerate(layout.families):
         missing = fewest - len(marks[family])
         first = marks[family].min(initial=layout.extent[family])
         inner[rows, :, family] = [*np.linspace(0, first, missing + 2)[1:-1], *marks[family]]
         inner[rows, :, 1 - family] = layout.levels[rows, None]
-    return refine(passing(assemble(inner, layout), pad, rules), count, layout)
+    return refine(pass_keep_outs(assemble_knots(inner, layout), pad, rules), count, layout)

@@ -18,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 
 from padforge.design.common.validation import InputError, check_type
 from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.bends import traced_curve
+from padforge.design.paths.bends import trace_curve
 from padforge.design.paths.curves import Crossing, beziers, common_stretches, crossings, flatten, lengths, slope_beziers
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import Layout
@@ -91,7 +91,7 @@ class Plan:
             return self
         layout = self.pad.layout
         larger = Layout(*layout.counts, layout.pitch_x_mm / shrunk, layout.pitch_y_mm / shrunk)
-        pad = Morphology.of_document({**self.pad.document(), "pitch_mm": larger.pitch_mm})
+        pad = Morphology.from_dict({**self.pad.to_dict(), "pitch_mm": larger.pitch_mm})
         return Plan(pad, self.settings.enlarged(), self)
 
     @cached_property
@@ -134,7 +134,7 @@ class Plan:
         past = self.settings.mould.exit_mm + past_mm
         found = []
         for fibre, (spans, slopes) in enumerate(zip(beziers(self.pad), slope_beziers(self.pad), strict=True)):
-            points, headings = traced_curve(spans, slopes, step)
+            points, headings = trace_curve(spans, slopes, step)
             (before, coming), (after, going) = (lead.traced(step, past) for lead in self.leads.pairs[fibre])
             headings = np.pi / 2 - headings if self.family(fibre) else headings
             whole = np.concatenate([coming[::-1] + np.pi, headings, going])

@@ -100,7 +100,7 @@ def record(
         if resume or dry_run or model:
             raise InputError("--resume, --dry-run and --model need --through-drivers or a real rig")
         shown = like if like and not morphology else pad
-        if like and morphology and (left := like.left_out()):
+        if like and morphology and (left := like.ignored_effects()):
             click.echo(f"{twin}: {left}", err=True)
         recording = operation.record_simulated(settings, shown, target, overrides, inputs, like)
     else:

@@ -121,7 +121,7 @@ def simulated(model: Path) -> "SimulatedConverter":
     if "twin" in source:
         raise InputError(f"{path}: of a pad simulated by its twin, which is not live; --replay shows a recording")
     try:
-        pad = Morphology.of_document(source["morphology"])
+        pad = Morphology.from_dict(source["morphology"])
         contact, rig = dict(source["contact"]), dict(source["rig"])
         rig.pop("channels", None)  # of no simulated pad; once it was a number
         size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}

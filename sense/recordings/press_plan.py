@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.design.paths.keep_outs import keep_outs, outside
+from padforge.design.paths.keep_outs import is_outside, keep_outs
 from padforge.design.settings import PadSettings
 from padforge.sense.recordings.formats.csv_table import CsvTable
 from padforge.sense.recordings.processing.limits import MAX_MM, Array, Indices, Mask, as_numbers, refuse_beyond
@@ -77,7 +77,7 @@ def size_of(pad: Morphology, size: PadSettings | None = None) -> PadSettings:
     Raises:
         InputError: presses beyond this pad, or keep-outs that leave less than LEAST_FREE of what is pressed.
     """
-    size = or_default("size", size, PadSettings).of(pad.layout)
+    size = or_default("size", size, PadSettings).for_layout(pad.layout)
     if size.keep_out_mm:
         import shapely
 
@@ -90,15 +90,15 @@ def size_of(pad: Morphology, size: PadSettings | None = None) -> PadSettings:
 
 
 def told_pad(pad: Morphology) -> dict[str, Any]:
-    """What a recording says of its pad, which `Morphology.of_document` reads."""
-    document = pad.document()
+    """What a recording says of its pad, which `Morphology.from_dict` reads."""
+    document = pad.to_dict()
     kept = ("pitch_mm", "knots") if pad.layout.is_square else ("format", "fibres", "pitch_mm", "knots")
     return {key: document[key] for key in kept}
 
 
 def free_of(pad: Morphology, size: PadSettings) -> Free:
     """Which places on the plan of a pad lie in no keep-out of `size`."""
-    return lambda places_mm: outside(pad.to_grid(places_mm), size)
+    return lambda places_mm: is_outside(pad.to_grid(places_mm), size)
 
 
 def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator, size: PadSettings | None = None) -> PressPlan:

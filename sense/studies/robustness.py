@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from padforge.design.common.checkpoints import State
 from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.common.validation import InputError
-from padforge.design.contact import lattice, signals, signals_quantized
+from padforge.design.contact import grid_positions, signals, signals_quantized
 from padforge.design.morphology import Morphology
 from padforge.design.networks import Loss, PressSets, batches
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -93,7 +93,7 @@ def _found(
         return RULES[rule](pad, places, contact)
 
     trial = PressSets.of(pad, side, test, seed, answer)
-    places = lattice(between_fibres(pad.layout), SIDE)
+    places = grid_positions(between_fibres(pad.layout), SIDE)
     over = answer(places)
     repeats = -(-NETWORKS // math.comb(pad.layout.fibres, len(losses[0])))
     found = [

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from padforge.design import Morphology
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.settings import sensed_rectangle
-from padforge.design.twin import MOST_LOOKS, TwinReadings
+from padforge.design.twin import MAX_INFORMATION_GAIN, TwinReadings
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.recordings.simulation.strengths import strengths
@@ -208,7 +208,7 @@ def _readings(
     if not found:
         return None
     told = information(recording, live).sum() / (pad.steepness(places_mm) / noise_v[live] ** 2).sum()
-    return TwinReadings(**found, looks=float(np.clip(told, 1, MOST_LOOKS)))
+    return TwinReadings(**found, information_gain=float(np.clip(told, 1, MAX_INFORMATION_GAIN)))
 
 
 def _noise(alone: Array, pad: LaidPad, learnt: Responses, live: Indices) -> Array:

@@ -127,7 +127,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
     assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
     assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
     assert (search["weights"], search["presses"], search["levels"]) == ((1.0, 1e-7, 5e-6), 7, 4096)
-    assert (search["lost"], search["noise"], search["sharpness"]) == (3, 0.02, 0.0)
+    assert (search["max_failures"], search["noise"], search["sharpness"]) == (3, 0.02, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
         (PadSettings, "grid", (1, 64), (0,)),
         (PadSettings, "sensed_mm", ("beyond", "fibres", (56.25, 0.1)), ("all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0)),
         (Contact, "sides", (3,), (2,)),
-        (SearchSettings, "lost", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
+        (SearchSettings, "max_failures", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
         (SearchSettings, "noise", (1e-9, 10.0), (0.0, 10.1)),
         (SearchSettings, "weights", ((1.0, 0.0, 0.0), (0.0, 1e6, 5e-324)), ((0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,))),
         (SearchSettings, "presses", (2, 64), (1, 65)),
@@ -161,11 +161,11 @@ def test_a_rectangle_is_what_was_stated_and_its_middle_is_pressed():
     assert stated.sensed == sensed_rectangle(stated.layout)
     assert Spec(tomllib.loads(commented_toml({"pad": PadSettings}, {"pad": stated}))).section(PadSettings) == stated
     assert PadSettings.model_validate_json(stated.model_dump_json()) == stated
-    assert stated.of(Layout.of(4)).layout == Layout.of(4)
+    assert stated.for_layout(Layout.create(4)).layout == Layout.create(4)
     assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
-    assert sensed_rectangle(Layout.of(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
-    assert sensed_rectangle(Layout.of(4), "fibres") == ((1, 1), (4, 4))
-    assert sensed_rectangle(Layout.of(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
+    assert sensed_rectangle(Layout.create(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
+    assert sensed_rectangle(Layout.create(4), "fibres") == ((1, 1), (4, 4))
+    assert sensed_rectangle(Layout.create(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
     assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
     again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
@@ -232,7 +232,11 @@ HOLE = [[0, 0], [4, 0], [0, 4]]
             {"sensitivity_profile": np.array([[0, 1], [5, 0.5], [12, 0]])},
             {"sensitivity_profile": ((0, 1), (5, 0.5), (12, 0))},
         ),
-        (SearchSettings, {"lost": np.array([0.5, 0.5]), "seed": np.uint32(7)}, {"lost": (0.5, 0.5), "seed": 7}),
+        (
+            SearchSettings,
+            {"max_failures": np.array([0.5, 0.5]), "seed": np.uint32(7)},
+            {"max_failures": (0.5, 0.5), "seed": 7},
+        ),
         (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
         (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
     ],
@@ -263,11 +267,11 @@ def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_pap
         design.signals_quantized(pad, presses), design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
     )
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
-    quick = {"lost": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
+    quick = {"n_failed": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
     assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
-    assert SearchSettings().usual_contact == Contact()
-    assert SearchSettings(method="genetic").usual_contact == PUBLISHED_CONTACT
-    terms, published = design.score(pad, lost=0), design.score(pad, PUBLISHED_CONTACT, lost=0)
+    assert SearchSettings().default_contact == Contact()
+    assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
+    terms, published = design.score(pad, max_failures=0), design.score(pad, PUBLISHED_CONTACT, max_failures=0)
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:
         assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name

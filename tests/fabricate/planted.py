@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from padforge.design.morphology import Morphology, assemble
+from padforge.design.morphology import Morphology, assemble_knots
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.fabricate.materials import FibreSettings, SiliconeSettings
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
@@ -18,14 +18,14 @@ def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology
     inner[:2, :, 1] = [[first], [second]]
     inner[2:, :, 0] = [[1], [2]]
     inner[2:, :, 1] = (1, 2)
-    return Morphology(assemble(inner), pitch_mm)
+    return Morphology(assemble_knots(inner), pitch_mm)
 
 
 def winding_pad(*places: tuple[float, float], pitch_mm: float = 10.0) -> Morphology:
     """A pad of 1 x 1 whose horizontal fibre runs through places (grid units, 0..2); its vertical one is straight."""
     along = 2 * np.arange(1, len(places) + 1) / (len(places) + 1)
     vertical = np.stack([np.ones(len(places)), along], axis=1)
-    return Morphology(assemble(np.stack([np.array(places, dtype=float), vertical])), pitch_mm)
+    return Morphology(assemble_knots(np.stack([np.array(places, dtype=float), vertical])), pitch_mm)
 
 
 def with_settings(

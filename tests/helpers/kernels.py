@@ -71,7 +71,7 @@ def design_kernels() -> None:
     indented_signals(pad, presses, 0.1, Indenter())
     check_rules(pad, RulesSettings())
     for contact in (Contact(), PUBLISHED_CONTACT):
-        search(PadSettings(grid=1), contact, SearchSettings(knots=1, starts=1, steps=2, lost=1))
+        search(PadSettings(grid=1), contact, SearchSettings(knots=1, starts=1, steps=2, max_failures=1))
     with tempfile.TemporaryDirectory() as folder:
         build(Morphology.straight(1), folder, ["stl"])
         check_mesh(Path(folder) / "mould.stl")

@@ -15,7 +15,7 @@ grid = 2
 knots = 2
 starts = 1
 steps = 10
-lost = 1
+max_failures = 1
 [rig]
 presses = 80
 [localizer]

@@ -114,7 +114,7 @@ def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
 
 
 def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
-    settings = SearchSettings(knots=1, starts=2, steps=2, lost=0)
+    settings = SearchSettings(knots=1, starts=2, steps=2, max_failures=0)
     asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
     monkeypatch.setattr("padforge.design.common.checkpoints.Checkpoints.clear", lambda self: None)
     with profiling.profiled() as profile:
@@ -147,11 +147,13 @@ def test_calibration_tells_its_stages():
 
 @pytest.mark.slow
 def test_the_command_line_profiles_on_stderr_and_loads_what_it_needs(tmp_path):
-    (tmp_path / "pad.toml").write_text("[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nlost = 0\n")
+    (tmp_path / "pad.toml").write_text(
+        "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 0\n"
+    )
     command = [sys.executable, "-m", "padforge", "design", "--profile", "--json"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode in (0, 1), result.stderr
-    assert json.loads(result.stdout)["format"] == "padforge-design/1"
+    assert json.loads(result.stdout)["format"] == "padforge-design/2"
     told = dict(line.split(maxsplit=1) for line in result.stderr.splitlines() if line.startswith("  "))
     assert told["starts"] == "0 of 1"
     skipped = told["imports"].split(" (not ")[0]

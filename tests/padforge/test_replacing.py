@@ -11,7 +11,7 @@ from padforge.design.morphology import Morphology
 from padforge.sense.recordings.recorder import Recorder
 from tests.helpers.door import called, refused
 
-SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nlost = 1\n[rules]\nenforce = false\n"
+SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nmax_failures = 1\n[rules]\nenforce = false\n"
 DESIGN = "design --out pad"
 
 

@@ -31,7 +31,7 @@ def sound() -> dict[str, Any]:
     """Arguments that suit, by the name of a parameter, of the files in the current folder."""
     pad = design.Morphology.load("pad/morphology.json")
     recording = sense.open_recording("pad/recording")
-    search = design.SearchSettings(knots=1, starts=1, steps=2, lost=1)
+    search = design.SearchSettings(knots=1, starts=1, steps=2, max_failures=1)
     found = {
         "pad": pad,
         "knots": pad.knots,
@@ -73,7 +73,7 @@ def sound() -> dict[str, Any]:
         "depths": np.array([0.1]),
         "tables": {"contact": {"radius": 0.5}},
         "held_back": (0, 1),
-        "document": pad.document(),
+        "document": pad.to_dict(),
         "levels": (0, 1),
         "tolerance": 1e-2,
         "provenance": {},

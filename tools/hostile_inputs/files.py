@@ -16,7 +16,7 @@ grid = 2
 knots = 1
 starts = 1
 steps = 2
-lost = 1
+max_failures = 1
 population = 4
 generations = 1
 [rules]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from shapely import ops
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.paths.bends import bend_radius, traced_curve
+from padforge.design.paths.bends import bend_radius, trace_curve
 from padforge.design.paths.curves import beziers, flatten, slope_beziers
 from padforge.fabricate.checks.findings import Finding, Status, as_places, graded, verdict
 from padforge.fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
@@ -244,7 +244,7 @@ def _folds(plan: Plan) -> Finding:
     curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, _FINE_MM / pad.unit_mm), strict=True)
     for fibre, (spans, slopes, line) in enumerate(curves):
         half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.levels[fibre]] * plan.settings.ridge_slope
-        points, headings = traced_curve(spans, slopes, _TURN)
+        points, headings = trace_curve(spans, slopes, _TURN)
         aside = -1 if plan.family(fibre) else 1
         places, walls = _inner_walls(pad.to_mm(points)[:, ::aside], headings, half)
         cuts = half - shapely.distance(shapely.LineString(pad.to_mm(line)), shapely.points(walls[:, ::aside]))

@@ -170,7 +170,7 @@ def read_pad(
     presses, channels = answers.shape
     # the divider draws first, as in `LivePad`: with the same seed fibres rest where they do there
     model = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
-    answers = answers * rig.response_scatter.gains((presses, channels), rng)
+    answers = answers * rig.response_scatter.sample_gains((presses, channels), rng)
     if noise_v is not None:
         own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
         answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)
@@ -248,7 +248,7 @@ class LivePad:
         strained = np.zeros((len(places_mm), len(self._pad.knots)))
         for row, touched in enumerate(depths_mm > 0):
             if touched and not self._touched:
-                self._gains = self._rig.response_scatter.gains((1, len(self._gains)), self._rng)[0]
+                self._gains = self._rig.response_scatter.sample_gains((1, len(self._gains)), self._rng)[0]
             self._touched = bool(touched)
             if touched:
                 strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(places_mm[row])

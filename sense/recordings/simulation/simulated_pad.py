@@ -79,7 +79,7 @@ def measured(twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
 
     def answers(places_mm: Array) -> Array:
         out = np.zeros((len(places_mm), len(twin.channels)))
-        out[:, columns] = gains_v * twin.laid_stretch(places_mm)[:, fibres]
+        out[:, columns] = gains_v * twin.as_built_stretch(places_mm)[:, fibres]
         return out
 
     half_mm = _sides_mm(twin) / 2
@@ -136,7 +136,12 @@ def _told(twin: Twin, noise_v: Array, source: dict[str, Any]) -> tuple[Array, di
     much as blurs the place where all that was read of a press counts.
     """
     strengths = asdict(twin.readings) if twin.readings else {}
-    looks = strengths.pop("looks", 1.0)
-    strengths |= {"scatter": twin.scatter.share / np.sqrt(looks), "scatter_common": twin.scatter.common}
-    said = {"presses": twin.presses, "noise": twin.noise, "looks": looks, "provenance": dict(twin.provenance)}
-    return twin.scatter.floor * noise_v / np.sqrt(looks), strengths, source | {"twin": said}
+    information_gain = strengths.pop("information_gain", 1.0)
+    strengths |= {"scatter": twin.scatter.share / np.sqrt(information_gain), "scatter_common": twin.scatter.common}
+    said = {
+        "presses": twin.presses,
+        "noise": twin.noise,
+        "information_gain": information_gain,
+        "provenance": dict(twin.provenance),
+    }
+    return twin.scatter.floor * noise_v / np.sqrt(information_gain), strengths, source | {"twin": said}

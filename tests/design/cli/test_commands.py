@@ -20,7 +20,7 @@ from padforge.design.optimize.twin_search import settings_for_twin, state_folder
 from padforge.design.settings import PadSettings, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
-QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nlost = 1\n"
+QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nmax_failures = 1\n"
 QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")
 
 
@@ -40,22 +40,23 @@ def designed(*arguments, spec):
 
 def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_read_again(here):
     told, document = designed(spec=QUICK)
-    pad, asked = Morphology.straight(2), {"lost": 1, "size": PadSettings(grid=2)}
+    pad, asked = Morphology.straight(2), {"max_failures": 1, "size": PadSettings(grid=2)}
     straight = [
-        *expected_errors(pad, Contact(), SearchSettings(lost=1), asked["size"]),
+        *expected_errors(pad, Contact(), SearchSettings(max_failures=1), asked["size"]),
         *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
     ]
-    assert list(document["straight"].values()) == pytest.approx(straight, rel=1e-6)
-    assert set(document["straight"]) == {name for name in document["terms"] if "_lost_" in name}
+    straight_mm = [pad.unit_mm * value for value in straight]
+    assert list(document["straight"].values()) == pytest.approx(straight_mm, rel=1e-6)
+    assert set(document["straight"]) == {name for name in document["terms"] if "_mm_" in name}
     result = load_result(Path("out/pad"))
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
-    assert document["found_by"] == result.found_by == "straight fibres"
+    assert document["candidate"] == result.candidate == "straight fibres"
     assert summary_lines(result, Path("out/pad"))[1:] == told[1:]
-    first, second = (11.25 * value for value in straight[:2])
+    first, second = straight_mm[:2]
     assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
     assert (told[3].startswith("  the search found no better pad"), told[4:]) == (True, ["  all rules hold"])
-    alike = summary_lines(replace(result, found_by="start 1"), Path("out/pad"))
+    alike = summary_lines(replace(result, candidate="start 1"), Path("out/pad"))
     assert alike[3].startswith("  not significantly better than straight fibres")
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
@@ -98,9 +99,11 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
 
 def judged(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
-    asked = {"lost": 1, "size": PadSettings(sensed_mm=(18, 30)).of(pad.layout)}
-    settings = SearchSettings(lost=1, noise=noise, scatter=0.05, scatter_common=0.5)
-    return score(pad, contact, **asked) | error_terms(expected_errors(pad, contact, settings, asked["size"]))
+    asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
+    settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
+    return score(pad, contact, **asked) | error_terms(
+        expected_errors(pad, contact, settings, asked["size"]), pad.unit_mm
+    )
 
 
 @pytest.mark.slow
@@ -108,7 +111,7 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(here, twin):
     _, document = designed("--twin", twin, spec=QUICK_SEARCH)
     used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
     assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
-    assert document["found_by"] in ("twin", "from usual", "usual", "straight fibres")
+    assert document["candidate"] in ("twin", "from usual", "usual", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
     assert document["terms"] == pytest.approx(judged(pad, contact, used["search"]["noise"]), rel=1e-9)

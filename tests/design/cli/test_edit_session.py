@@ -20,7 +20,7 @@ def session(tmp_path, pad=None, **size):
         source = tmp_path / "pad.json"
         pad.save(source)
         size = dict(pad.layout.settings)
-    evaluator = PathEvaluator(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(lost=1))
+    evaluator = PathEvaluator(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(max_failures=1))
     begun = EditSession(evaluator, source, tmp_path / "out.json", shown.append)
     begun.begin()
     return begun, shown
@@ -39,7 +39,7 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     _, shown = session(tmp_path, pad)
     assert [view["ready"] for view in shown] == [False, True]
     view = shown[-1]
-    size = PadSettings().of(pad.layout)
+    size = PadSettings().for_layout(pad.layout)
     assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
     ambiguity = np.array(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size))
     assert view["ambiguity_mm"] == pytest.approx(pad.unit_mm * ambiguity, abs=3e-3)

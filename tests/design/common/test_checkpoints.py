@@ -87,7 +87,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes
 
 
 def searched(method: str, run: SearchOptions) -> SearchResult:
-    settings = SearchSettings(method=method, knots=1, starts=1, steps=3, lost=0, population=4, generations=2)  # pyright: ignore
+    settings = SearchSettings(method=method, knots=1, starts=1, steps=3, max_failures=0, population=4, generations=2)  # pyright: ignore
     return search(PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False), run=run)
 
 

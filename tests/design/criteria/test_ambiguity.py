@@ -122,7 +122,7 @@ def test_fibres_that_no_press_touches_change_no_ambiguity():
     ],
 )
 def test_the_mean_of_the_map_is_the_ambiguity_of_the_score(pad, contact):
-    size = PadSettings().of(pad.layout)
+    size = PadSettings().for_layout(pad.layout)
     means = ambiguity_map(pad, free_presses(size), contact, 3, 0.05).mean(axis=1)
     # the score's is in single precision
     assert means == pytest.approx(ambiguities(pad, contact, 3, 0.05, size), rel=1e-3, abs=3e-4)

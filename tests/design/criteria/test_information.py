@@ -106,7 +106,7 @@ def test_the_objective_is_that_of_plain_numpy_and_comes_nearer_to_the_exact_one_
 
 
 def test_published_presses_cover_the_grid():
-    places = published_presses(Layout.of(4))
+    places = published_presses(Layout.create(4))
     assert places.shape == (49, 2)
     assert places.min() >= 1
     assert 3.9 < places.max() <= 4 + 2 / 49
@@ -115,7 +115,7 @@ def test_published_presses_cover_the_grid():
 @pytest.mark.parametrize(("name", "share"), [("square_grid_cir", 0.70), ("5para_dis", 0.58)])
 def test_idle_share_of_the_published_pads(published, name, share):
     """Table III of the paper: 70 % and 57 % in simulation."""
-    places = serpentine_presses(between_fibres(Layout.of(4)), 32, 5 / 49)
+    places = serpentine_presses(between_fibres(Layout.create(4)), 32, 5 / 49)
     changes = signals(Morphology.load(published / f"{name}.mat"), places, PUBLISHED_CONTACT)
     assert idle_share(changes) == pytest.approx(share, abs=0.01)
 

@@ -16,47 +16,47 @@ def test_a_pad_is_scored_where_it_is_pressed():
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
     pad = Morphology.random(3, 4, seed=1)
     beyond, between, wide = (
-        score(pad, lost=1, size=PadSettings(sensed_mm=where)) for where in ("beyond", "fibres", (40, 20))
+        score(pad, max_failures=1, size=PadSettings(sensed_mm=where)) for where in ("beyond", "fibres", (40, 20))
     )
     for name in beyond:
         same = name.startswith(("published", "information", "penalty"))
         assert (beyond[name] == between[name] == wide[name]) == same
-    assert score(pad, lost=1) == beyond
+    assert score(pad, max_failures=1) == beyond
     disc = Contact(radius=0.9, sides=None)
     terms = published_terms(pad, disc)[0]
-    assert score(pad, disc, lost=0)["published_objective"] == terms.objective != beyond["published_objective"]
+    assert score(pad, disc, max_failures=0)["published_objective"] == terms.objective != beyond["published_objective"]
     assert beyond["published_objective"] == published_terms(pad)[0].objective  # a measured contact has none of its own
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
 def test_the_joint_entropy_of_the_published_pads_is_saturated(published, name):
-    terms = score(Morphology.load(published / f"{name}.mat"), lost=0)
+    terms = score(Morphology.load(published / f"{name}.mat"), max_failures=0)
     assert terms["published_joint_entropy"] == pytest.approx(math.log2(49))
 
 
 def test_the_joint_entropy_of_all_fibres_saturates_where_those_of_the_families_do_not():
     """49 presses give no more than log2 49 bits, and straight fibres have them."""
     pad = Morphology.straight(4)
-    assert score(pad, lost=0)["published_joint_entropy"] == pytest.approx(math.log2(49))
+    assert score(pad, max_failures=0)["published_joint_entropy"] == pytest.approx(math.log2(49))
     assert published_terms(pad)[0].entropy < 9
-    one = score(Morphology.straight((1, 0)), lost=0)  # one family is all there is
+    one = score(Morphology.straight((1, 0)), max_failures=0)  # one family is all there is
     assert one["published_joint_entropy"] == one["published_entropy"]
 
 
 def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
     """Of 2M = 32 fibres taken 5 at a time there are two hundred thousand losses: a sample stands for them."""
-    terms = score(Morphology.straight(16), PUBLISHED_CONTACT, lost=5)
-    assert 0 < terms["ambiguity_lost_0"] <= terms["ambiguity_lost_5"]
+    terms = score(Morphology.straight(16), PUBLISHED_CONTACT, max_failures=5)
+    assert 0 < terms["ambiguity_mm_0"] <= terms["ambiguity_mm_5"]
 
 
 @pytest.mark.parametrize(
     ("pad", "asked", "message"),
     [
         (Morphology.straight(3), {"size": PadSettings(sensed_mm=(46, 20))}, "the pad itself is 45 mm wide"),
-        (Morphology.random(16, 3000, seed=0), {"lost": 0}, "too many"),
-        (Morphology.straight(2), {"lost": -1}, r"\[search\] lost"),
-        (Morphology.straight(2), {"lost": (0.0, 0.0)}, r"\[search\] lost"),
+        (Morphology.random(16, 3000, seed=0), {"max_failures": 0}, "too many"),
+        (Morphology.straight(2), {"max_failures": -1}, r"\[search\] max_failures"),
+        (Morphology.straight(2), {"max_failures": (0.0, 0.0)}, r"\[search\] max_failures"),
         (Morphology.straight(2), {"noise": 0.0}, r"\[search\] noise"),
         (Morphology.straight(2), {"contact": 0.6}, "contact"),
         (Morphology.straight(2), {"rules": {}}, "rules"),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from padforge.design import Contact, Morphology
-from padforge.design.morphology import assemble
+from padforge.design.morphology import assemble_knots
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.published import disorder, disorder_area
 from padforge.design.objectives.rules import check_rules
@@ -54,7 +54,7 @@ def wild_pad(kind, seed):
         inner[:grid, :, 0] = inner[grid:, :, 1] = rng.uniform(0, grid) + 1e-9 * np.arange(count)
     elif kind == "level":
         inner[:grid, :, 1], inner[grid:, :, 0] = levels + rng.normal(0, 1e-12, (grid, count)), levels
-    return Morphology(assemble(inner), rng.choice([0.1, 11.25, 1000.0]))
+    return Morphology(assemble_knots(inner), rng.choice([0.1, 11.25, 1000.0]))
 
 
 @pytest.fixture(params=[0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from padforge.design.contact import lattice, relative_stretch, signals
+from padforge.design.contact import grid_positions, relative_stretch, signals
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import expected_error as module
 from padforge.design.objectives.expected_error import (
@@ -242,7 +242,7 @@ def test_judging_a_huge_pad_looks_at_a_draw_of_windows_and_of_presses():
 def test_places_far_apart_on_a_large_pad_may_not_look_alike():
     """Fibres that fold back answer alike at places more than a window apart: which a window alone does not see."""
     pad = Morphology.straight(PadSettings(grid=8).layout)
-    search, size, contact = SearchSettings(lost=0), PadSettings(grid=8), Contact()
+    search, size, contact = SearchSettings(max_failures=0), PadSettings(grid=8), Contact()
     usual = expected_errors(pad, contact, search, size)[0]
 
     def folded(positions):
@@ -268,11 +268,11 @@ def test_fibres_of_a_strip_are_compared_each_by_its_own_full_scale():
     """Those along a strip show a third of those across it; a localizer scales its inputs, and is no worse for it."""
     size = PadSettings(horizontals=3, verticals=12)
     weights = kernel_weights(size.layout)
-    stretch = relative_stretch(Morphology.straight(size.layout), lattice(size.sensed, 40), Contact())
+    stretch = relative_stretch(Morphology.straight(size.layout), grid_positions(size.sensed, 40), Contact())
     full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, Contact(), "beyond")
     assert (weights.numpy() * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
     assert kernel_weights(PadSettings(grid=4).layout).numpy() == pytest.approx(np.ones(8))
-    search = SearchSettings(lost=0)
+    search = SearchSettings(max_failures=0)
     strip, square = (
         expected_errors(Morphology.straight(each.layout), Contact(), search, each)[0]
         for each in (size, PadSettings(grid=4))
@@ -281,7 +281,7 @@ def test_fibres_of_a_strip_are_compared_each_by_its_own_full_scale():
 
 
 def test_responses_are_shares_of_the_length_in_full_scales_of_straight_fibres():
-    pad, presses = Morphology.random(3, knots=4, seed=2), lattice(((0.5, 0.5), (3.5, 3.5)), 9)
+    pad, presses = Morphology.random(3, knots=4, seed=2), grid_positions(((0.5, 0.5), (3.5, 3.5)), 9)
     stretch = relative_stretch(pad, presses, Contact())
     assert stretch * lengths(pad) == pytest.approx(signals(pad, presses, Contact()))
     scale = straight_full_scale(pad.layout, Contact(), "beyond")
@@ -305,15 +305,15 @@ def test_longer_fibres_of_the_same_signal_err_more():
         along = 0 if fibre < 2 else 1
         knots[fibre, :, along] = [0, 0.1, 0.2, 0.3, 1.5, 2.7, 2.8, 2.9, 3]
         knots[fibre, [1, 7], 1 - along] += 0.6
-    longer = Morphology.of_layout(knots, size.layout)
+    longer = Morphology.from_layout(knots, size.layout)
     narrow = Contact(sensitivity_profile=((0, 1), (1, 0.8), (2, 0.4), (3, 0.1), (4, 0)))
-    search = SearchSettings(lost=1)
+    search = SearchSettings(max_failures=1)
     a, b = (expected_errors(pad, narrow, search, size) for pad in (straight, longer))
     assert np.all(np.array(b) > a)
 
 
 def test_a_pad_that_answers_no_press_errs_as_a_guess():
-    asked = Contact(radius=1e-9), SearchSettings(lost=1, noise=0.01), PadSettings(grid=2)
+    asked = Contact(radius=1e-9), SearchSettings(max_failures=1, noise=0.01), PadSettings(grid=2)
     found = expected_errors(Morphology.straight(2), *asked)
     assert found == pytest.approx([found[0]] * 2)
     assert found[0] > 0.8

@@ -20,9 +20,9 @@ def means(pad, **settings):
 
 def test_the_published_pad_beats_the_square_grid(published):
     square = localisation_error(
-        Morphology.load(published / "square_grid_cir.mat"), Contact(sides=50), lost=(0, 1), subsets=1
+        Morphology.load(published / "square_grid_cir.mat"), Contact(sides=50), n_failed=(0, 1), subsets=1
     )
-    curved = localisation_error(Morphology.load(published / "5para_dis.mat"), lost=(0, 1, 3), subsets=1)
+    curved = localisation_error(Morphology.load(published / "5para_dis.mat"), n_failed=(0, 1, 3), subsets=1)
     assert [level.subsets for level in curved] == [1, 1, 1]
     for straight, bent in zip(square, curved[:2], strict=True):
         assert bent.mean < 0.7 * straight.mean
@@ -33,7 +33,7 @@ def test_the_published_pad_beats_the_square_grid(published):
 
 def test_errors_grow_with_lost_fibres_and_are_summed_up_over_all_sets():
     found = localisation_error(Morphology.random(2, 5, seed=1), presses=144, test=300, hidden=10)
-    assert [(level.lost, level.subsets) for level in found] == [(0, 1), (1, 4), (2, 6), (3, 4)]
+    assert [(level.n_failed, level.subsets) for level in found] == [(0, 1), (1, 4), (2, 6), (3, 4)]
     assert found[0].std == 0
     assert found[0].mean < found[2].mean < found[3].mean
     assert all(level.mean <= level.max and (level.subsets == 1) == (level.std == 0) for level in found)
@@ -41,18 +41,18 @@ def test_errors_grow_with_lost_fibres_and_are_summed_up_over_all_sets():
 
 def test_the_result_depends_on_the_seed_and_not_on_the_cores(monkeypatch):
     pad = Morphology.random(3, 5, seed=1)
-    side_by_side = means(pad, lost=(0, 1), subsets=3)
+    side_by_side = means(pad, n_failed=(0, 1), subsets=3)
     threads = torch.get_num_threads()
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    assert means(pad, lost=(0, 1), subsets=3) == side_by_side
-    assert means(pad, lost=(1,), subsets=3) == side_by_side[1:]
-    assert means(pad, lost=(0, 1), subsets=3, seed=1) != side_by_side
+    assert means(pad, n_failed=(0, 1), subsets=3) == side_by_side
+    assert means(pad, n_failed=(1,), subsets=3) == side_by_side[1:]
+    assert means(pad, n_failed=(0, 1), subsets=3, seed=1) != side_by_side
     assert torch.get_num_threads() == threads
 
 
 @pytest.mark.parametrize("grid", [1, 4])
 def test_presses_to_test_on_are_others_than_those_learned(grid):
-    between = between_fibres(Layout.of(grid))
+    between = between_fibres(Layout.create(grid))
     learned, fresh = training_presses(between, 32, seed=0), fresh_presses(between, 2000, seed=0)
     low, high = (0.5, 1.5) if grid == 1 else (1, grid)
     assert not set(map(tuple, learned)) & set(map(tuple, fresh))
@@ -65,12 +65,14 @@ def test_presses_to_test_on_are_others_than_those_learned(grid):
 
 def test_a_pad_of_two_fibres_is_evaluated_as_far_as_fibres_are_left():
     found = localisation_error(Morphology.random(1, 5, seed=0), presses=144, test=200, hidden=10)
-    assert [level.lost for level in found] == [0, 1]
+    assert [level.n_failed for level in found] == [0, 1]
     assert 0 < found[0].mean < 0.6
 
 
 def test_fibres_that_no_press_touches_do_no_harm():
-    found = localisation_error(Morphology.straight(2), Contact(radius=1e-6), presses=64, test=100, hidden=5, lost=(0,))
+    found = localisation_error(
+        Morphology.straight(2), Contact(radius=1e-6), presses=64, test=100, hidden=5, n_failed=(0,)
+    )
     assert 0.2 < found[0].mean < 0.7
 
 
@@ -82,8 +84,8 @@ def test_fibres_that_no_press_touches_do_no_harm():
         ({"test": 0}, "test is 0, allowed is"),
         ({"hidden": 0}, "hidden is 0, allowed is"),
         ({"seed": -1}, "seed is -1, allowed is"),
-        ({"lost": (-1,)}, "lost is -1, allowed is"),
-        ({"lost": 3}, "lost is 3, expected numbers"),
+        ({"n_failed": (-1,)}, "n_failed is -1, allowed is"),
+        ({"n_failed": 3}, "n_failed is 3, expected numbers"),
         ({"subsets": 0}, "subsets is 0, allowed is"),
         ({"contact": 0.6}, "contact"),
         ({"pad": None}, "pad"),
@@ -96,7 +98,7 @@ def test_settings_that_cannot_be_used_are_refused(asked, message):
 
 def test_more_networks_than_can_be_trained_are_refused():
     with pytest.raises(InputError, match=r"that takes \d+ networks, allowed are"):
-        localisation_error(Morphology.straight(12), lost=(12,))
+        localisation_error(Morphology.straight(12), n_failed=(12,))
 
 
 def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
@@ -111,7 +113,7 @@ def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
         assert (places <= 2.5 + jitter).all()
         assert (np.ptp(places, axis=0) > 1.97).all()
     none, one = trial.loss_errors([[()], [(0,), (3,)]], hidden=10)
-    assert (none.lost, none.subsets, one.lost, one.subsets) == (0, 1, 1, 2)
+    assert (none.n_failed, none.subsets, one.n_failed, one.subsets) == (0, 1, 1, 2)
     assert 0.005 < none.mean < one.mean < 0.6
 
 
@@ -140,7 +142,7 @@ def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press
         (contact, pad) for contact in contacts for pad in ("designed", "straight")
     ]
     for each in found:
-        assert [error.lost for error in each.errors] == [0, 1, 2, 3]
+        assert [error.n_failed for error in each.errors] == [0, 1, 2, 3]
         assert all(math.isfinite(error.mean) and 0 < error.mean < 2 for error in each.errors)
         assert each.errors[0].mean < each.errors[3].mean
     wide, narrow = found[1].errors, found[3].errors
@@ -148,7 +150,7 @@ def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press
     assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
     two_fibres = {"pad": Morphology.straight(1)}
     (small,) = errors_by_contact(two_fibres, {"as believed": Contact()}, PadSettings(grid=1), ASKED[1])
-    assert [error.lost for error in small.errors] == [0, 1]
+    assert [error.n_failed for error in small.errors] == [0, 1]
 
 
 def test_responses_that_scatter_more_are_localised_worse_and_presses_lie_in_no_keep_out():

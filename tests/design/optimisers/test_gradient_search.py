@@ -28,7 +28,7 @@ from padforge.design.torch_signals import arc_lengths, pchip_slopes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False)
-BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "lost": 1, "knots": 6})
+BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "max_failures": 1, "knots": 6})
 
 
 def begun(search, rules, start=0, state=None, pad=PAD, contact=PUBLISHED_CONTACT):
@@ -111,7 +111,7 @@ def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
 
 def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit():
     """Before the first step, amid the steps, before the repair and in it."""
-    asked = SearchSettings(knots=3, steps=10, lost=1), RulesSettings(max_length_mm=34)
+    asked = SearchSettings(knots=3, steps=10, max_failures=1), RulesSettings(max_length_mm=34)
     unbroken = begun(*asked)
     unbroken.advance(30)
     assert unbroken.step == 30
@@ -127,7 +127,7 @@ def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit():
 
 
 def test_an_early_end_leaves_the_repair_alone():
-    run = begun(SearchSettings(knots=3, steps=1000, lost=1), RulesSettings(max_length_mm=34))
+    run = begun(SearchSettings(knots=3, steps=1000, max_failures=1), RulesSettings(max_length_mm=34))
     run.advance(3)
     run.finish()
     assert run.step == 1000
@@ -158,7 +158,7 @@ def test_each_further_rule_is_kept(rules, usual):
 
 def test_several_contacts_serve_both_better_than_one_alone():
     large = Contact(radius=1.2)
-    one = BRIEF.model_copy(update={"steps": 30, "lost": 0, "knots": 4})
+    one = BRIEF.model_copy(update={"steps": 30, "max_failures": 0, "knots": 4})
     for_one, for_both = (finished(each, FREE) for each in (one, one.model_copy(update={"contacts": (large,)})))
     alone, together = (expected_errors(pad, large, one, PadSettings(grid=2)) for pad in (for_one, for_both))
     assert together[0] < 0.9 * alone[0]
@@ -166,10 +166,12 @@ def test_several_contacts_serve_both_better_than_one_alone():
 
 @pytest.mark.slow
 def test_descent_beats_the_square_grid_within_the_rules():
-    asked = PUBLISHED_SEARCH.model_copy(update={"knots": 9, "starts": 1, "steps": 60, "lost": 1})
+    asked = PUBLISHED_SEARCH.model_copy(update={"knots": 9, "starts": 1, "steps": 60, "max_failures": 1})
     found = search(PUBLISHED_PAD, PUBLISHED_CONTACT, asked)
     pads = found.morphology, Morphology.straight(4)
-    pad, grid = (score(m, PUBLISHED_CONTACT, lost=1, noise=0.02, size=PadSettings(sensed_mm="fibres")) for m in pads)
+    pad, grid = (
+        score(m, PUBLISHED_CONTACT, max_failures=1, noise=0.02, size=PadSettings(sensed_mm="fibres")) for m in pads
+    )
     assert found.violations == []
-    assert pad["ambiguity_lost_0"] < 0.5 * grid["ambiguity_lost_0"]
-    assert pad["ambiguity_lost_1"] < 0.5 * grid["ambiguity_lost_1"]
+    assert pad["ambiguity_mm_0"] < 0.5 * grid["ambiguity_mm_0"]
+    assert pad["ambiguity_mm_1"] < 0.5 * grid["ambiguity_mm_1"]

@@ -22,7 +22,7 @@ from padforge.design.common.command_line import run_to_end
 from padforge.design.optimize import problem as stopping
 
 PAD = PadSettings(grid=1)
-SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, lost=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, max_failures=1)
 FREE = RulesSettings(enforce=False)
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
@@ -165,7 +165,7 @@ grid = 2
 knots = 3
 starts = 2
 steps = 75
-lost = 1
+max_failures = 1
 [rules]
 enforce = false
 """

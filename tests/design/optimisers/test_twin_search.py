@@ -48,14 +48,14 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
             yield ContactErrors("", name, tuple(errors))
 
     monkeypatch.setattr(twin_search, "errors_by_contact", lambda *asked: list(judged(*asked)))
-    quick = SearchSettings(knots=3, starts=1, steps=2, lost=1)
+    quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
     pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []
     run = SearchOptions(report=lambda name, done, total, objective: steps.append(name))
     found = search_for_twin(pad, contact, quick, RulesSettings(**rules), quick, run=run)
-    assert found.found_by == expected
+    assert found.candidate == expected
     assert bool(found.violations) == (expected == "twin")
     if expected == "straight fibres":
         assert found.morphology == Morphology.straight(pad.layout)
-        assert found.terms["expected_error_lost_0"] == pytest.approx(found.straight["expected_error_lost_0"], rel=1e-6)
+        assert found.terms["expected_error_mm_0"] == pytest.approx(found.straight["expected_error_mm_0"], rel=1e-6)
     assert {name.split(",")[0] for name in steps} == {"usual", "twin", "from usual"}

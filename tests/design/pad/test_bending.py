@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, flatten
-from padforge.design.paths.bends import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, traced_curve
+from padforge.design.paths.bends import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, trace_curve
 from padforge.design.paths.curves import beziers, slope_beziers
 from tests.design.pad.wild_pads import SEEDS, wild_pads
 
@@ -19,7 +19,7 @@ def arc_of(points):
 
 
 def traced(pad, fibre, step=2.5e-3):
-    return traced_curve(beziers(pad)[fibre], slope_beziers(pad)[fibre], step)
+    return trace_curve(beziers(pad)[fibre], slope_beziers(pad)[fibre], step)
 
 
 def dense(pad, fibre, per_span=2000):

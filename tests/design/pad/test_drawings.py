@@ -21,7 +21,7 @@ from padforge.fabricate import Plan
 from padforge.fabricate.report.track_drawings import tracks_dxf
 from tests.design.pad.damage import damages, read_damaged
 
-LAYOUT = Layout.of((2, 3), (10.0, 12.0))
+LAYOUT = Layout.create((2, 3), (10.0, 12.0))
 """40 by 36 mm: ends of horizontals at y = -6 and 6, of verticals at x = -10, 0 and 10."""
 WAYS = (
     *(f"M -20 {y} C -10 {y - 9} 10 {y + 9} 20 {y}" for y in (-6, 6)),
@@ -195,7 +195,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 @given(st.sampled_from(["damaged.svg", "damaged.dxf"]), damages)
 @settings(max_examples=20)
 def test_a_damaged_drawing_is_read_or_refused_in_one_line(drawn, tmp_path_factory, name, damage) -> None:
-    layout, path = Layout.of(1), tmp_path_factory.getbasetemp() / name
+    layout, path = Layout.create(1), tmp_path_factory.getbasetemp() / name
     found = read_damaged(path, drawn[name], damage, lambda path: import_plan(path, layout, 0.5))
     assert found is None or np.isfinite(found.pad.knots).all()
 
@@ -265,8 +265,8 @@ def test_our_own_plan_comes_back(tmp_path: Path) -> None:
         axis = LAYOUT.family(fibre)
         line[:, axis] = np.linspace(0, LAYOUT.extent[axis], 6)
         line[1:-1, 1 - axis] = LAYOUT.levels[fibre] + rng.uniform(-0.4, 0.4, 4)
-    pad = Morphology.of_layout(courses, LAYOUT)
-    save_figure(draw_plan(pad, Contact(), (), PadSettings().of(LAYOUT).keep_out_mm), tmp_path / "plan.svg")
+    pad = Morphology.from_layout(courses, LAYOUT)
+    save_figure(draw_plan(pad, Contact(), (), PadSettings().for_layout(LAYOUT).keep_out_mm), tmp_path / "plan.svg")
     found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
     assert apart(found.pad, pad) < 0.08
     assert found.pad.knots.shape[1] <= 6 + 3

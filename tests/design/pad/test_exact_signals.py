@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.contact import fibre_axes, signals_and_spans
-from padforge.design.morphology import assemble
+from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from tests.design.pad import wild_pads as wild
 
@@ -73,7 +73,7 @@ def oracle(pad, press, contact, fibre):
 def test_exact_signals_equal_the_oracle(weight, length, sides):
     contact = Contact(radius=0.7, sides=sides, weight=weight, length=length)
     plain = weight == "uniform" and length == "manhattan"
-    ways = (0, Layout.of(1)), (5, Layout.of((2, 1), (5.0, 30.0))), (20, Layout.of((1, 2), (10.0, 10.0)))
+    ways = (0, Layout.create(1)), (5, Layout.create((2, 1), (5.0, 30.0))), (20, Layout.create((1, 2), (10.0, 10.0)))
     for knots, layout in ways:
         rng = np.random.default_rng([knots, sides or 0])
         pad = Morphology.random(layout, knots, rng)
@@ -208,7 +208,7 @@ def test_a_circle_that_only_touches_a_fibre_adds_nothing(radius, weight):
 def test_knots_that_nearly_coincide_make_a_step_and_nothing_else(gap):
     """A rise of 1 within `gap`, slope up to 1e12: the Manhattan signal is run plus rise."""
     inner = np.array([[[1.0, 0.5], [1.0 + gap, 1.5]], [[1.0, 0.5], [1.0, 1.5]]])
-    pad = Morphology(assemble(inner))
+    pad = Morphology(assemble_knots(inner))
     presses = [[1.0, 1.0], [1.0 + gap, 1.5], [1.0, 0.5]]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
-from padforge.design.paths.fitting import HAIR, fitted_knots, with_spares, without_spares
+from padforge.design.paths.fitting import HAIR, add_spare_knots, fit_knots, remove_spare_knots
 
 
 def off(knots, points):
@@ -19,18 +19,18 @@ def off(knots, points):
 
 def test_straight_curves_waves_and_steps_need_few_knots():
     points = np.stack([np.linspace(-20, 20, 50), np.full(50, 3.0)], axis=1)
-    assert np.array_equal(fitted_knots(points, 0.05), points[[0, -1]])
-    assert len(fitted_knots(points[[0, -1]], 0.05)) == 2
+    assert np.array_equal(fit_knots(points, 0.05), points[[0, -1]])
+    assert len(fit_knots(points[[0, -1]], 0.05)) == 2
     x = np.linspace(-28, 28, 1500)
     points = np.stack([x, 4 * np.sin(x / 3)], axis=1)
-    found = fitted_knots(points, 0.05)
+    found = fit_knots(points, 0.05)
     assert off(found, points) < 0.06
     assert len(found) < 40
-    assert len(fitted_knots(points, 0.5)) < len(found)
-    assert len(fitted_knots(points, 1e-6, most=12)) == 14
+    assert len(fit_knots(points, 0.5)) < len(found)
+    assert len(fit_knots(points, 1e-6, most=12)) == 14
     assert (np.diff(found[:, 0]) > 0).all()
     assert np.array_equal(found[[0, -1]], points[[0, -1]])
-    found = fitted_knots(np.array([[0.0, 0], [10, 0], [10.001, 5], [20, 5]]), 0.05)
+    found = fit_knots(np.array([[0.0, 0], [10, 0], [10.001, 5], [20, 5]]), 0.05)
     assert np.isfinite(found).all()
     assert np.ptp(found[:, 1]) >= 4.9
 
@@ -42,7 +42,7 @@ def test_a_pchip_curve_is_found_with_hardly_more_knots_than_it_has(heights):
     knots = np.stack([t, [1.0, *heights, 1.0]], axis=1)
     x = np.linspace(-28, 28, 1500)
     points = np.stack([x, PchipInterpolator(*knots.T)(x)], axis=1)
-    found = fitted_knots(points, 0.05)
+    found = fit_knots(points, 0.05)
     assert off(found, points) < 0.06
     assert len(found) <= len(knots) + 4
 
@@ -52,11 +52,11 @@ def moved(course, count):
     straight = Morphology.straight(2)
     layout = straight.layout
     more = np.stack([np.linspace(0, 3, len(course) + count), np.full(len(course) + count, 2.0)], axis=1)
-    pad = Morphology.of_layout(with_spares([course, more, *straight.knots[2:]], layout), layout)
+    pad = Morphology.from_layout(add_spare_knots([course, more, *straight.knots[2:]], layout), layout)
     assert pad.knots.shape[1] == len(course) + count
     x = np.linspace(0, 3, 5001)
     plain, filled = (PchipInterpolator(*line.T)(x) for line in (course, pad.knots[0]))
-    return np.abs(plain - filled).max(), without_spares(pad.knots, layout)[0]
+    return np.abs(plain - filled).max(), remove_spare_knots(pad.knots, layout)[0]
 
 
 @given(st.lists(st.integers(1, 29), min_size=5, max_size=12), st.integers(1, 40))

@@ -12,7 +12,7 @@ from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import free_presses
 from padforge.design.paths.bends import bend_radius, rolled_turns
-from padforge.design.paths.keep_outs import keep_outs, outside, passing, require_free_ends, straight_course
+from padforge.design.paths.keep_outs import check_fibre_ends, is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
@@ -28,7 +28,7 @@ def square(x, y, side):
 
 
 def kept_off(*polygons, counts=(3, 6), pitch_mm=(8.0, 15.0)):
-    return PadSettings(keep_out_mm=polygons, **Layout.of(counts, pitch_mm).settings)
+    return PadSettings(keep_out_mm=polygons, **Layout.create(counts, pitch_mm).settings)
 
 
 def test_the_distance_of_straight_fibres_to_a_square_is_exact_and_presses_lie_in_no_keep_out():
@@ -47,7 +47,7 @@ def test_the_distance_of_straight_fibres_to_a_square_is_exact_and_presses_lie_in
     assert not check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), kept_off(square(-8.0, 7.0, 6.0)))
     size = kept_off(square(0.0, 0.0, 16.0), ((-20.0, -20.0), (-10.0, -20.0), (-15.0, -10.0)))
     places = np.random.default_rng(0).uniform(0, size.layout.extent, (500, 2))
-    free = outside(places, size)
+    free = is_outside(places, size)
     mm = Morphology.straight(size.layout).to_mm(places)
     assert not free[(np.abs(mm) < 8).all(axis=1)].any()
     assert free[(mm[:, 0] > 8.1)].all()
@@ -69,11 +69,11 @@ def test_keep_outs_that_leave_no_room_or_are_none_are_refused_in_one_line(polygo
     def use():
         size = kept_off(tuple((float(x), float(y)) for x, y in polygon))
         free_presses(size)
-        require_free_ends(size, RulesSettings())
+        check_fibre_ends(size, RulesSettings())
 
     with pytest.raises(InputError, match=rf"keep_out_mm:? .*{message.removeprefix('keep_out_mm ')}"):
         use()
-    require_free_ends(kept_off(square(-24.0, -15.0, 4.0)), RulesSettings())
+    check_fibre_ends(kept_off(square(-24.0, -15.0, 4.0)), RulesSettings())
 
 
 def penalty(pad, size, cross=None, clearance=3.0):
@@ -99,11 +99,11 @@ def test_the_penalty_of_a_keep_out_vanishes_with_the_clearance_and_has_a_true_gr
 def test_straight_fibres_bow_around_a_keep_out_within_the_rules_and_stay_in_order():
     size, rules = kept_off(square(2.0, 1.0, 10.0)), RulesSettings()
     assert check_rules(Morphology.straight(size.layout), rules, size)
-    pad = Morphology.of_layout(straight_course(size, rules, 21), size.layout)
+    pad = Morphology.from_layout(straight_paths(size, rules, 21), size.layout)
     assert check_rules(pad, rules, size) == []
     away = np.abs(pad.knots[:3, :, 1] - size.layout.levels[:3, None]).max(axis=1)
     assert (away[1] > 0.3, away[0] == 0) == (True, True)
-    few = Morphology.of_layout(straight_course(size, rules, 3), size.layout)
+    few = Morphology.from_layout(straight_paths(size, rules, 3), size.layout)
     assert few.knots.shape == (9, 5, 2)
 
 
@@ -111,14 +111,14 @@ def test_straight_fibres_bow_around_a_keep_out_within_the_rules_and_stay_in_orde
 @settings(max_examples=12)
 def test_fibres_that_pass_keep_outs_keep_the_order_they_had(seed, x, y, side):
     size, rng = kept_off(square(x, y, side), square(-x, 2.0, 3.0)), np.random.default_rng(seed)
-    course = straight_course(PadSettings().of(size.layout), RulesSettings(), 12)
+    course = straight_paths(PadSettings().for_layout(size.layout), RulesSettings(), 12)
     lifts = 0.3 * rng.standard_normal(12)
     course[:3, 1:-1, 1] += lifts
     course[3:, 1:-1, 0] += lifts
-    found = passing(course, size, RulesSettings())
+    found = pass_keep_outs(course, size, RulesSettings())
     assert (np.diff(found[:3, :, 1], axis=0) > 0).all()
     assert (np.diff(found[3:, :, 0], axis=0) > 0).all()
-    np.testing.assert_array_equal(passing(course, size, RulesSettings(enforce=False)), course)
+    np.testing.assert_array_equal(pass_keep_outs(course, size, RulesSettings(enforce=False)), course)
 
 
 def test_helices_and_arcs_on_a_cylinder_are_as_curved_as_in_space():
@@ -147,13 +147,13 @@ def test_helices_and_arcs_on_a_cylinder_are_as_curved_as_in_space():
 
 
 def test_a_bent_pad_bends_fibres_that_run_around_it():
-    rules, pad = only(min_bend_radius_mm=10.0), Morphology.straight(Layout.of((3, 2), (8.0, 15.0)))
+    rules, pad = only(min_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
     assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
     found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
     assert [(v.fibres, v.measured) for v in found] == [((f,), pytest.approx(9)) for f in (1, 2, 3)]
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     for radius, expected in ((9.0, 10 / 9 - 1), (10.5, 0.0)):
-        size = PadSettings(bent_radius_mm=radius).of(pad.layout)
+        size = PadSettings(bent_radius_mm=radius).for_layout(pad.layout)
         # the penalty takes every fibre to run around the cylinder
         assert penalties(travel, cross, size, rules)["min_bend_radius_mm"].item() == pytest.approx(
             expected * float((travel[:, -1] / travel[:, -1].mean()).mean()), abs=1e-9

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.contact import fibre_axes, signals_and_spans
 from padforge.design.kernels.measured_signals import PRECISION
-from padforge.design.morphology import kernel_ends
+from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
@@ -47,7 +47,7 @@ def knots_of(pad):
 def searched(pad, presses, contact):
     """(Q, 2M) signals of the kind that a search takes."""
     travel, cross = knots_of(pad)
-    slope, ends = pchip_slopes(travel, cross), kernel_ends(pad.layout)
+    slope, ends = pchip_slopes(travel, cross), fibre_ends(pad.layout)
     return press_signals(travel, cross, slope, presses, contact, ends, pad.unit_mm).detach().numpy().T
 
 
@@ -107,8 +107,8 @@ def test_a_measured_reach_is_felt_and_has_a_gradient_only_up_to_its_end():
     travel = torch.linspace(0, grid + 1, 42, dtype=torch.float64).repeat(2 * grid, 1)
     cross = torch.arange(1.0, grid + 1, dtype=torch.float64).repeat(2)[:, None].repeat(1, 42).requires_grad_()
     slope = torch.zeros_like(cross)
-    layout = Layout.of(grid)
-    press_signals(travel, cross, slope, corner, contact_of(reach), kernel_ends(layout), layout.unit_mm).sum().backward()
+    layout = Layout.create(grid)
+    press_signals(travel, cross, slope, corner, contact_of(reach), fibre_ends(layout), layout.unit_mm).sum().backward()
     assert cross.grad is not None
     moved = cross.grad.numpy().astype(bool)
     assert moved[0, :4].all()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design import InputError, Morphology, signals
-from padforge.design.morphology import assemble
+from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.pad.damage import damages, read_damaged
 from tests.design.pad.wild_pads import SEEDS, wild_pads
@@ -30,7 +30,7 @@ def test_random_morphologies_hold_the_invariants_and_depend_on_the_seed_alone(gr
 @given(wild_pads((1, 4), (0, 20)))
 @settings(max_examples=30)
 def test_assembled_knots_are_a_pad(pad):
-    np.testing.assert_allclose(assemble(pad.knots[:, 1:-1]), pad.knots, atol=1e-12)
+    np.testing.assert_allclose(assemble_knots(pad.knots[:, 1:-1]), pad.knots, atol=1e-12)
 
 
 def test_frames_convert_both_ways_and_knots_lie_apart_and_cannot_be_changed():
@@ -40,10 +40,10 @@ def test_frames_convert_both_ways_and_knots_lie_apart_and_cannot_be_changed():
     assert pad.to_grid(pad.to_mm([[1.0, 4.0]])) == pytest.approx(np.array([[1.0, 4.0]]))
     with pytest.raises(ValueError, match="read-only"):
         Morphology.straight(2).knots[0, 0, 0] = 1
-    pad = Morphology(assemble(np.full((2, 5, 2), 0.7)))
+    pad = Morphology(assemble_knots(np.full((2, 5, 2), 0.7)))
     assert (np.diff(pad.knots[0, :, 0]) > 0).all()
     assert np.abs(pad.knots[0, 1:-1] - 0.7).max() < 1e-8
-    heaped = Morphology(assemble(np.full((2, 4, 2), 2.0))).knots
+    heaped = Morphology(assemble_knots(np.full((2, 4, 2), 2.0))).knots
     assert heaped.max() == 2.0
     assert (np.diff(heaped[1, :, 1]) > 0).all()
 
@@ -74,8 +74,8 @@ REFUSED = [
         (lambda times=times: Morphology.straight(4).tiled(times), r"times is .*, allowed is a whole number from 1 to")
         for times in (0, ODD[-1], 10**4)
     ),
-    *((lambda x=x: Morphology.of_document(x), r"document is .*, expected a table") for x in ODD),
-    *((lambda x=x: Morphology.of_layout(PAD.knots, x), r"layout is .*, expected a Layout") for x in ODD),
+    *((lambda x=x: Morphology.from_dict(x), r"document is .*, expected a table") for x in ODD),
+    *((lambda x=x: Morphology.from_layout(PAD.knots, x), r"layout is .*, expected a Layout") for x in ODD),
     (lambda: Morphology(PAD.knots, provenance={"noise": np.nan}), "provenance is .*, expected JSON"),
     (lambda: Morphology(PAD.knots, provenance=[1]), "provenance is .*, expected a table"),  # pyright: ignore
     *((lambda x=x: Morphology.from_parameters(x), "parameters") for x in (np.empty((0, 0)), np.ones((2, 8)) * 1j)),
@@ -109,7 +109,7 @@ def test_files_that_hold_no_morphology_are_refused_in_one_line(tmp_path, text):
 @given(damages)
 @settings(max_examples=40)
 def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory, damage):
-    content = json.dumps(Morphology.random((1, 2), 2, seed=0).document()).encode()
+    content = json.dumps(Morphology.random((1, 2), 2, seed=0).to_dict()).encode()
     pad = read_damaged(tmp_path_factory.getbasetemp() / "damaged_pad.json", content, damage, Morphology.load)
     assert pad is None or np.isfinite(pad.knots).all()
 

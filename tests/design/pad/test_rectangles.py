@@ -23,7 +23,7 @@ CONTACTS = [ROUND, Contact(radius=0.5, sides=4, length="euclidean"), Contact(), 
 def layouts(draw, least=0):
     """Of up to 4 by 4 fibres, pitches up to 1 : 6, one family empty at times."""
     counts = draw(st.tuples(st.integers(least, 4), st.integers(least, 4)).filter(any))
-    return Layout.of(counts, draw(st.sampled_from([(5.0, 30.0), (30.0, 5.0), (8.0, 15.0), (10.0, 10.0)])))
+    return Layout.create(counts, draw(st.sampled_from([(5.0, 30.0), (30.0, 5.0), (8.0, 15.0), (10.0, 10.0)])))
 
 
 @st.composite
@@ -35,7 +35,7 @@ def turned(pad):
     """The pad with x and y, and so its families, exchanged."""
     layout = pad.layout
     other = Layout(layout.verticals, layout.horizontals, layout.pitch_y_mm, layout.pitch_x_mm)
-    return Morphology.of_layout(pad.knots[order(pad)][..., ::-1], other)
+    return Morphology.from_layout(pad.knots[order(pad)][..., ::-1], other)
 
 
 def order(pad):
@@ -83,9 +83,9 @@ def test_a_pad_that_is_turned_breaks_the_same_rules_and_is_as_long(pad):
 
 
 def test_a_pad_that_is_turned_is_as_ambiguous():
-    pad = Morphology.random(Layout.of((2, 1), (8.0, 15.0)), 3, seed=1)
+    pad = Morphology.random(Layout.create((2, 1), (8.0, 15.0)), 3, seed=1)
     found, swapped = (
-        ambiguities(each, Contact(), 1, 0.05, PadSettings().of(each.layout)) for each in (pad, turned(pad))
+        ambiguities(each, Contact(), 1, 0.05, PadSettings().for_layout(each.layout)) for each in (pad, turned(pad))
     )
     assert swapped == pytest.approx(found, rel=2e-3)  # in single precision
 
@@ -93,14 +93,14 @@ def test_a_pad_that_is_turned_is_as_ambiguous():
 def test_a_fibre_of_a_coarse_family_is_felt_as_far_as_it_strays_and_a_single_one():
     """Horizontals lie 6 pitches of the verticals apart; one leaves its level by nearly that and is felt there."""
     for counts in ((1, 0), (0, 1)):
-        pad = Morphology.straight(Layout.of(counts, (8.0, 15.0)))
+        pad = Morphology.straight(Layout.create(counts, (8.0, 15.0)))
         middle = np.array([pad.layout.extent]) / 2
         assert signals(pad, middle, Contact(radius=0.3, sides=None)) == pytest.approx(0.6)
-    layout = Layout.of((2, 3), (5.0, 30.0))
+    layout = Layout.create((2, 3), (5.0, 30.0))
     knots = Morphology.straight(layout).knots
     middle = knots.mean(axis=1, keepdims=True)
     middle[0, 0, 1] += 0.9 * layout.spacing[1]
-    pad = Morphology.of_layout(np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1), layout)
+    pad = Morphology.from_layout(np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1), layout)
     found = signals(pad, middle[:1, 0], ROUND)[0]
     assert found[0] > 0.5
     assert found[3] > 1.0  # the middle vertical runs there as well
@@ -110,7 +110,7 @@ def test_a_fibre_of_a_coarse_family_is_felt_as_far_as_it_strays_and_a_single_one
 @settings(max_examples=20)
 def test_a_rectangle_is_read_as_it_was_written_to_the_bit(tmp_path_factory, pad, data):
     pitch = data.draw(st.tuples(*[st.floats(0.1, 1000)] * 2)) if data.draw(st.booleans()) else pad.pitch_mm
-    pad = Morphology.random(Layout.of(pad.layout.counts, pitch), 3, data.draw(st.integers(0, 99)))
+    pad = Morphology.random(Layout.create(pad.layout.counts, pitch), 3, data.draw(st.integers(0, 99)))
     path = tmp_path_factory.mktemp("pads") / "pad.json"
     pad.save(path)
     again = Morphology.load(path)
@@ -120,12 +120,12 @@ def test_a_rectangle_is_read_as_it_was_written_to_the_bit(tmp_path_factory, pad,
     assert json.loads(path.read_text())["format"][-1] == ("1" if pad.layout.is_square else "2")
 
 
-PAD = Morphology.random(Layout.of((1, 2), (8.0, 15.0)), 2, seed=0)
+PAD = Morphology.random(Layout.create((1, 2), (8.0, 15.0)), 2, seed=0)
 WRONG = [
     *({"fibres": value} for value in ([2, 1], [2, 2], [1], 3, ["1", "2"], [0, 0], [10**30, 1], [1.5, 1.5], None)),
     *({"pitch_mm": value} for value in ([0, 15.0], [8.0, -1], [8.0], None)),
-    *({"knots": value} for value in ([], [[[0, 1], [3, 1]]], "many", Morphology.straight(2).document()["knots"])),
-    {"knots": Morphology.straight(Layout.of((1, 2), (8.0, 15.0))).knots.tolist()},  # fewer spans, other ends
+    *({"knots": value} for value in ([], [[[0, 1], [3, 1]]], "many", Morphology.straight(2).to_dict()["knots"])),
+    {"knots": Morphology.straight(Layout.create((1, 2), (8.0, 15.0))).knots.tolist()},  # fewer spans, other ends
     {"format": "padforge-morphology/1"},
 ]
 
@@ -133,6 +133,6 @@ WRONG = [
 @pytest.mark.parametrize("change", WRONG, ids=lambda change: str(change)[:40])
 def test_files_that_are_no_rectangle_are_one_line(tmp_path, change):
     path = tmp_path / "pad.json"
-    path.write_text(json.dumps(PAD.document() | change))
+    path.write_text(json.dumps(PAD.to_dict() | change))
     with pytest.raises(InputError, match=r"pad\.json: "):
         Morphology.load(path)

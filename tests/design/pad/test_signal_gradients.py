@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 
 from padforge.design import Contact, Morphology, signals
 from padforge.design.contact import fibre_axes
-from padforge.design.morphology import kernel_ends
+from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import SEEDS, wild_contacts, wild_pads
@@ -37,7 +37,7 @@ def straight_axes(grid):
 def torch_signals(travel, cross, presses, contact):
     slope = pchip_slopes(travel, cross)
     return press_signals(
-        travel, cross, slope, presses, contact, kernel_ends(Layout.of(len(travel) // 2)), DEFAULT_PITCH_MM
+        travel, cross, slope, presses, contact, fibre_ends(Layout.create(len(travel) // 2)), DEFAULT_PITCH_MM
     )
 
 
@@ -70,7 +70,7 @@ def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(conta
 @pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[5], CONTACTS[9]], ids=["polygon", "inverse square", "reach"])
 @pytest.mark.parametrize("counts", [(2, 3), (3, 1), (0, 2)])
 def test_the_torch_function_gives_the_exact_signals_and_their_gradient_on_rectangles(contact, counts):
-    pad, rng = Morphology.random(Layout.of(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
+    pad, rng = Morphology.random(Layout.create(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0, pad.layout.extent, (20, 2))
     travel, cross, ends, _ = fibre_axes(pad)
 

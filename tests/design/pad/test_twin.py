@@ -28,13 +28,13 @@ def twin() -> Twin:
     return Twin(PAD, channels, frame, DISTANCE * PAD.pitch_mm, WEIGHT, laid, 0.015, (20.0, 22.0), 900)
 
 
-READINGS = TwinReadings(noise_mv=2.0, drift_mv=18.0, hysteresis=0.3, hysteresis_s=14.0, looks=8.0)
+READINGS = TwinReadings(noise_mv=2.0, drift_mv=18.0, hysteresis=0.3, hysteresis_s=14.0, information_gain=8.0)
 
 
 def test_a_file_brings_a_twin_back(twin, tmp_path):
-    uneven = tuple(None if line is None else np.linspace(0.8, 1.2, len(line) - 1) for line in twin.laid_mm)
+    uneven = tuple(None if line is None else np.linspace(0.8, 1.2, len(line) - 1) for line in twin.as_built_mm)
     whole = replace(
-        twin, sensitivity=uneven, angle_weight=0.1 * WEIGHT, readings=READINGS, scatter=TwinScatter(0.1, 0.3, 0.9)
+        twin, sensitivity=uneven, angular_weight=0.1 * WEIGHT, readings=READINGS, scatter=TwinScatter(0.1, 0.3, 0.9)
     )
     for each in (twin, whole):
         each.save(tmp_path / "twin.json")
@@ -44,25 +44,25 @@ def test_a_file_brings_a_twin_back(twin, tmp_path):
         assert back.contact() == each.contact()
         assert back.contact().sensitivity_profile == tuple(zip(each.distance_mm, each.weight, strict=True))
         assert back.contact().length == "euclidean"
-        assert back.laid_stretch(PLACES) == pytest.approx(each.laid_stretch(PLACES), abs=1e-3)
-    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/2"
+        assert back.as_built_stretch(PLACES) == pytest.approx(each.as_built_stretch(PLACES), abs=1e-3)
+    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/3"
 
 
 def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     exact = relative_stretch(PAD, PAD.to_grid(twin.frame.to_plan(PLACES)), twin.contact())
-    assert twin.laid_stretch(PLACES)[:, :3] == pytest.approx(exact[:, :3], abs=1e-3)
-    assert not twin.laid_stretch(PLACES)[:, 3].any()
-    double = replace(twin, sensitivity=tuple(None if x is None else np.full(len(x) - 1, 2.0) for x in twin.laid_mm))
-    assert double.laid_stretch(PLACES) == pytest.approx(2 * twin.laid_stretch(PLACES))
+    assert twin.as_built_stretch(PLACES)[:, :3] == pytest.approx(exact[:, :3], abs=1e-3)
+    assert not twin.as_built_stretch(PLACES)[:, 3].any()
+    double = replace(twin, sensitivity=tuple(None if x is None else np.full(len(x) - 1, 2.0) for x in twin.as_built_mm))
+    assert double.as_built_stretch(PLACES) == pytest.approx(2 * twin.as_built_stretch(PLACES))
     straight = np.column_stack([np.linspace(-20, 20, 400), np.zeros(400)])
-    plain = replace(twin, laid_mm=(straight, None, None, None), frame=PlanTransform())
-    angled = replace(plain, angle_weight=0.5 * WEIGHT)
+    plain = replace(twin, as_built_mm=(straight, None, None, None), frame=PlanTransform())
+    angled = replace(plain, angular_weight=0.5 * WEIGHT)
     over, beside = np.array([[0.0, 0.0], [0.0, 12.0]])
-    assert angled.laid_stretch([over])[0, 0] > plain.laid_stretch([over])[0, 0]
-    assert angled.laid_stretch([beside])[0, 0] < plain.laid_stretch([beside])[0, 0]
+    assert angled.as_built_stretch([over])[0, 0] > plain.as_built_stretch([over])[0, 0]
+    assert angled.as_built_stretch([beside])[0, 0] < plain.as_built_stretch([beside])[0, 0]
     for none in ([[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]):
         with pytest.raises(InputError, match="places_mm"):
-            twin.laid_stretch(none)
+            twin.as_built_stretch(none)
     assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
         np.array([[0.0, -4.0]])
     )
@@ -75,7 +75,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
         ({"channels": tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))}, "two channels read the same fibre"),
         ({"weight": WEIGHT[:-1]}, "weight of reach"),
         ({"weight": np.where(WEIGHT == 0, 0.1, WEIGHT)}, "the last weight must be 0"),
-        ({"laid_mm": (None,)}, "laid_mm must have"),
+        ({"as_built_mm": (None,)}, "as_built_mm must have"),
         ({"sensitivity": (None, None, None, None)}, "sensitivity must have"),
         ({"noise": float("nan")}, "noise"),
         ({"sensed_mm": (20.0, 0.0)}, "sensed_mm"),
@@ -90,17 +90,20 @@ def test_what_does_not_fit_together_is_refused(twin, change, said):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "padforge-design/1"}, "padforge-twin/2"),
+        ({"format": "padforge-design/1"}, "padforge-twin/3"),
         ({"channels": [{"gain": 1}]}, "no valid twin"),
         ({"morphology": {}}, "morphology"),
         ({"frame__scale": -1}, "scale"),
-        ({"readings__looks": 0.5}, "looks"),
+        ({"readings__information_gain": 0.5}, "information_gain"),
         ({"readings__hysteresis": 1.0}, "hysteresis"),
         ({"readings__drift_mv": -1}, "drift_mv"),
         ({"readings__noise_mv": "much"}, "noise_mv"),
         ({"readings__warmth": 3}, "warmth"),
         # a file of some kilobytes would take gigabytes, and an hour for a few presses
-        ({"laid_mm": [[[-9e3, -9e3], [9e3, 9e3]] * 40, None, None, None]}, r"laid_mm are 2.*e\+06 mm long in all"),
+        (
+            {"as_built_mm": [[[-9e3, -9e3], [9e3, 9e3]] * 40, None, None, None]},
+            r"as_built_mm are 2.*e\+06 mm long in all",
+        ),
     ],
 )
 def test_a_file_that_holds_no_twin_is_refused_in_one_line(twin, tmp_path, change, message):

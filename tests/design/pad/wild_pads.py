@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from padforge.design import Contact, Morphology
-from padforge.design.morphology import assemble
+from padforge.design.morphology import assemble_knots
 
 Array = NDArray[np.float64]
 KINDS = ("random", "steps", "lattice", "border", "alike", "edge", "needles", "level")
@@ -45,7 +45,7 @@ def wild_knots(kind: str, grid: int, count: int, rng: np.random.Generator) -> Ar
     elif kind == "level":
         inner[:grid, :, 1] = np.arange(1, grid + 1)[:, None] + rng.normal(0, 1e-12, (grid, count))
         inner[grid:, :, 0] = np.arange(1, grid + 1)[:, None]
-    return assemble(inner.clip(0, grid + 1))
+    return assemble_knots(inner.clip(0, grid + 1))
 
 
 wild_contacts = st.builds(

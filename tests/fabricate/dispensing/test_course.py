@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from padforge.design.morphology import Morphology, assemble
+from padforge.design.morphology import Morphology, assemble_knots
 from padforge.fabricate.dispensing.clearance import check_course
 from padforge.fabricate.dispensing.course import Stroke, laying_steps
 from padforge.fabricate.mould.plan import Plan
@@ -80,7 +80,7 @@ def test_bends_only_where_they_are_slow_a_fibre_down():
     inner = np.zeros((2, 3, 2))
     inner[0] = [(0.6, 1.0), (1.0, 1.0), (1.02, 1.2)]
     inner[1] = [(1, 0.5), (1, 1.0), (1, 1.5)]
-    bent, straight = strokes(Plan(Morphology(assemble(inner), 10.0)))
+    bent, straight = strokes(Plan(Morphology(assemble_knots(inner), 10.0)))
     assert straight.feeds_mm_s.tolist() == [10.0]
     assert len(straight.places_mm) == 2
     at_most = bent.feeds_mm_s == 10

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.design.morphology import Morphology, assemble
+from padforge.design.morphology import Morphology, assemble_knots
 from padforge.fabricate.checks.mesh_checks import sound
 from padforge.fabricate.checks.plan_checks import check
 from padforge.fabricate.mould.assembly import mould_body
@@ -52,7 +52,7 @@ def wild(kind: str, grid: int = 2, count: int = 4) -> Morphology:
         inner[:grid, :, 0] = inner[grid:, :, 1] = 1.3 + 1e-9 * np.arange(count)
     elif kind == "level":
         inner[:grid, :, 1] = np.arange(1, grid + 1)[:, None] + rng.normal(0, 1e-12, (grid, count))
-    return Morphology(assemble(inner))
+    return Morphology(assemble_knots(inner))
 
 
 KINDS = ["steps", "lattice", "border", "alike", "edge", "needles", "level"]

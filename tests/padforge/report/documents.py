@@ -22,19 +22,19 @@ def design_document() -> dict:
     used = {"pad": PadSettings(grid=2), "contact": Contact(), "search": SearchSettings(), "rules": RulesSettings()}
     settings = {name: section.model_dump(mode="json") for name, section in used.items()}
     return {
-        "format": "padforge-design/1",
+        "format": "padforge-design/2",
         "terms": {
-            "expected_error_lost_0": 0.06,
-            "expected_error_lost_1": 0.08,
-            "ambiguity_lost_0": 0.1,
-            "ambiguity_lost_1": 0.2,
+            "expected_error_mm_0": 0.675,
+            "expected_error_mm_1": 0.9,
+            "ambiguity_mm_0": 1.125,
+            "ambiguity_mm_1": 2.25,
             "information": 9.5,
         },
         "straight": {
-            "expected_error_lost_0": 0.12,
-            "expected_error_lost_1": 0.24,
-            "ambiguity_lost_0": 0.25,
-            "ambiguity_lost_1": 0.5,
+            "expected_error_mm_0": 1.35,
+            "expected_error_mm_1": 2.7,
+            "ambiguity_mm_0": 2.8125,
+            "ambiguity_mm_1": 5.625,
         },
         "violations": [],
         "provenance": provenance("padforge design", 3) | {"settings": settings},

@@ -197,7 +197,7 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
 
 
 DAMAGED = {
-    "design.json": ['{"format": "padforge-design/1", "terms": {}}', '{"format": "padforge-design/2"}', "{", "[]"],
+    "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}', "{", "[]"],
     "fabrication.json": ['{"format": "padforge-fabrication/1", "findings": []}'],
     "calibration.json": ['{"format": "padforge-calibration/1", "errors": []}'],
     "fibre_loss.json": ['{"format": "padforge-fibre-loss/1", "ways": {"x": {"by_subset": [{"lost": [1]}]}}}'],

@@ -36,7 +36,7 @@ def test_a_fit_explains_fresh_presses_and_is_nearer_to_the_truth_than_the_plan_i
     off, planned = [], []
     for channel, fibre in enumerate(fitted.pad.fibres):
         plan = fitted.pad.plan
-        true = plan.to_grid(printed.laid_mm[fibre])[1:-1]
+        true = plan.to_grid(printed.as_built_mm[fibre])[1:-1]
         across = plan.tangent[fibre] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
         inside = (np.abs(plan.course[fibre] - 1.5) < 1).all(axis=1)
         off.append(((fitted.pad.course(channel)[0] - true) * across).sum(axis=1)[inside])

@@ -16,7 +16,9 @@ QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.
 def known_information(twin: Twin, places_mm: np.ndarray) -> np.ndarray:
     """(C',) 1/mm^2 of the live channels: squares of how answers change with the place, over their noise."""
     live = [channel for channel in twin.channels if channel.fibre is not None]
-    steps = [twin.laid_stretch(places_mm + step) - twin.laid_stretch(places_mm - step) for step in 0.5 * np.eye(2)]
+    steps = [
+        twin.as_built_stretch(places_mm + step) - twin.as_built_stretch(places_mm - step) for step in 0.5 * np.eye(2)
+    ]
     slopes = np.sum(np.square(steps), axis=0).mean(axis=0)
     return np.array([slopes[c.fibre] * (c.gain_v / c.noise_v) ** 2 for c in live])
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from padforge.benchmarks.filter import fibre, admm, linear_program
+from padforge.benchmarks.filter import admm, fibre, linear_program
 from padforge.design.common.validation import InputError
 from padforge.sense import TotalVariation, open_recording, running_median, total_variation
 from padforge.sense.recordings.processing.filters import stretches

@@ -34,7 +34,7 @@ def calibrated(recording: Recording) -> tuple[Localizer, dict]:
 
 
 def test_a_recording_says_which_pad_it_is_of(recording: Recording, tmp_path: Path) -> None:
-    assert Morphology.of_document(recording.source["morphology"]) == PAD
+    assert Morphology.from_dict(recording.source["morphology"]) == PAD
     assert recording.source["keep_out_mm"] == [[list(corner) for corner in HOLE]]
     recording.save(tmp_path / "recording", {})
     assert simulated(tmp_path).connect()["channels"] == 5

@@ -38,7 +38,7 @@ def test_channels_respond_as_the_twin_names_them_a_dead_one_by_noise_alone_and_a
     twin = twin_of(PlanTransform(turn_deg=5, shift_mm=(2, -1), scale=0.9))
     recording = simulate(twin, RigSettings(presses=200, hysteresis=0, **STILL))
     expected = np.zeros((200, 4))
-    expected[:, [0, 2, 3]] = GAINS * twin.laid_stretch(recording.presses_mm)[:, [3, 0, 1]]
+    expected[:, [0, 2, 3]] = GAINS * twin.as_built_stretch(recording.presses_mm)[:, [3, 0, 1]]
     found = responses(recording)
     assert found == pytest.approx(expected, abs=4e-3)  # creep of the press before, and steps of the converter
     assert np.corrcoef(found[:, 0], expected[:, 0])[0, 1] > 0.999
@@ -66,15 +66,17 @@ def test_a_mirrored_pad_answers_as_at_the_mirrored_place_and_is_pressed_where_it
     assert spans == pytest.approx((20, 10))
 
 
-@pytest.mark.parametrize(("looks", "rig"), [(1.0, {}), (4.0, {}), (1.0, {"drift_mv": 100.0, "noise_mv": 5.0})])
-def test_responses_scatter_as_the_twin_says(looks: float, rig: dict) -> None:
-    """With 4 looks by half of it, as all that is read of a press deviates alike; what it has measured counts first."""
+@pytest.mark.parametrize(
+    ("information_gain", "rig"), [(1.0, {}), (4.0, {}), (1.0, {"drift_mv": 100.0, "noise_mv": 5.0})]
+)
+def test_responses_scatter_as_the_twin_says(information_gain: float, rig: dict) -> None:
+    """With an information gain of 4 by half of it; what was measured takes precedence."""
     measures = {"noise_mv": 1.6, "drift_mv": 10.0, "hysteresis": 0.0, "hysteresis_s": 12.0} | rig
-    twin = twin_of(noise_v=0.012, readings=TwinReadings(**measures, looks=looks))
+    twin = twin_of(noise_v=0.012, readings=TwinReadings(**measures, information_gain=information_gain))
     recording = simulate(twin, RigSettings(presses=1500, creep=0))
     assert recording.source["rig"].items() >= (measures | {"creep": 0}).items()
     scatter = responses(recording) - measured(twin).answers(recording.presses_mm)
-    assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / looks**0.5, rel=0.08)
+    assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / information_gain**0.5, rel=0.08)
 
 
 def test_another_pad_answers_as_planned_with_the_reach_and_median_gain_of_the_twin_or_is_refused() -> None:
