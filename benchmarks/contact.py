@@ -96,7 +96,7 @@ def reference_signals(pad: Morphology, presses: Array, contact: Contact) -> Arra
                 t = np.linspace(low, high, 400)
                 sign = np.sign(outside(t, press))
                 changes = np.flatnonzero(sign[:-1] * sign[1:] < 0)
-                roots = (brentq(outside, t[i], t[i + 1], args=(press,), xtol=1e-15) for i in changes)
+                roots: list[Any] = [brentq(outside, t[i], t[i + 1], args=(press,), xtol=1e-15) for i in changes]
                 for a, b in pairwise([low, *roots, high]):
                     if outside((a + b) / 2, press) <= 0:
                         signals[q, fibre] += b - a + abs(curve(b) - curve(a))

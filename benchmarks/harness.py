@@ -1,9 +1,8 @@
 """Measure benchmarks: trials, each some work and an evaluation of its result, timed in several rounds.
 
-Disturbances only add to run time and last for a while. Hence the minimum counts, and every trial is repeated in later
-rounds, with other trials between, until its two best rounds agree. The pace of the machine is the time of a fixed
-reference work, measured before and after every trial. Two runs are compared by times relative to the best pace, and,
-since a machine that is busy all the time never shows it, relative to the pace beside the trial.
+Disturbances only add to run time and last for a while. Hence the minimum over rounds counts, with other trials between.
+The pace of the machine is the time of a fixed reference work, measured before and after every trial, so that two runs
+can be compared by relative times.
 """
 
 import time
@@ -17,9 +16,7 @@ import numpy as np
 from padforge.benchmarks.results import SLOWER, TrialKey, Worsening, find_worsenings, write_bench, write_summary
 from padforge.design.common.files import check_writable
 
-MIN_ROUNDS, MAX_ROUNDS = 2, 5
-MAX_S = 300.0
-"""Time after which no further round starts, s."""
+ROUNDS = 3
 MAX_RECHECKS = 5
 """Further rounds of trials that seem slower than in the earlier run."""
 BUDGET_S = 0.2
@@ -28,8 +25,6 @@ LONG_S = 1.0
 """Work that takes longer is done once a round, s."""
 MAX_BASELINE_S = 0.1
 """Baselines that take longer are measured in the first round only, s: their run time is not compared between runs."""
-AGREEMENT = 1.04
-"""Ratio of the two best rounds of a trial below which it is settled."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +94,6 @@ class BenchRounds:
     seconds: dict[TrialKey, list[float]] = field(default_factory=dict)
     paces: dict[TrialKey, list[float]] = field(default_factory=dict)
     pace_s: float = np.inf
-
-    def is_settled(self, key: TrialKey) -> bool:
-        """Whether the two best rounds of a trial agree."""
-        best, *others = sorted(self.seconds[key])
-        return bool(others) and others[0] < AGREEMENT * best
 
 
 def measure_round(
@@ -210,13 +200,9 @@ def run_benches(
     def slower_trials() -> set[tuple[str, TrialKey]]:
         return {(change.bench, change.key) for change in find_worsenings(earlier, documents) if change.what == SLOWER}
 
-    begin = time.perf_counter()
-    for number in range(MAX_ROUNDS):
-        if number >= MIN_ROUNDS and time.perf_counter() - begin > MAX_S:
-            break
+    for number in range(ROUNDS):
         for bench in benches:
-            is_settled = rounds[bench.name].is_settled
-            measure(bench, f"round {number + 1}", lambda key, s=is_settled, n=number: n < MIN_ROUNDS or not s(key))
+            measure(bench, f"round {number + 1}", lambda key: True)
     for number in range(MAX_RECHECKS):
         time.sleep(number if slower_trials() else 0)  # a disturbance may take a while
         for bench in benches:

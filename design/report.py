@@ -42,7 +42,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     low, high = sensed_rectangle(layout)
     size = " x ".join(f"{round((b - a) * layout.unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
     errors = [
-        [name[-1], *(_format_mm(errors, name) for errors in (terms, document.get("straight", {})))]
+        [name[-1], *(f"{float(errors_mm[name]):#.3g}" for errors_mm in (terms, document["straight"]))]
         for name in sorted(terms)
         if name.startswith("expected_error")
     ]
@@ -74,13 +74,9 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     key_figures = [
         (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
         (check, "design rules"),
-        (f"{errors[0][1] if errors else '-'} mm", "expected error of the design"),
+        (f"{errors[0][1]} mm", "expected error of the design"),
     ]
     return [PageSection("Fibres", body, key_figures)]
-
-
-def _format_mm(terms: Mapping[str, Any], name: str) -> str:
-    return f"{float(terms[name]):#.3g}" if name in terms else "-"
 
 
 def _rule_rows(rules: Mapping[str, Any], violations: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:

@@ -34,7 +34,7 @@ def move(begun, fibre, knot, x_mm, y_mm, gesture=""):
     return ask(begun, do="move", fibre=fibre, knot=knot, x_mm=x_mm, y_mm=y_mm, gesture=gesture)
 
 
-def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
+def test_view_has_rules_and_ambiguity(tmp_path):
     pad = Morphology.random((1, 2), 4, 1, (9.0, 12.0))
     _, shown = session(tmp_path, pad)
     assert [view["ready"] for view in shown] == [False, True]
@@ -48,7 +48,7 @@ def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
 
 
-def test_a_knot_goes_where_it_is_dragged_and_drags_are_undone_and_done_again(tmp_path):
+def test_move_clips_knot_and_gestures_are_undone_together(tmp_path):
     begun, shown = session(tmp_path, grid=2)
     first = shown[-1]["fibres"]
     for y_mm in (1.0, 2.0, 3.0):
@@ -72,7 +72,7 @@ def test_a_knot_goes_where_it_is_dragged_and_drags_are_undone_and_done_again(tmp
     assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
 
 
-def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
+def test_add_and_remove_change_one_fibre(tmp_path):
     begun, shown = session(tmp_path, Morphology.random(2, 5, 3))
     before = shown[-1]
     more = ask(begun, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
@@ -87,7 +87,7 @@ def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
     assert fewer["fibres"][1]["knots"] == before["fibres"][1]["knots"]
 
 
-def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
+def test_save_writes_view_with_provenance(tmp_path):
     begun, _ = session(tmp_path, Morphology.random(2, 3, 3))
     read = sha256(tmp_path / "pad.json")
     Morphology.straight(2).save(tmp_path / "pad.json")  # what was read counts
@@ -118,7 +118,7 @@ HOSTILE = (
 )
 
 
-def test_what_cannot_be_done_is_told_and_changes_nothing(tmp_path):
+def test_invalid_edits_are_refused_and_change_nothing(tmp_path):
     begun, shown = session(tmp_path, grid=2)
     for body in HOSTILE:
         with pytest.raises(InputError) as refused:
@@ -143,7 +143,7 @@ def test_what_cannot_be_done_is_told_and_changes_nothing(tmp_path):
     assert begun.unsaved
 
 
-def test_what_another_has_saved_meanwhile_stays(tmp_path):
+def test_save_does_not_replace_file_of_other_session(tmp_path):
     """Two that are begun on one pad are to be saved to the same free name."""
     first, second = (session(tmp_path, grid=1)[0] for _ in range(2))
     for number, begun in enumerate((first, second, second, first)):
@@ -154,7 +154,7 @@ def test_what_another_has_saved_meanwhile_stays(tmp_path):
     assert [pad.to_mm(pad.knots[0])[1, 1] for pad in found] == pytest.approx([3.0, 2.0])
 
 
-def test_a_pad_that_a_mould_was_made_from_stays(tmp_path):
+def test_save_does_not_replace_pad_with_mould(tmp_path):
     """One that was saved before, and one that lies there from the beginning."""
     begun, _ = session(tmp_path, Morphology.straight(2))
     begun.save(b"{}")

@@ -80,7 +80,7 @@ def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
         yield program
 
 
-def test_it_refuses_what_is_hostile_and_saves_beside_the_pad(program: Program, tmp_path: Path, pad: Path) -> None:
+def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, tmp_path: Path, pad: Path) -> None:
     before = pad.read_bytes()
     assert "saves to pad-edited.json" in program.said
     first = program.ask(do="undo")
@@ -112,7 +112,7 @@ def test_it_refuses_what_is_hostile_and_saves_beside_the_pad(program: Program, t
 
 
 @pytest.mark.slow
-def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None:
+def test_editor_announces_file_it_replaces(tmp_path: Path, pad: Path) -> None:
     with at_work(tmp_path, "pad.json", "--out", "pad.json") as program:
         assert program.said.endswith("saves to pad.json in place of its content\n")
         program.ask(do="add", fibre=1)
@@ -130,13 +130,13 @@ def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None
         (["pad.json", "--out", "pad.json/x.json"], r"pad.json: cannot be written"),
     ],
 )
-def test_mistakes_are_told_before_a_page_is_there(tmp_path: Path, pad: Path, arguments: list[str], told: str) -> None:
+def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path, arguments: list[str], told: str) -> None:
     with chdir(tmp_path):
         assert re.search(told, str(CliRunner().invoke(edit, arguments).exception))
 
 
 @pytest.mark.slow
-def test_it_takes_no_torch() -> None:
+def test_editor_does_not_import_torch() -> None:
     code = "import padforge.design.editor.session, sys; sys.exit('torch' in sys.modules)"
     root = Path(__file__).resolve().parents[3]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
@@ -173,7 +173,7 @@ def control_key(browser: Chromium, key: str, modifiers: int = 2) -> None:
 
 
 @pytest.mark.slow
-def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
+def test_dragging_updates_page_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
     first = {name: browser.ask(TEXT.format(name)) for name in ("rules", "ambiguity")}
     colours = "[...document.querySelectorAll('#map rect')].map(each => each.getAttribute('fill-opacity')).join()"
     coloured = browser.ask(colours)
@@ -203,7 +203,7 @@ def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, bro
 
 
 @pytest.mark.slow
-def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: Chromium) -> None:
+def test_editor_works_by_keyboard_and_touch(program: Program, browser: Chromium) -> None:
     browser.ask("document.getElementById('fibre').focus()")
     for _ in range(12):  # once round the page, to the first knot
         browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key="Tab", windowsVirtualKeyCode=9)
@@ -240,7 +240,7 @@ def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: 
 
 
 @pytest.mark.slow
-def test_another_page_follows_and_one_that_was_away_comes_back(program: Program, browser: Chromium) -> None:
+def test_second_page_follows_and_reconnects(program: Program, browser: Chromium) -> None:
     moved = program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
     shown = "view.fibres[0].knots[1][1]"
     browser.wait_for(f"{shown} == 3.25")
