@@ -27,8 +27,12 @@ from padforge.design.common.command_line import (
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from padforge.design.common.settings import Spec
     from padforge.design.compare import MakePad
+    from padforge.design.morphology import Morphology
+    from padforge.design.objectives.rules import Violation
     from padforge.design.optimize.search import OnProgress
+    from padforge.design.settings import PadSettings
 
 EDIT_PORT = 8322
 POLL_S = 0.2
@@ -143,17 +147,13 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     """
     from padforge.design.common.plotting import save_figure
     from padforge.design.common.validation import InputError
-    from padforge.design.morphology import Morphology
-    from padforge.design.objectives.rules import check_rules
     from padforge.design.plan_drawing import draw_plan
-    from padforge.design.settings import Contact, PadSettings, RulesSettings
+    from padforge.design.settings import Contact
 
     path = out or pad_folder(morphology) / "plan.svg"
     if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
-    settings, pad = load_spec(spec), Morphology.load(morphology)
-    pad_settings = settings.section(PadSettings, **pad.layout.settings)
-    violations = check_rules(pad, settings.section(RulesSettings), pad_settings)
+    pad, settings, pad_settings, violations = _load_and_check(morphology, spec)
     save_figure(draw_plan(pad, settings.section(Contact), violations, pad_settings.keep_out_mm), path)
     click.echo(f"plan -> {path}")
 
@@ -169,15 +169,9 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     \b
     padforge design check out/pad/morphology.json
     """
-    from padforge.design.morphology import Morphology
-    from padforge.design.objectives.rules import check_rules
-    from padforge.design.settings import PadSettings, RulesSettings
-
-    pad, settings = Morphology.load(morphology), load_spec(spec)
-    pad_settings = settings.section(PadSettings, **pad.layout.settings)
-    violations = check_rules(pad, settings.section(RulesSettings), pad_settings)
+    violations = _load_and_check(morphology, spec)[-1]
     lines = [str(violation) for violation in violations] or ["all rules hold"]
-    show_result({"violations": [asdict(violation) for violation in violations]}, lines, as_json)
+    show_result({"violations": list(map(asdict, violations))}, lines, as_json)
     context.exit(int(bool(violations)))
 
 
@@ -195,22 +189,32 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     padforge design score out/pad/morphology.json
     padforge design score out/pad/morphology.json --twin out/pad/twin.json
     """
-    from padforge.design.morphology import Morphology
     from padforge.design.objectives.expected_error import error_terms, expected_errors
-    from padforge.design.objectives.rules import check_rules
     from padforge.design.objectives.score import score as score_terms
-    from padforge.design.optimize.twin_search import settings_for_twin
-    from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+    from padforge.design.settings import Contact, RulesSettings, SearchSettings
 
-    settings, pad = load_spec(spec), Morphology.load(morphology)
-    if twin is not None:
-        settings = settings_for_twin(settings, twin, pad)
-    contact, search = settings.section(Contact), settings.section(SearchSettings)
-    rules, pad_settings = settings.section(RulesSettings), settings.section(PadSettings, **pad.layout.settings)
+    pad, settings, pad_settings, violations = _load_and_check(morphology, spec, twin)
+    contact, search, rules = (settings.section(model) for model in (Contact, SearchSettings, RulesSettings))
     terms = error_terms(expected_errors(pad, contact, search, pad_settings), pad.unit_mm)
     terms |= score_terms(pad, contact, search.max_failures, rules=rules, size=pad_settings)
-    violations = [asdict(violation) for violation in check_rules(pad, rules, pad_settings)]
-    show_result({"terms": terms, "violations": violations}, [], as_json=True)
+    show_result({"terms": terms, "violations": list(map(asdict, violations))}, [], as_json=True)
+
+
+def _load_and_check(
+    morphology: Path, spec: Path | None, twin: Path | None = None
+) -> "tuple[Morphology, Spec, PadSettings, list[Violation]]":
+    """Load a morphology and its settings, for a twin if there is one, and check the design rules."""
+    from padforge.design.morphology import Morphology
+    from padforge.design.objectives.rules import check_rules
+    from padforge.design.settings import PadSettings, RulesSettings
+
+    pad, settings = Morphology.load(morphology), load_spec(spec)
+    if twin is not None:
+        from padforge.design.optimize.twin_search import settings_for_twin
+
+        settings = settings_for_twin(settings, twin, pad)
+    pad_settings = settings.section(PadSettings, **pad.layout.settings)
+    return pad, settings, pad_settings, check_rules(pad, settings.section(RulesSettings), pad_settings)
 
 
 @design.command()

@@ -60,19 +60,19 @@ def test_variant_folders_are_valid_on_every_system(tmp_path):
 
 
 def test_interrupt_ends_whole_comparison(tmp_path, monkeypatch):
-    begun = []
+    started = []
 
     def interrupted(spec, folder, *arguments, **options):
-        begun.append(folder)
+        started.append(folder)
         return {}, SimpleNamespace(stopped="interrupted")
 
     monkeypatch.setattr(comparison, "run_design", interrupted)
     result = called("design", "compare", "--vary", "pad.grid=1,2", cwd=tmp_path)
-    assert (result.code, len(begun)) == (130, 1)
+    assert (result.code, len(started)) == (130, 1)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("arguments", "message"),
     [
         ((), "there are 1 pads to compare"),
         (("--vary", "grid=3"), "SECTION.KEY=VALUE"),
@@ -83,8 +83,8 @@ def test_interrupt_ends_whole_comparison(tmp_path, monkeypatch):
         (("--vary", "pad.grid=3,3"), "two pads have this name"),
     ],
 )
-def test_compare_refuses_invalid_variants_before_searching(tmp_path, given, said):
-    result = called("design", "compare", *given, cwd=tmp_path)
+def test_compare_refuses_invalid_variants_before_searching(tmp_path, arguments, message):
+    result = called("design", "compare", *arguments, cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert said in result.err
+    assert message in result.err
     assert not list(tmp_path.iterdir())

@@ -39,11 +39,11 @@ def designed(*arguments, spec):
 
 
 def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
-    told, document = designed(spec=QUICK)
-    pad, asked = Morphology.straight(2), {"max_failures": 1, "size": PadSettings(grid=2)}
+    printed, document = designed(spec=QUICK)
+    pad, options = Morphology.straight(2), {"max_failures": 1, "size": PadSettings(grid=2)}
     straight = [
-        *expected_errors(pad, Contact(), SearchSettings(max_failures=1), asked["size"]),
-        *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
+        *expected_errors(pad, Contact(), SearchSettings(max_failures=1), options["size"]),
+        *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **options),
     ]
     straight_mm = [pad.unit_mm * value for value in straight]
     assert list(document["straight"].values()) == pytest.approx(straight_mm, rel=1e-6)
@@ -52,12 +52,12 @@ def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
     assert document["candidate"] == result.candidate == "straight fibres"
-    assert summary_lines(result, Path("out/pad"))[1:] == told[1:]
+    assert summary_lines(result, Path("out/pad"))[1:] == printed[1:]
     first, second = straight_mm[:2]
-    assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
-    assert (told[3].startswith("  the search found no better pad"), told[4:]) == (True, ["  all rules hold"])
-    alike = summary_lines(replace(result, candidate="start 1"), Path("out/pad"))
-    assert alike[3].startswith("  not significantly better than straight fibres")
+    assert printed[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
+    assert (printed[3].startswith("  the search found no better pad"), printed[4:]) == (True, ["  all rules hold"])
+    similar = summary_lines(replace(result, candidate="start 1"), Path("out/pad"))
+    assert similar[3].startswith("  not significantly better than straight fibres")
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
         Path("out/pad/design.json").write_text(json.dumps(document | change))
@@ -93,16 +93,16 @@ def test_settings_for_twin_take_profile_noise_area_and_layout(here, twin):
     assert (wider.section(PadSettings).pitch_mm, wider.section(PadSettings).sensed_mm) == (20, (18, 31.5))
     Morphology.straight(2, 10.0).save(here / "pad.json")
     scored = CliRunner().invoke(design, ["score", "pad.json", "--twin", str(twin)], catch_exceptions=False)
-    terms = judged(Morphology.straight(2, 10.0), contact, used.noise)
+    terms = evaluate(Morphology.straight(2, 10.0), contact, used.noise)
     assert json.loads(scored.output)["terms"] == pytest.approx(terms, rel=1e-9)
 
 
-def judged(pad, contact, noise):
+def evaluate(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
-    asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
+    options = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
     settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
-    return score(pad, contact, **asked) | error_terms(
-        expected_errors(pad, contact, settings, asked["size"]), pad.unit_mm
+    return score(pad, contact, **options) | error_terms(
+        expected_errors(pad, contact, settings, options["size"]), pad.unit_mm
     )
 
 
@@ -114,7 +114,7 @@ def test_design_for_twin_uses_its_contact(here, twin):
     assert document["candidate"] in ("twin", "from usual", "usual", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
-    assert document["terms"] == pytest.approx(judged(pad, contact, used["search"]["noise"]), rel=1e-9)
+    assert document["terms"] == pytest.approx(evaluate(pad, contact, used["search"]["noise"]), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -136,19 +136,19 @@ def test_design_for_twin_refuses_contradicting_settings_and_invalid_files(here, 
 @pytest.mark.slow
 def test_search_for_twin_resumes(here, twin):
     long = QUICK_SEARCH.replace("steps = 3", "steps = 20")
-    _, whole = designed("--twin", twin, spec=long)
+    _, unbroken = designed("--twin", twin, spec=long)
 
     def stop(*step):
         raise SystemError
 
     spec = settings_for_twin(Spec.load(Path("pad.toml")), twin)
     pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
-    begun = state_folders(Path("out/pad/search"))["twin"]
+    states = state_folders(Path("out/pad/search"))["twin"]
     with pytest.raises(SystemError):
-        search(pad, contact, settings, run=SearchOptions(stop, begun))
-    assert list(begun.glob("start_*.npz"))
+        search(pad, contact, settings, run=SearchOptions(stop, states))
+    assert list(states.glob("start_*.npz"))
     _, resumed = designed("--twin", twin, "--resume", spec=long)
-    assert resumed["terms"] == whole["terms"]
+    assert resumed["terms"] == unbroken["terms"]
     assert not list(Path("out/pad").glob("search*"))
 
 
