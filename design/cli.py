@@ -104,13 +104,13 @@ def design(
     """Optimise the paths of the fibres, or evaluate a finished morphology.
 
     \b
-    padforge design                                      into out/pad, with the settings of pad.toml or the defaults
+    padforge design                                        into out/pad, with the settings of pad.toml or the defaults
     padforge design --knots 8 --seed 1 --out out/pad
-    padforge design --start-from out/pad/morphology.json improve a pad
-    padforge design --twin out/pad/twin.json             for the measured contact of a printed pad
-    padforge design check out/pad/morphology.json        exit code 1 if a rule is broken
-    padforge design edit out/pad/morphology.json         edit the paths in a browser
-    padforge design import plan.svg                      import paths from a drawing
+    padforge design --start-from out/pad/morphology.json   improve a pad
+    padforge design --twin out/pad/twin.json               for the measured contact of a printed pad
+    padforge design check out/pad/morphology.json          exit code 1 if a rule is broken
+    padforge design edit out/pad/morphology.json           edit the paths in a browser
+    padforge design import plan.svg                        import paths from a drawing
 
     Writes morphology.json, design.json, design.svg and design.png. Exit code 1 if the best pad breaks a rule. Ctrl-C
     stops with the best pad so far (exit code 130); --resume continues from there, also after a kill. A pad from which a

@@ -50,7 +50,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     [
         f"{DESIGN} --seed 1",
         f"{DESIGN} --seed 1 --resume",
-        f"{DESIGN} --from pad/morphology.json",
+        f"{DESIGN} --start-from pad/morphology.json",
         "design import plan.svg --out pad",
         "design edit other.json --out pad/morphology.json",
     ],
