@@ -141,7 +141,7 @@ def _run_exact(
     def work(begin: int, end: int) -> int:
         return exact_signals(travel, cross, slope, strays, ends, places, *shape, begin, end, starts, fibre, out)
 
-    visited = sum(map_chunks(work, len(travel) * len(places), grain=2000))
+    visited = sum(map_chunks(work, len(travel) * len(places), min_chunk=2000))
     if profiling.is_profiling():
         record_visits(travel, strays, ends, places, shape[1], visited)
     return visited
@@ -151,8 +151,8 @@ def record_visits(travel: Array, strays: Array, ends: geometry.Ends, places: Arr
     """Tell the profile how many fibres and spans were looked at, press by press."""
     pads, fibres, knots = travel.shape
     within = sum(int(geometry.count_touched(each, places, reach, ends)[-1]) for each in strays)
-    profiling.looked_at("fibres, press by press", within, pads * len(places) * fibres)
-    profiling.looked_at("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
+    profiling.add_count("fibres, press by press", within, pads * len(places) * fibres)
+    profiling.add_count("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
 
 
 def fibre_axes(

@@ -104,7 +104,7 @@ FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 def contact_of(spec: "Spec", settings: SearchSettings) -> Contact:
     """What is designed for: the contact that `spec` states, or the usual one of such a search."""
-    return spec.section(Contact) if spec.given(Contact) else settings.default_contact
+    return spec.section(Contact) if spec.stated(Contact) else settings.default_contact
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

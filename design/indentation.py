@@ -154,7 +154,7 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
         shape = _SHAPES[indenter.shape]
         lengthenings(travel[0], cross[0], slope, ends.horizontals, places, a, steepness, floor, shape, begin, end, out)
 
-    map_chunks(work, len(places), grain=50)
+    map_chunks(work, len(places), min_chunk=50)
     return out
 
 

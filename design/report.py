@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import read_json, reraise_as_input_error, unchanged
+from padforge.design.common.files import find_unchanged, read_json, reraise_as_input_error
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
@@ -144,7 +144,7 @@ def _find_mismatches(
     origin = document["provenance"]
     inputs, name = origin.get("inputs", {}), f"{stage} ({origin.get('command')})"
     pad = document.get("morphology_sha256") if stage == "design" else inputs.get(PAD)
-    if isinstance(pad, str) and (folder / PAD).is_file() and not unchanged(folder, {PAD: pad}):
+    if isinstance(pad, str) and (folder / PAD).is_file() and not find_unchanged(folder, {PAD: pad}):
         yield f"{name} is of another pad than the {PAD} here"
     if isinstance(inputs.get("recording"), str) and recording() not in (None, inputs["recording"]):
         yield f"{name} is of another recording than the one here"
@@ -172,7 +172,7 @@ def _describe_inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
         if not isinstance(digest, str):  # the provenance of an input that was computed
             yield f"{name}: {digest['command']}" if digest else name
         elif Path(name).name == name and (folder / name).is_file():  # never opens a file in another folder
-            match = "the one here" if unchanged(folder, {name: digest}) else "not the one here"
+            match = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
             yield f"{name} {digest} ({match})"
         else:
             yield f"{name} {digest}"

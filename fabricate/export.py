@@ -17,11 +17,11 @@ from padforge.design.common import profiling
 from padforge.design.common.files import (
     atomic_files,
     check_file,
+    find_unchanged,
     provenance,
     read_json,
     reraise_write_error,
     sha256,
-    unchanged,
     write_json,
 )
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
@@ -109,7 +109,7 @@ def build(
     require_formats(formats)
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
     made_by = provenance("fabricate", inputs=_require_files(inputs), packages=packages)  # minutes later they may differ
-    profiling.looked_at("formats", len(set(formats)), len(FORMATS))
+    profiling.add_count("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
         plan.require_levels()
@@ -157,7 +157,7 @@ def _put_in_place(out: Path, writes: Sequence[Write], document: dict[str, Any], 
     """Write the files of a mould and their digests at once, and take those of an earlier one out."""
     names = {name for name, _ in writes}
     earlier = _earlier_files(out)
-    gone = unchanged(out, earlier) - names
+    gone = find_unchanged(out, earlier) - names
     with atomic_files(out, without=gone) as folder:
         for name, write in writes:
             with profiling.stage(f"write {name}"), reraise_write_error(out / name):

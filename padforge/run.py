@@ -106,7 +106,7 @@ class Run:
         content = {
             "settings": {name: self.spec.section(models[name]).model_dump(mode="json") for name in names},
             # a contact that is stated is designed for, even if it is the default one
-            "stated": {"contact": self.spec.given(Contact)} if "contact" in names else {},
+            "stated": {"contact": self.spec.stated(Contact)} if "contact" in names else {},
             "seed": self.seed,
             "inputs": dict(inputs),
             "options": options,

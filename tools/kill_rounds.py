@@ -112,7 +112,7 @@ def started(words: Sequence[str], folder: Path, prepare: Callable[[], None] = la
 
     def command() -> None:
         sys.argv = ["padforge", *words]
-        import_module("padforge").main()
+        import_module("padforge.cli").main()
 
     return forked(command, folder, prepare)
 

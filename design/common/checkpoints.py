@@ -1,4 +1,4 @@
-"""What a search has done so far, on disk: one small file of arrays per start, so that it survives being killed."""
+"""Checkpoints of a search or study: a small file of arrays for each of its tasks, so that it survives a kill."""
 
 import hashlib
 import io
@@ -11,97 +11,106 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import MAX_BYTES, atomic_file, clear_litter, read_bytes, read_json, write_json
+from padforge.design.common.files import MAX_BYTES, atomic_file, read_bytes, read_json, remove_leftovers, write_json
 from padforge.design.common.validation import InputError, short_repr
 
 FORMAT = "padforge-search/1"
 
 State = dict[str, NDArray[Any]]
 
-_STATE = re.compile(r"start_([0-9]{4,})\.npz")
-_SEAL = "seal"
-"""Name of the array that tells whether the others are as they were written."""
+_SETTINGS_FILE = "search.json"
+_STATE_FILE = re.compile(r"start_([0-9]{4,})\.npz")
+_DIGEST = "seal"
+"""Name of the array that holds the digest of the others."""
 
 
 class Checkpoints:
-    """The folder a search keeps its states in.
-
-    Args:
-        folder: made when the first state is written.
-        settings: what the search depends on, JSON; states of other settings are no help.
-    """
+    """The folder of the states of a search."""
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        """Use a folder.
+
+        Args:
+            folder: created with the first state.
+            settings: what the search depends on, JSON by section and key; states of other settings are refused.
+        """
         self.folder = folder
         self.settings = json.loads(json.dumps(settings))
 
     def begin(self, resume: bool) -> dict[int, State]:
-        """States by start to go on from; none, and an empty folder, unless `resume` is asked for.
+        """Read the states of an earlier run, or remove them.
+
+        Args:
+            resume: whether to go on from them.
+
+        Returns:
+            States by number.
 
         Raises:
-            InputError: the states there belong to other settings, or cannot be read.
+            InputError: the states belong to other settings, or cannot be read.
         """
-        about = self.folder / "search.json"
-        if not (resume and about.exists()):
+        path = self.folder / _SETTINGS_FILE
+        if not (resume and path.exists()):
             self.clear()
             return {}
-        before = read_json(about, FORMAT).get("settings")
-        if not isinstance(before, dict) or not all(isinstance(section, dict) for section in before.values()):
-            raise InputError(f"{about}: settings are not as padforge writes them; start anew without --resume")
-        for section in self.settings:
-            for key, value in self.settings[section].items():
-                if before.get(section, {}).get(key) != value:
-                    was = before.get(section, {}).get(key)
+        stored = read_json(path, FORMAT).get("settings")
+        if not isinstance(stored, dict) or not all(isinstance(section, dict) for section in stored.values()):
+            raise InputError(f"{path}: settings are not as padforge writes them; start anew without --resume")
+        for section, values in self.settings.items():
+            for key, value in values.items():
+                before = stored.get(section, {}).get(key)
+                if before != value:
                     raise InputError(
-                        f"{self.folder}: begun with {section} {key} {short_repr(was)}, now {short_repr(value)}; "
+                        f"{self.folder}: begun with {section} {key} {short_repr(before)}, now {short_repr(value)}; "
                         "allowed to resume are the same settings"
                     )
-        named = {path: _STATE.fullmatch(path.name) for path in sorted(self.folder.glob("start_*.npz"))}
-        return {int(number[1]): self._read(path, int(number[1])) for path, number in named.items() if number}
+        paths = {int(name[1]): path for path in self.folder.iterdir() if (name := _STATE_FILE.fullmatch(path.name))}
+        return {number: self._read(paths[number], number) for number in sorted(paths)}
 
-    def save(self, start: int, state: State) -> None:
-        """Put the state of a start in the place of its last one, atomically."""
-        if not (self.folder / "search.json").exists():
-            write_json(self.folder / "search.json", {"format": FORMAT, "settings": self.settings})
-        with atomic_file(self.folder / f"start_{start:04d}.npz") as temporary:
-            np.savez(temporary, allow_pickle=False, **state, **{_SEAL: np.array(self._seal(start, state))})
+    def save(self, number: int, state: State) -> None:
+        """Write a state atomically in place of the last one of that number."""
+        if not (self.folder / _SETTINGS_FILE).exists():
+            write_json(self.folder / _SETTINGS_FILE, {"format": FORMAT, "settings": self.settings})
+        with atomic_file(self.folder / f"start_{number:04d}.npz") as temporary:
+            np.savez(temporary, allow_pickle=False, **state, **{_DIGEST: np.array(self._digest(number, state))})
 
     def clear(self) -> None:
-        """Remove all states, and nothing else that may lie there: what they led to is kept, or it begins anew.
+        """Remove all states, and the folder if nothing else is in it.
 
         Raises:
-            InputError: a search.json there that is none of a search.
+            InputError: its search.json is not that of a search.
         """
-        about = self.folder / "search.json"
-        if about.exists():
+        path = self.folder / _SETTINGS_FILE
+        if path.exists():
             try:
-                read_json(about, FORMAT)
+                read_json(path, FORMAT)
             except InputError as error:
                 raise InputError(f"{error}; remove it, or choose another folder") from error
-            for path in self.folder.iterdir():
-                if _STATE.fullmatch(path.name) and path.is_file() and not path.is_symlink():
-                    path.unlink()
-            about.unlink()
-        clear_litter(self.folder)
-        with suppress(OSError):  # where it is not there, or there is more in it than states
+            for file in list(self.folder.iterdir()):
+                if _STATE_FILE.fullmatch(file.name) and file.is_file() and not file.is_symlink():
+                    file.unlink()
+            path.unlink()
+        remove_leftovers(self.folder)
+        with suppress(OSError):  # it does not exist, or is not empty
             self.folder.rmdir()
 
-    def _read(self, path: Path, start: int) -> State:
-        content = io.BytesIO(read_bytes(path))
+    def _read(self, path: Path, number: int) -> State:
         try:
-            with np.load(content, allow_pickle=False) as arrays:
+            with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as arrays:
                 if sum(entry.file_size for entry in arrays.zip.infolist()) > MAX_BYTES:
                     raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
                 state = {name: arrays[name] for name in arrays.files}
-            if str(state.pop(_SEAL, "")) != self._seal(start, state):
+            if str(state.pop(_DIGEST, "")) != self._digest(number, state):
                 raise ValueError("it is not as it was written")
-        except Exception as error:  # the readers of NumPy and of zip files raise whatever a torn file leads them to
+        except InputError:
+            raise
+        except Exception as error:  # NumPy and zipfile raise many kinds on torn files
             raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error
         return state
 
-    def _seal(self, start: int, state: State) -> str:
-        """Digest of a state and of what it belongs to: one that bears it needs no further check."""
-        digest = hashlib.sha256(json.dumps([self.settings, start], sort_keys=True).encode())
+    def _digest(self, number: int, state: State) -> str:
+        """Compute the digest of a state and of what it belongs to, which makes further checks unnecessary."""
+        digest = hashlib.sha256(json.dumps([self.settings, number], sort_keys=True).encode())
         for name, array in sorted(state.items()):
             digest.update(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes())
         return digest.hexdigest()

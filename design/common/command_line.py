@@ -1,4 +1,4 @@
-"""What every stage's command line shares: the settings file, progress on stderr, results on stdout."""
+"""Shared by the command lines of all stages: common options, progress on stderr, results on stdout, exit codes."""
 
 import atexit
 import functools
@@ -38,7 +38,13 @@ force_option = click.option("--force", is_flag=True, help="Replace files that ot
 
 
 def out_option(default: str = "", what: str = "Folder for the results", file: bool = False) -> Callable[..., Any]:
-    """`--out`, the folder (or file) results go to: unless `default` names one, a command takes that of `pad_folder`."""
+    """Make the option `--out`.
+
+    Args:
+        default: shown and used if the option is missing; "" where the command uses `pad_folder`.
+        what: of the help text.
+        file: whether the results are a file rather than a folder.
+    """
     return click.option(
         "--out",
         type=click.Path(file_okay=file, dir_okay=not file, path_type=Path),
@@ -48,11 +54,11 @@ def out_option(default: str = "", what: str = "Folder for the results", file: bo
 
 
 def pad_folder(source: Path | None = None) -> Path:
-    """The one rule for where results go that no `--out` says: to the folder of the pad they belong to.
+    """Return the folder for results without `--out`: that of the pad they belong to.
 
     Args:
-        source: what a command is given. A morphology.json or a recording's folder lies in the folder of its pad; a file
-            from elsewhere, NAME.mat, makes one of its own, out/NAME; without any it is out/pad.
+        source: input of the command. A morphology.json or the folder of a recording is in the folder of its pad; any
+            other file NAME.mat gets a folder out/NAME; without an input it is out/pad.
     """
     if source is None:
         return Path("out/pad")
@@ -62,38 +68,38 @@ def pad_folder(source: Path | None = None) -> Path:
 
 
 def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`--profile`: at the command's end, say on stderr where time went and what was skipped."""
+    """Add `--profile` to a command: at its end, print to stderr where time went and what was skipped."""
 
     @click.option("--profile", is_flag=True, help="Say on stderr where time went and what was skipped.")
     @functools.wraps(command)
-    def noted(*arguments: Any, profile: bool, **options: Any) -> Any:
+    def with_profile(*arguments: Any, profile: bool, **options: Any) -> Any:
         if not profile:
             return command(*arguments, **options)
         from .profiling import profiled
 
-        with profiled() as found:
+        with profiled() as result:
             try:
                 return command(*arguments, **options)
             finally:
-                click.echo("\n".join(found.lines()), err=True)
+                click.echo("\n".join(result.lines()), err=True)
 
-    return noted
+    return with_profile
 
 
 def load_spec(path: Path | None) -> "Spec":
-    """The settings file named, else `pad.toml` here if there is one, else the defaults.
+    """Load the settings file `path`, else pad.toml in the current folder if it exists, else the defaults.
 
-    Sections are those that the front door has put into its context, or any.
+    Allowed are the sections that the root command has put into its context; any without a context.
     """
     from .settings import Spec
 
-    here, context = Path("pad.toml"), click.get_current_context(silent=True)
-    return Spec.load(path or (here if here.exists() else None), context.find_root().obj if context else None)
+    default, context = Path("pad.toml"), click.get_current_context(silent=True)
+    return Spec.load(path or (default if default.exists() else None), context.find_root().obj if context else None)
 
 
 @contextmanager
 def progress() -> Iterator["Progress"]:
-    """A progress display on stderr; silent where stderr is no terminal."""
+    """Show progress bars on stderr if it is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -109,29 +115,33 @@ def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> No
 
 
 INTERRUPTED = 130
+"""Exit code after Ctrl-C, as of shells."""
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line on the arguments of this process; its exit code, with one line on stderr where it failed.
-
-    The process is to end with that code, and does so at once where tasks are left at work by then.
+    """Run a command line on the arguments of this process, errors as one line on stderr.
 
     Args:
-        extras: what has to be installed for its commands, by the first word of each; for others it is all of these.
+        command: the root command.
+        name: of the program.
+        extras: optional dependencies that its commands need, by their first word; for others all of these.
+
+    Returns:
+        The exit code, with which the process has to end; it ends at once if tasks are running by then.
     """
-    _prepare()
+    _prepare_process()
     code = _run(command, name, extras)
-    atexit.register(_leave_tasks, code)
+    atexit.register(_end_with_tasks, code)
     return code
 
 
-def _leave_tasks(code: int) -> None:
-    """End this process if tasks are at work: they can neither be told to stop nor be waited for.
+def _end_with_tasks(code: int) -> None:
+    """End this process if tasks are running, which can be neither stopped nor waited for.
 
-    Where the interpreter ends under them, those in torch crash it.
+    Those in torch would crash where the interpreter ends before them.
     """
-    computing = sys.modules.get(f"{__package__}.parallel")
-    if computing is not None and computing.DaemonThreads.at_work:
+    parallel = sys.modules.get(f"{__package__}.parallel")
+    if parallel is not None and parallel.active_threads:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
@@ -140,59 +150,56 @@ def _leave_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        _require_words(sys.argv[1:])
+        _check_words(sys.argv[1:])
         return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         return 2
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
-        told = str(error if isinstance(error, KeyboardInterrupt) else error.__cause__ or "")
-        return _fail(name, f"interrupted; {told or 'what was finished is kept'}", INTERRUPTED)
+        message = str(error if isinstance(error, KeyboardInterrupt) else error.__cause__ or "")
+        return _fail(name, f"interrupted; {message or 'what was finished is kept'}", INTERRUPTED)
     except click.ClickException as error:
-        return _fail(name, error.format_message(), 2)
+        return _fail(name, error.format_message())
     except InputError as error:
-        return _fail(name, str(error), 2)
+        return _fail(name, str(error))
     except Fault as fault:
         return _fail(name, str(fault), fault.exit_code)
     except OSError as error:
-        return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error), 2)
+        return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except ModuleNotFoundError as error:
         message = missing_extra(error, extras.get("".join(sys.argv[1:2]), ",".join(dict.fromkeys(extras.values()))))
         if message is None:
             raise
-        return _fail(name, message, 2)
+        return _fail(name, message)
     except MemoryError as error:
-        return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})", 2)
+        return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})")
 
 
-def _prepare() -> None:
-    """Let names that are no text be printed, and an end from outside clear up as Ctrl-C does."""
+def _prepare_process() -> None:
+    """Print file names that are not valid text escaped, and let SIGTERM and SIGHUP clean up as Ctrl-C does."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    for ending in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
-        number = getattr(signal, ending)
+    for name in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
+        number = getattr(signal, name)
         if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
             signal.signal(number, signal.default_int_handler)
 
 
-def _require_words(words: list[str]) -> None:
-    """Refuse what no shell can hand over, but a caller from Python can: such names would trip whatever opens them."""
+def _check_words(words: list[str]) -> None:
+    """Refuse arguments that no shell can pass but a Python caller can, on which functions of the system fail."""
     for word in words:
         try:
-            odd = b"\0" in os.fsencode(word)
+            is_valid = b"\0" not in os.fsencode(word)
         except UnicodeEncodeError:
-            odd = True
-        if odd:
+            is_valid = False
+        if not is_valid:
             raise InputError(f"{word!r}: holds characters that no argument can have")
 
 
-def _fail(name: str, message: str, code: int) -> int:
-    with suppress(OSError):  # of a disk that is full: the exit code says the same
-        print(f"{name}: {_plain(' '.join(message.split()))}", file=sys.stderr)
+def _fail(name: str, message: str, code: int = 2) -> int:
+    # Control characters of a file could give orders to a terminal.
+    line = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in " ".join(message.split()))
+    with suppress(OSError):  # on a full disk the exit code has to say it
+        print(f"{name}: {line}", file=sys.stderr)
     return code
-
-
-def _plain(text: str) -> str:
-    """A text whose control characters are written out: what a file has them for is to order terminals about."""
-    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)

@@ -1,4 +1,14 @@
-"""Files as every stage writes and reads them: atomic, together or not at all, self-describing JSON."""
+"""Files of every stage: atomic writes, sets of files replaced together, locks, self-describing JSON and provenance.
+
+A set of files (a pad, a mould, a localizer) is replaced by a write-ahead protocol:
+
+1. The files are written into a temporary folder beside their destinations, and synchronised to the disk.
+2. That folder is renamed to `EXCHANGE`. This single rename is the commit: from here on readers get the new files.
+3. The files move to their destinations, and the folder is removed.
+
+A run that is killed before step 2 leaves a temporary folder, which the next run removes; one that is killed after it
+leaves `EXCHANGE`, from which readers take the files that have not moved yet, and which the next writer completes.
+"""
 
 import errno
 import hashlib
@@ -11,18 +21,44 @@ import shutil
 import stat
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from functools import partial
 from importlib import metadata
+from itertools import count
 from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple
 
 from padforge.design.common.validation import InputError, short_repr
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+UNFINISHED = ".unfinished-"
+"""Prefix of the names of temporary files and folders."""
+EXCHANGE = f"{UNFINISHED}exchange"
+"""Name of the folder of a committed set of files that are moving to their destinations."""
+MAX_BYTES = 2**28
+"""Size limit of a file, bytes; of what padforge writes only recordings are larger."""
+PATIENCE_S = 10.0
+"""How long to wait for another run that moves its files to their destinations, which takes milliseconds."""
+
+_NOTE = f"{UNFINISHED}note"
+"""Name of the file in `EXCHANGE` that says what it does."""
+_MAX_NOTE_BYTES = 2**20
+_MAX_ATTEMPTS = 100
+_LOCK_OFFSET = 2**40
+"""Byte of a file that is locked on Windows, beyond the end of any."""
+_PACKAGES = ("padforge", "numpy", "scipy")
+_MORPHOLOGY = "padforge-morphology/"
+"""Prefix of the format of pads: a pad derived from another one stands on its own."""
+
 
 @contextmanager
 def reraise_as_input_error(path: Path) -> Iterator[None]:
-    """Blame a document that is not as padforge writes it on its file."""
+    """Report a document without the structure that padforge writes as an InputError that names its file."""
     try:
         yield
     except InputError:
@@ -33,11 +69,7 @@ def reraise_as_input_error(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reraise_write_error(path: Path) -> Iterator[None]:
-    """Turn what the system has against writing `path` into one line.
-
-    Raises:
-        InputError: naming `path` and the reason.
-    """
+    """Report an OSError of the body as an InputError that says why `path` cannot be written."""
     try:
         yield
     except OSError as error:
@@ -45,87 +77,80 @@ def reraise_write_error(path: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise InputError if files cannot be put into `folder`, or it is not there and cannot be made."""
+    """Check that files can be created in `folder`, or that it can be created itself.
+
+    Raises:
+        InputError: a file is in the way, or the permissions forbid it.
+    """
     with reraise_write_error(folder):
-        there = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
-        if not there.is_dir():
-            raise InputError(f"{folder}: cannot be written, {there} is a file, expected a folder")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"{folder}: cannot be written, {there} does not allow it; choose another folder")
+        existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+        if not existing.is_dir():
+            raise InputError(f"{folder}: cannot be written, {existing} is a file, expected a folder")
+        if not os.access(existing, os.W_OK | os.X_OK):
+            raise InputError(f"{folder}: cannot be written, {existing} does not allow it; choose another folder")
 
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
-LOCKS = fcntl is not None
-"""Whether this system can tell of a file or folder, while others may rename it, that its run is no more."""
-_LOCK_FILE, _FAR = ".unfinished-lock", 2**40
-"""On Windows: what keeps others off the folder it is in, and the byte of a file that is locked, beyond all content."""
+# Locks: flock on the file or folder itself, which ends with the process however that is killed, and leaves no file
 
 
 class BusyError(InputError):
-    """Somebody else is at work with it."""
+    """Another process holds the lock."""
 
 
-def lock(file: IO[Any] | int | None, busy: str) -> None:
-    """Keep others off until `file`, or what this descriptor is of, is closed; on a disk without locks nobody is.
+def _try_lock(handle: int) -> bool | None:
+    """Lock an open file or folder without waiting: whether that was possible, None on a disk without locks."""
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        import msvcrt
+
+        position = os.lseek(handle, 0, os.SEEK_CUR)
+        os.lseek(handle, _LOCK_OFFSET, os.SEEK_SET)  # Windows lets nobody read a locked byte
+        try:
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]  Windows only
+        finally:
+            os.lseek(handle, position, os.SEEK_SET)
+    except OSError as error:
+        return False if fcntl is None or isinstance(error, BlockingIOError) else None
+    return True
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether `path` is that of an open file or folder still."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def lock(file: IO[Any] | int, busy: str) -> None:
+    """Lock an open file until it is closed; do nothing on a disk without locks.
+
+    Args:
+        file: the file or its descriptor.
+        busy: message of the error.
 
     Raises:
-        BusyError: saying `busy`, where somebody has locked it.
+        BusyError: another process has locked it.
     """
-    if file is None:
-        return
-    try:
-        if fcntl is None:
-            _lock_far(file if isinstance(file, int) else file.fileno())
-        else:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if fcntl is None or isinstance(error, BlockingIOError):
-            raise BusyError(busy) from error
-
-
-def _lock_far(handle: int) -> None:
-    """Lock a byte of a file on Windows, where nobody can read what is locked."""
-    import msvcrt
-
-    at = os.lseek(handle, 0, os.SEEK_CUR)
-    os.lseek(handle, _FAR, os.SEEK_SET)
-    try:
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]  there alone
-    finally:
-        os.lseek(handle, at, os.SEEK_SET)
-
-
-@contextmanager
-def held_folder(folder: Path, busy: str) -> Iterator[None]:
-    """`locked`, of a folder that stays where it is: on Windows by a file in it, which goes with whoever made it."""
-    if LOCKS:
-        with locked(folder, busy):
-            yield
-        return
-    try:
-        handle = os.open(folder / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_TEMPORARY)  # pyright: ignore[reportAttributeAccessIssue]
-    except PermissionError as error:  # it is there, and on its way out
-        raise BusyError(busy) from error
-    try:
-        lock(handle, busy)
-        yield
-    finally:
-        os.close(handle)
+    if _try_lock(file if isinstance(file, int) else file.fileno()) is False:
+        raise BusyError(busy)
 
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Keep others off a file or folder to the end or the death of this run, as `lock` does.
+    """Lock a file or folder during the body; do nothing on Windows, where nothing that is open can be renamed.
+
+    Args:
+        path: the file or folder.
+        busy: message of the error.
 
     Raises:
-        BusyError: saying `busy`, where somebody has it, or it has gone meanwhile.
+        BusyError: another process has locked it, or has removed it meanwhile.
         InputError: it cannot be opened.
     """
-    if not LOCKS:
+    if fcntl is None:
         yield
         return
     with reraise_write_error(path):
@@ -135,423 +160,181 @@ def locked(path: Path, busy: str) -> Iterator[None]:
             raise BusyError(busy) from error
     try:
         lock(handle, busy)
-        if not is_at(handle, path):
+        if not _is_at(handle, path):
             raise BusyError(busy)
         yield
     finally:
         os.close(handle)
 
 
-def try_lock(handle: int) -> bool | None:
-    """Lock what a descriptor is of: whether that was free, or None where disk or system have no such locks."""
-    if fcntl is None:
-        return None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
-
-
-def is_at(handle: int, path: Path) -> bool:
-    """Whether an open file or folder still lies at a path."""
-    try:
-        return os.path.samestat(os.fstat(handle), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def is_folder(path: Path) -> bool:
-    """Whether a folder lies there, and not a link to one."""
-    try:
-        return stat.S_ISDIR(path.lstat().st_mode)
-    except (OSError, ValueError):  # ValueError: a name that no file can have
-        return False
-
-
-UNFINISHED = ".unfinished-"
-"""Names of files and folders begin with this until they are whole."""
-_SET = f"{UNFINISHED}set-"
-
-
-def clear_litter(folder: Path, folders: str = _SET, files: str = UNFINISHED) -> None:
-    """Remove what killed runs of this user have left in a folder; never what a link leads to.
-
-    Args:
-        folders, files: with what their names begin, see `temporary_folder` and `temporary_file`; 16 hex digits follow.
-    """
-    if not LOCKS:
-        return
-    of_folders = re.compile(rf"{re.escape(folders)}[0-9a-f]{{16}}")
-    of_files = re.compile(rf"{re.escape(files)}[0-9a-f]{{16}}(\.[^.]+)?")
-    with suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=False):
-                ours = of_folders.fullmatch(entry.name)
-            else:
-                ours = entry.is_file(follow_symlinks=False) and of_files.fullmatch(entry.name)
-            if ours:
-                _remove(Path(entry.path))
-
-
-def _remove(path: Path) -> None:
-    """Remove a file or folder of this user's, unless somebody is at work with it or that cannot be told."""
-    with suppress(OSError):
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        try:
-            if os.fstat(handle).st_uid != os.geteuid() or not try_lock(handle) or not is_at(handle, path):
-                return
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink()
-        finally:
-            os.close(handle)
-
-
-@contextmanager
-def temporary_folder(folder: Path, prefix: str = _SET) -> Iterator[Path]:
-    """Yield an empty folder in `folder` that goes at the end, with all that is still in it; left ones go first.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    clear_litter(folder, prefix)
-    while True:
-        made = folder / f"{prefix}{secrets.token_hex(8)}"
-        with ExitStack() as end:
-            for _ in range(2):  # the second time where a Ctrl-C meets the first
-                end.callback(shutil.rmtree, made, ignore_errors=True)
-            made.mkdir()
-            if _kept_from_others(made, os.O_RDONLY, end):
-                yield made
-                return
-
-
-@contextmanager
-def temporary_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> Iterator[Path]:
-    """Yield an empty file in `folder` that is gone at the end, unless it has got another name; left ones go first.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    clear_litter(folder, files=prefix)
-    while True:
-        made = folder / f"{prefix}{secrets.token_hex(8)}{suffix}"
-        with ExitStack() as end:  # from before there is a file, so that no interrupt finds one that nobody clears up
-            end.callback(made.unlink, missing_ok=True)
-            if not LOCKS:
-                made.touch(exist_ok=False)
-            elif not _kept_from_others(made, os.O_RDONLY | os.O_CREAT | os.O_EXCL, end):
-                continue
-            yield made
-            return
-
-
-def _kept_from_others(made: Path, flags: int, end: ExitStack) -> bool:
-    """Lock what is just made, to that end; False where another run took it for litter before it was locked."""
-    if not LOCKS:
-        return True
-    try:
-        handle = os.open(made, flags, 0o666)
-    except FileNotFoundError:
-        if made.parent.is_dir() and not flags & os.O_CREAT:
-            return False
-        raise
-    end.callback(os.close, handle)
-    return try_lock(handle) is not False and is_at(handle, made)
-
-
-EXCHANGE = f"{UNFINISHED}exchange"
-"""Name of the folder whose files are being put in place."""
-_NOTE, _SEAL, _KEPT = f"{UNFINISHED}note", f"{UNFINISHED}seal", f"{UNFINISHED}kept"
-"""In it, the names of files that come and go, what binds these to the folder, and the files that were there before."""
-_MAX_SEAL_BYTES = 1000
-PATIENCE_S = 10.0
-"""How long another run is waited for that puts files in place: it takes milliseconds."""
-
-
-class _Note(NamedTuple):
-    """What an exchange does: names of files that come, and of those that go."""
-
-    come: list[str]
-    go: list[str]
-
-
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Keep other runs off `folder` while results are made for it; one that was not there goes again if left empty.
+    """Keep other runs out of `folder` while results are made for it, and complete or remove what a killed run left.
 
-    What a killed run has left there is put in place, or goes.
+    A folder that did not exist is created, and removed again if it stays empty.
 
     Raises:
-        InputError: another run is at it, or it cannot be written.
+        InputError: another run has locked it, or it cannot be written.
     """
     check_writable(folder)
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    busy = f"{folder}: another run is writing there; wait for its end, or choose another folder"
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
     with reraise_write_error(folder):
         folder.mkdir(parents=True, exist_ok=True)
     try:
-        with held_folder(folder, f"{folder}: another run is writing there; wait for its end, or choose another folder"):
+        with locked(folder, busy) if fcntl is not None else _lock_file(folder / f"{UNFINISHED}lock", busy):
             recover(folder)
-            clear_litter(folder)
+            remove_leftovers(folder)
             yield
     finally:
-        with suppress(OSError):  # where something is in it
-            for each in missing:
-                each.rmdir()
+        with suppress(OSError):  # not empty
+            for path in created:
+                path.rmdir()
 
 
 @contextmanager
-def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
-    """Yield an empty folder in `folder`; on success its files move to `folder`, on failure they vanish.
+def _lock_file(path: Path, busy: str) -> Iterator[None]:
+    """Lock a file that stands for its folder, since Windows locks no folders."""
+    try:
+        with path.open("ab") as file:
+            lock(file, busy)
+            yield
+    finally:
+        with suppress(OSError):  # another run has it open
+            path.unlink()
 
-    Where they cannot all be moved, or an interrupt comes meanwhile, `folder` is put back as it was; after a kill
-    meanwhile they have all moved for whoever reads them by `reading`. What killed runs of this user left goes first.
+
+# Temporary files and folders
+
+
+def remove_leftovers(folder: Path, prefix: str = UNFINISHED) -> None:
+    """Remove temporary files and folders of this user's killed runs; symbolic links are not followed.
 
     Args:
-        without: names of files in `folder` that go as the others come.
-
-    Raises:
-        InputError: `folder` cannot be written.
+        folder: where they are.
+        prefix: of their names; 16 hexadecimal digits and possibly a suffix follow.
     """
-    with reraise_write_error(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        recover(folder)
-        with temporary_folder(folder) as stage:
-            yield stage
-            _exchange(stage, folder, without)
+    if fcntl is None:  # whether their run is at work cannot be known
+        return
+    names = re.compile(rf"{re.escape(prefix)}[0-9a-f]{{16}}(\.[^.]+)?")
+    with suppress(OSError):
+        for path in [path for path in folder.iterdir() if names.fullmatch(path.name)]:
+            with suppress(OSError), ExitStack() as stack:
+                handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+                stack.callback(os.close, handle)
+                status = os.fstat(handle)
+                if status.st_uid != os.geteuid() or not _try_lock(handle) or not _is_at(handle, path):
+                    continue
+                if stat.S_ISDIR(status.st_mode):
+                    shutil.rmtree(path, ignore_errors=True)
+                elif stat.S_ISREG(status.st_mode):
+                    path.unlink()
 
 
-def recover(folder: Path) -> None:
-    """Put in place what a killed run of this user was putting in place in a folder, so that its files belong together.
+def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> AbstractContextManager[Path]:
+    """Create an empty folder in `folder`, and remove it with its content at the end.
 
-    Raises:
-        InputError: they cannot be put in place, or are of another user or folder.
+    Args:
+        folder: where it is created; leftovers of killed runs with the same prefix are removed first.
+        prefix: of its name.
+
+    Returns:
+        Context manager of its path, which raises OSError if it cannot be created.
     """
-    exchange = folder / EXCHANGE
-    with reraise_write_error(folder), _exchange_in(folder) as note:
-        if note is None:
-            return
-        if {path.lstat().st_uid for path in (exchange, exchange / _NOTE, exchange / _SEAL)} != {_user()}:
-            raise InputError(f"{exchange}: left by a run of another user, who puts its files in place by another run")
-        _put(exchange, folder, note)
-        with temporary_folder(folder) as away:
-            exchange.rename(away / EXCHANGE)
+    return _temporary(folder, prefix, "", Path.mkdir, lambda path: shutil.rmtree(path, ignore_errors=True))
 
 
-def resolve_exchange(path: Path) -> Path:
-    """Return where the valid content of a file lies: in what a killed run was putting in place beside it, or at `path`.
+def temporary_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> AbstractContextManager[Path]:
+    """Create an empty file in `folder`, and remove it at the end unless it has been renamed.
 
-    Nothing is changed by it. A path at which nothing lies is returned for a file that goes.
+    Args:
+        folder: where it is created; leftovers of killed runs with the same prefix are removed first.
+        suffix: of its name, by which writers choose their format.
+        prefix: of its name.
 
-    Raises:
-        InputError: files beside it may be of two runs, as what was being put in place is of another folder.
+    Returns:
+        Context manager of its path, which raises OSError if it cannot be created.
     """
-    with _exchange_in(path.parent) as note:
-        if note is None:
-            return path
-        pending = path.parent / EXCHANGE / path.name
-        comes = path.name in note.come and pending.exists()  # else it is in place
-        return pending if comes or path.name in note.go else path
-
-
-@contextmanager
-def _exchange_in(folder: Path) -> Iterator[_Note | None]:
-    """Yield what the exchange in a folder does, kept from others meanwhile; None where there is none.
-
-    Raises:
-        InputError: it was not begun in this folder, or another run does not come to its end.
-    """
-    exchange, until = folder / EXCHANGE, time.monotonic() + PATIENCE_S
-    while is_folder(exchange) and not _is_strange(exchange, folder):
-        with ExitStack() as end:
-            try:
-                end.enter_context(
-                    locked(exchange, f"{folder}: another run is putting files in place; wait for its end")
-                )
-            except BusyError:
-                if time.monotonic() > until:
-                    raise
-                time.sleep(0.01)
-                continue
-            yield _read_note(exchange, folder)
-            return
-    yield None
-
-
-def _write_note(stage: Path, folder: Path, note: _Note) -> None:
-    """Note what an exchange does, and bind that to this folder."""
-    (stage / _NOTE).write_text(json.dumps(note), encoding="utf-8")
-    (stage / _SEAL).write_text(_seal(stage, folder), encoding="utf-8")
-
-
-def _read_note(exchange: Path, folder: Path) -> _Note:
-    """Read what an exchange does, on the word of its seal alone.
-
-    Raises:
-        InputError: it was begun in another folder, by another program, or torn by a power cut.
-    """
-    seal = exchange / _SEAL
-    try:
-        about = seal.lstat()
-        small = stat.S_ISREG(about.st_mode) and about.st_size <= _MAX_SEAL_BYTES
-        if small and seal.read_text(encoding="utf-8") == _seal(exchange, folder):
-            return _Note(*json.loads((exchange / _NOTE).read_text(encoding="utf-8")))
-    except (OSError, ValueError):
-        if not is_folder(exchange):  # a run has come to its end meanwhile, where there are no locks
-            return _Note([], [])
-    raise InputError(
-        f"{exchange}: begun in another folder, or torn, so files here may be of two runs; remove it, and make them anew"
+    return _temporary(
+        folder, prefix, suffix, partial(Path.touch, exist_ok=False), partial(Path.unlink, missing_ok=True)
     )
 
 
-def _seal(exchange: Path, folder: Path) -> str:
-    """Return what no archive and no copy carries along: numbers of files, and the time at which the note was written.
-
-    That is the system's own time of the last change, which nobody sets and a renamed folder leaves as it was.
-    """
-    note = (exchange / _NOTE).lstat()
-    return " ".join(map(str, (folder.stat().st_ino, exchange.lstat().st_ino, note.st_ino, note.st_ctime_ns)))
-
-
-def _user() -> int:
-    return getattr(os, "geteuid", int)()  # on Windows all files are of user 0
-
-
-def _is_strange(exchange: Path, folder: Path) -> bool:
-    """Whether what lies there is no folder, or of one who may not replace files of others, as in /tmp nobody may."""
-    try:
-        made, about = exchange.lstat(), folder.stat()
-    except FileNotFoundError:  # all is in place
-        return False
-    if not stat.S_ISDIR(made.st_mode):
-        return True
-    return bool(about.st_mode & stat.S_ISVTX) and made.st_uid not in (os.geteuid(), about.st_uid)
-
-
-def _put(exchange: Path, folder: Path, note: _Note) -> None:
-    """Put the files of an exchange in place, and those out of it that go; doing it again does the rest."""
-    for name in note.go:
-        (folder / name).unlink(missing_ok=True)
-    for name in note.come:
-        with suppress(FileNotFoundError):  # it is in place
-            (exchange / name).replace(folder / name)
+@contextmanager
+def _temporary(
+    folder: Path, prefix: str, suffix: str, create: Callable[[Path], object], remove: Callable[[Path], object]
+) -> Iterator[Path]:
+    """Create a temporary file or folder, locked so that other runs do not take it for a leftover."""
+    remove_leftovers(folder, prefix)
+    while True:
+        path = folder / f"{prefix}{secrets.token_hex(8)}{suffix}"
+        with ExitStack() as stack:
+            for _ in range(2):  # before it exists, so that no interrupt leaves it; twice, where one interrupts removal
+                stack.callback(remove, path)
+            create(path)
+            if fcntl is not None:
+                try:
+                    handle = os.open(path, os.O_RDONLY)
+                except FileNotFoundError:  # another run removed it before it was locked
+                    continue
+                stack.callback(os.close, handle)
+                if _try_lock(handle) is False or not _is_at(handle, path):
+                    continue
+            yield path
+            return
 
 
-def _files(stage: Path) -> list[Path]:
-    files = (path for path in stage.iterdir() if path.is_file() and not path.is_symlink())
-    return sorted(path for path in files if not path.name.startswith(UNFINISHED))
-
-
-def _exchange(stage: Path, folder: Path, without: Collection[str]) -> None:
-    """Move the files of a stage to `folder` and take others out of it: all, or none where that fails."""
-    names = [file.name for file in _files(stage)]
-    without = sorted({*without} - {*names})
-    for path in (folder / name for name in names):
-        with suppress(OSError):  # there is nothing, or what a link leads to is gone
-            if not stat.S_ISREG(mode := path.stat().st_mode):
-                kind = "a folder" if stat.S_ISDIR(mode) else "no file"
-                raise InputError(f"{path}: is {kind}, expected a file or nothing")
-    note = _Note(names, without)
-    _write_note(stage, folder, note)
-    exchange = folder / EXCHANGE
-    try:
-        _commit(stage, folder)
-        _keep(exchange / _KEPT, folder, (*names, *without))  # now that nobody else replaces them
-        _put(exchange, folder, note)
-        exchange.rename(stage)
-    except BaseException:
-        if not stage.exists():
-            exchange.rename(stage)
-            _put_back(stage, folder, names)
-        raise
-
-
-def _commit(stage: Path, folder: Path) -> None:
-    """Make the files of a stage the valid ones; others that are being put in place come first."""
-    while stage.exists():
-        recover(folder)
-        try:
-            stage.rename(folder / EXCHANGE)
-        except OSError as error:
-            busy = error.errno in (errno.ENOTEMPTY, errno.EEXIST) or is_folder(folder / EXCHANGE)
-            if not busy or _is_strange(folder / EXCHANGE, folder):
-                raise
-
-
-def _keep(kept: Path, folder: Path, names: Iterable[str]) -> None:
-    """Keep what lies in a folder by some names."""
-    kept.mkdir()
-    for name in filter(lambda name: os.path.lexists(folder / name), names):
-        with suppress(FileNotFoundError):  # somebody has taken it away
-            try:
-                (kept / name).hardlink_to(folder / name)
-            except OSError:  # a disk without such
-                shutil.copy2(folder / name, kept / name, follow_symlinks=False)
-
-
-def _put_back(stage: Path, folder: Path, names: Collection[str]) -> None:
-    """Undo what was done of an exchange."""
-    kept = stage / _KEPT
-    for name in names:
-        if not (stage / name).exists() and not os.path.lexists(kept / name):
-            (folder / name).unlink(missing_ok=True)
-    for file in list(kept.iterdir()) if kept.exists() else ():
-        file.replace(folder / file.name)
-
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+# Atomic writes
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it takes `path`'s place, on failure it vanishes.
+    """Write a file atomically: yield a temporary path beside it, which replaces it on success.
 
-    The temporary name keeps the suffix, because many writers choose their format by it. It is that of an empty file,
-    which has to be written into and not replaced: its lock tells other runs that somebody is at work.
-    A reader never sees half a file, and an interrupted write leaves the old one as it was.
+    The temporary file exists, is empty and locked; write into it rather than replace it. Its name has the suffix of
+    `path`, by which many writers choose their format.
+
+    Args:
+        path: the destination; a path that is temporary itself is yielded as it is.
 
     Raises:
-        InputError: what the system has against writing `path`, such as a full disk.
+        InputError: `path` cannot be written, as on a full disk.
     """
-    if path.name.startswith(UNFINISHED):  # it is another one's, who puts it in place
+    if path.name.startswith(UNFINISHED):
         yield path
         return
     with reraise_write_error(path):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it is there and no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
-        recover(path.parent)  # or an older file would come over this one later
+        recover(path.parent)  # else a later recovery would replace the new file by an older one
         with temporary_file(path.parent, path.suffix) as temporary:
             yield temporary
+            sync(temporary)
             temporary.replace(path)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path` as UTF-8 with its own line ends, atomically.
-
-    What UTF-8 has not, as in names of files, is written as \\udc80.
-    """
+    """Write `text` atomically as UTF-8, its line ends unchanged; what UTF-8 cannot encode is written as \\udc80."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write `document` to `path` atomically; NaN and infinities are refused, since JSON has none."""
+    """Write `document` atomically as JSON.
+
+    Raises:
+        ValueError: it holds NaN or infinity, which JSON does not have.
+    """
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def open_in_place(path: Path) -> BinaryIO:
-    """Open a file that is there, to be read and changed where it lies, without a buffer; never what a link leads to.
+    """Open an existing file for reading and writing in place, unbuffered, without following a symbolic link.
 
     Raises:
-        InputError: it is a link. OSError: it cannot be opened.
+        InputError: it is a symbolic link.
+        OSError: it cannot be opened.
     """
     file = path.open("r+b", buffering=0)
     if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
@@ -561,7 +344,7 @@ def open_in_place(path: Path) -> BinaryIO:
 
 
 def sync(path: Path) -> None:
-    """Put a file, or the names in a folder, on the disk, so that they outlast a power cut, where the system can."""
+    """Synchronise a file, or the names in a folder, to the disk, so that they outlast a power cut; POSIX only."""
     if os.name == "posix":
         handle = os.open(path, os.O_RDONLY)
         try:
@@ -571,81 +354,228 @@ def sync(path: Path) -> None:
 
 
 def to_disk(handle: int) -> None:
-    """As `os.fsync`, and on macOS out of the drive's own cache as well, which fsync leaves it in there."""
-    full = getattr(fcntl, "F_FULLFSYNC", None)
-    if fcntl is not None and full is not None:
-        with suppress(OSError):  # a disk that knows no such order
-            fcntl.fcntl(handle, full)
+    """Synchronise an open file to the disk; on macOS out of the drive's own cache too, where `os.fsync` leaves it."""
+    full_sync = getattr(fcntl, "F_FULLFSYNC", None)
+    if fcntl is not None and full_sync is not None:
+        with suppress(OSError):  # a disk without that operation
+            fcntl.fcntl(handle, full_sync)
             return
     os.fsync(handle)
 
 
-_PACKAGES = ("padforge", "numpy", "scipy")
-
-MAX_BYTES = 2**28
-"""A file of more is none that padforge has written, but for recordings."""
+# Sets of files
 
 
-def check_file(path: Path, most: int = MAX_BYTES) -> Path:
-    """Refuse what may never end, such as pipes and devices, and what is too large to be looked at.
+class _Note(NamedTuple):
+    """What an exchange does, and the inode numbers of its destination and of itself.
+
+    Neither an archive nor a copy preserves these, so that an exchange is carried out only where it was begun.
+    """
+
+    inodes: list[int]
+    names: list[str]
+    removed: list[str]
+
+
+@contextmanager
+def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
+    """Replace a set of files together: yield an empty folder, whose files move to `folder` on success.
+
+    On failure `folder` is as it was before. If the run is killed while the files move, or one of them cannot be moved,
+    all functions of this module read the new files, and the next run completes the move.
+
+    Args:
+        folder: the destination, created if needed.
+        without: names of files in `folder` that are removed as the others come.
+
+    Raises:
+        InputError: `folder` cannot be written.
+    """
+    with reraise_write_error(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        recover(folder)
+        with temporary_folder(folder) as stage:
+            yield stage
+            _commit(stage, folder, without)
+    try:
+        recover(folder)
+    except KeyboardInterrupt:
+        recover(folder)
+        raise
+
+
+def _commit(stage: Path, folder: Path, without: Collection[str]) -> None:
+    """Turn a temporary folder into an exchange, once all of its files can be expected to move."""
+    files = [path for path in stage.iterdir() if path.is_file() and not path.is_symlink()]
+    names = [path.name for path in files if not path.name.startswith(UNFINISHED)]
+    names.sort(key=lambda name: (name.endswith(".json"), name))  # JSON documents, which hold digests, move last
+    for path in (folder / name for name in names):
+        with suppress(OSError):  # nothing there, or a link that leads nowhere
+            if not stat.S_ISREG(mode := path.stat().st_mode):
+                kind = "a folder" if stat.S_ISDIR(mode) else "no file"
+                raise InputError(f"{path}: is {kind}, expected a file or nothing")
+            if _is_protected(path.lstat(), folder.stat()):
+                raise InputError(f"{path}: cannot be written, it belongs to another user")
+    inodes = [folder.stat().st_ino, stage.stat().st_ino]
+    note = _Note(inodes, names, sorted({*without} - {*names}))
+    (stage / _NOTE).write_text(json.dumps(note), encoding="utf-8")
+    for name in (*names, _NOTE):
+        sync(stage / name)
+    for attempt in count(1):
+        try:
+            stage.rename(folder / EXCHANGE)
+            return
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or attempt == _MAX_ATTEMPTS:
+                raise
+        recover(folder)  # another run has committed meanwhile
+
+
+def _is_protected(status: os.stat_result, folder: os.stat_result) -> bool:
+    """Whether a file belongs to another user in a folder such as /tmp, where nobody may replace files of others."""
+    return bool(folder.st_mode & stat.S_ISVTX) and os.geteuid() not in (0, status.st_uid, folder.st_uid)
+
+
+def recover(folder: Path) -> None:
+    """Complete the exchange of this user in a folder, such as a killed run left, so that its files belong together.
+
+    Raises:
+        InputError: it cannot be completed, or is of another user or folder.
+    """
+    exchange, deadline = folder / EXCHANGE, time.monotonic() + PATIENCE_S
+    while (note := _read_note(folder)) is not None:
+        try:
+            with reraise_write_error(folder), locked(exchange, f"{folder}: another run is moving its files there"):
+                user = getattr(os, "geteuid", int)()  # on Windows all files are of user 0
+                if {exchange.lstat().st_uid, (exchange / _NOTE).lstat().st_uid} != {user}:
+                    raise InputError(f"{exchange}: left by a run of another user, who completes it by another run")
+                for name in note.removed:
+                    (folder / name).unlink(missing_ok=True)
+                for name in note.names:
+                    with suppress(FileNotFoundError):  # it has moved
+                        (exchange / name).replace(folder / name)
+                # One rename ends the exchange: if its folder is not removed then, it is a leftover like any other.
+                leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")
+                shutil.rmtree(leftover, ignore_errors=True)
+        except BusyError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.01)
+
+
+def resolve_exchange(path: Path) -> Path:
+    """Return where the valid content of a file is: in an exchange that has not moved it yet, or at `path`.
+
+    Nothing is changed. For a file that the exchange removes, it is a path where nothing is.
+
+    Raises:
+        InputError: the exchange beside it was begun in another folder, so that files may be of two runs.
+    """
+    note, pending = _read_note(path.parent), path.parent / EXCHANGE / path.name
+    if note is not None and (path.name in note.removed or (path.name in note.names and pending.exists())):
+        return pending
+    return path
+
+
+def _read_note(folder: Path) -> _Note | None:
+    """Read what the exchange in a folder does; None if there is none.
+
+    Raises:
+        InputError: it was begun in another folder, by another program, or torn by a power cut.
+    """
+    exchange = folder / EXCHANGE
+    try:
+        status, destination = exchange.lstat(), folder.stat()
+        if not stat.S_ISDIR(status.st_mode):
+            return None
+        if destination.st_mode & stat.S_ISVTX and status.st_uid not in (os.geteuid(), destination.st_uid):
+            return None  # of anybody who may create files there, as in /tmp
+        file = (exchange / _NOTE).lstat()
+        if stat.S_ISREG(file.st_mode) and file.st_size <= _MAX_NOTE_BYTES:
+            note = _Note(*json.loads((exchange / _NOTE).read_text(encoding="utf-8")))
+            if note.inodes == [destination.st_ino, status.st_ino]:
+                return note
+    except (OSError, ValueError, TypeError, RecursionError):
+        if not os.path.lexists(exchange):  # there is none, or its run has completed it meanwhile
+            return None
+    raise InputError(
+        f"{exchange}: begun in another folder, or torn, so files here may be of two runs; remove it, and make them anew"
+    )
+
+
+# Reading
+
+
+def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
+    """Check that `path` is a file of limited size, rather than a pipe or device that may never end.
+
+    Args:
+        path: the file.
+        max_bytes: size limit, bytes.
 
     Returns:
         Where to read it, see `resolve_exchange`.
 
     Raises:
-        InputError: nothing there, no file, or one of more than `most` bytes.
+        InputError: it does not exist, is not a regular file, or is larger.
     """
-    valid = resolve_exchange(path)
     try:
-        about = valid.stat()
+        valid = resolve_exchange(path)
+        status = valid.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
-    if stat.S_ISDIR(about.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path}: cannot be read (Is a directory)")
-    if not stat.S_ISREG(about.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: cannot be read (a pipe or device, expected a file)")
-    if about.st_size > most:
-        raise InputError(f"{path}: cannot be read (it has {about.st_size} bytes, allowed are {most})")
+    if status.st_size > max_bytes:
+        raise InputError(f"{path}: cannot be read (it has {status.st_size} bytes, allowed are {max_bytes})")
     return valid
 
 
-def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
-    """The content of a file.
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read the content of a file.
+
+    Args:
+        path: the file.
+        max_bytes: size limit, bytes.
 
     Raises:
-        InputError: it cannot be read, or see `check_file`.
+        InputError: it cannot be read, is not a regular file, or is larger.
     """
-    valid = check_file(path, most)
+    valid = check_file(path, max_bytes)
     try:
         return valid.read_bytes()
     except OSError as error:
-        if isinstance(error, FileNotFoundError) and valid != path:  # a run has put it in place meanwhile
-            return read_bytes(path, most)
+        if isinstance(error, FileNotFoundError) and valid != path:  # it has moved to its destination meanwhile
+            return read_bytes(path, max_bytes)
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def read_json(path: Path, *kinds: str) -> dict[str, Any]:
-    """Read a JSON document whose `format` is one of `kinds`, e.g. "padforge-morphology/1".
+def read_json(path: Path, *formats: str) -> dict[str, Any]:
+    """Read a JSON document whose `format` is one of `formats`, such as "padforge-morphology/1".
 
     Raises:
-        InputError: the file is missing, is no JSON, or says another format.
+        InputError: the file cannot be read, is not JSON, or has another format.
     """
     content = read_bytes(path)
     try:
         document = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON file ({error})") from error
-    found = document.get("format") if isinstance(document, dict) else None
-    if found not in kinds:
-        raise InputError(f"{path}: format is {short_repr(found)}, expected {' or '.join(map(repr, kinds))}")
+    actual = document.get("format") if isinstance(document, dict) else None
+    if actual not in formats:
+        raise InputError(f"{path}: format is {short_repr(actual)}, expected {' or '.join(map(repr, formats))}")
     return document
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file; of a directory, the digest of its files' names and digests in sorted order.
+    """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal.
 
     Raises:
-        InputError: nothing there, or no file, such as a pipe or device that never ends.
+        InputError: it does not exist, or is neither a regular file nor a folder.
     """
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
@@ -654,25 +584,37 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
-    """Names of the files in a folder, and of no other one, whose content still has the digest noted for the name."""
+def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
+    """Return the names of the files directly in a folder whose content still has the digest of that name.
 
-    def same(name: str) -> bool:
+    Args:
+        folder: the folder.
+        digests: expected digests by file name; may come from a file and hold anything.
+    """
+
+    def is_unchanged(name: str) -> bool:
         try:
             check_file(folder / name)
             return Path(name).name == name and sha256(folder / name) == digests[name]
         except (InputError, OSError):
             return False
 
-    return set(filter(same, digests))
+    return set(filter(is_unchanged, digests))
+
+
+# Provenance
 
 
 def provenance(
     command: str, seed: int | None = None, inputs: Sequence[Path] = (), packages: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Where a result came from: command, seed, versions of what made it and digests of its inputs.
+    """Describe where a result comes from; without time and output folder, so that equal work gives equal bytes.
 
-    Neither time nor output folder enters, so the same work gives the same bytes wherever and whenever it is done.
+    Args:
+        command: what made it.
+        seed: of its random choices.
+        inputs: files and folders it was made from; their digests are recorded.
+        packages: distributions whose versions are recorded besides those that every result depends on.
     """
     return {
         "command": command,
@@ -683,22 +625,28 @@ def provenance(
     }
 
 
-_MORPHOLOGY = "padforge-morphology/"
-"""How the format of a pad begins: one that was made from another pad is a pad of its own."""
-
-
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
-    """Return the names of documents and recordings beside a file that were made from it, or from such a one.
+    """Return the names of the documents and recordings beside a file that were made from it, directly or not.
 
     Args:
         path: the file.
-        remade: names of those that come with the file that takes its place.
+        remade: names of those that are replaced together with the file.
     """
-    documents = {name: document for name, document in _documents(path.parent) if path.parent / name != path}
-    sources, dependents = [path], []
+    # The documents of stages by name, those of recordings by the name of their folder.
+    paths = sorted([*path.parent.glob("[!.]*.json"), *path.parent.glob("[!.]*/start.json")])
+    documents = {
+        (file.name if file.parent == path.parent else file.parent.name): document
+        for file in paths
+        if file != path and not str((document := _read_object(file)).get("format")).startswith(_MORPHOLOGY)
+    }
+    sources, dependents = [path], list[str]()
     for source in sources:
-        about = _about(source)
-        for name in [name for name, document in documents.items() if _is_made_from(document, source.name, *about)]:
+        digest, origin = None, dict[str, Any]()
+        if not source.is_dir():  # documents hold other digests of a recording
+            digest, origin = sha256(source), _provenance_of(_read_object(source))
+        for name in [
+            name for name, document in documents.items() if _is_made_from(document, source.name, digest, origin)
+        ]:
             del documents[name]
             dependents.append(name)
             sources.append(path.parent / name)
@@ -708,40 +656,32 @@ def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
 def check_replaceable(
     path: Path, by: Path | Mapping[str, Any], remade: Collection[str] = (), force: bool = False
 ) -> None:
-    """Refuse to replace a file that others beside it were made from, unless it stays as it is.
+    """Check that replacing a file changes nothing, or that no other file beside it was made from it.
 
     Args:
-        path: the file, which need not be there.
-        by: the file that takes its place; before there is one, what is known of its provenance.
-        remade: see `find_dependents`.
-        force: whether it is replaced all the same.
+        path: the file, which need not exist.
+        by: the file that replaces it, or, before there is one, its provenance as far as that is certain.
+        remade: names of files that are replaced together with it.
+        force: skip the check.
 
     Raises:
-        InputError: naming what was made from it.
+        InputError: others were made from it; they are named.
     """
     if force or not path.is_file():
         return
     if isinstance(by, Path):
-        stays = sha256(by) == sha256(path)
+        is_same = sha256(by) == sha256(path)
     else:
-        before = _provenance(_document(path))
-        stays = all(before.get(key) == value for key, value in json.loads(json.dumps(by)).items())
-    if not stays and (dependents := find_dependents(path, remade)):
+        before = _provenance_of(_read_object(path))
+        is_same = all(before.get(key) == value for key, value in json.loads(json.dumps(by)).items())
+    if not is_same and (dependents := find_dependents(path, remade)):
         *names, last = dependents
         listed = f"{', '.join(names)} and {last} were" if names else f"{last} was"
         raise InputError(f"{path}: {listed} made from it; choose another --out, or replace it with --force")
 
 
-def _documents(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the documents of stages in a folder by name, those of recordings by the name of their folder."""
-    for path in sorted([*folder.glob("[!.]*.json"), *folder.glob("[!.]*/start.json")]):
-        document = _document(path)
-        if not str(document.get("format")).startswith(_MORPHOLOGY):
-            yield path.name if path.parent == folder else path.parent.name, document
-
-
-def _document(path: Path) -> dict[str, Any]:
-    """Read a JSON object; an empty one where there is none, since whatever lies in a folder is looked at."""
+def _read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON object; an empty one from any other file, since a folder may hold whatever a user puts there."""
     try:
         document = json.loads(read_bytes(path))
     except (InputError, ValueError, RecursionError):
@@ -749,22 +689,17 @@ def _document(path: Path) -> dict[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-def _provenance(document: Mapping[str, Any]) -> Mapping[str, Any]:
-    made_by = document.get("provenance")
-    return made_by if isinstance(made_by, dict) else {}
+def _provenance_of(document: Mapping[str, Any]) -> dict[str, Any]:
+    origin = document.get("provenance")
+    return origin if isinstance(origin, dict) else {}
 
 
-def _about(source: Path) -> tuple[str | None, Mapping[str, Any]]:
-    """Return the digest of a file and its provenance; of a recording neither, as documents have other digests of it."""
-    return (None, {}) if source.is_dir() else (sha256(source), _provenance(_document(source)))
-
-
-def _is_made_from(document: Mapping[str, Any], name: str, digest: str | None, made_by: Mapping[str, Any]) -> bool:
-    """Whether a document says that it was made from a file with this digest, or from a model of this provenance."""
-    inputs = _provenance(document).get("inputs")
+def _is_made_from(document: Mapping[str, Any], name: str, digest: str | None, origin: Mapping[str, Any]) -> bool:
+    """Whether a document names as its input a file of this digest, or a model of this provenance."""
+    inputs = _provenance_of(document).get("inputs")
     inputs = inputs if isinstance(inputs, dict) else {}
     if digest is None:
         return name in inputs
     if name == "morphology.json" and document.get("morphology_sha256") == digest:
         return True
-    return inputs.get(name) == digest or (bool(made_by) and inputs.get(Path(name).stem) == made_by)
+    return inputs.get(name) == digest or (bool(origin) and inputs.get(Path(name).stem) == origin)

@@ -1,6 +1,6 @@
-"""Self-contained HTML pages: everything inlined, no network, readable on a phone and on paper.
+"""Self-contained HTML pages: everything inlined, without network access, readable on a phone and on paper.
 
-How they look is in `page.html`, `elements.html` and `page.css`; here is what goes into them.
+Their layout is in the templates `page.html`, `elements.html` and `page.css`.
 """
 
 import base64
@@ -23,34 +23,34 @@ from padforge.design.common.validation import InputError
 
 
 def read_resource(package: str, name: str) -> str:
-    """The text of a file that a package ships."""
+    """Read a text file that a package ships."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
-_HERE = "padforge.design.common.templates"
+TEMPLATES = "padforge.design.common.templates"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
-_MOST_PICTURE = 2**25
-"""Bytes of a picture at most: a page holds it as it is."""
+_MAX_PICTURE_BYTES = 2**25
+"""Size limit of a picture, which a page contains as it is."""
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")
-"""What stands flush right in a table."""
+"""Cells that are right-aligned in a table."""
 _SHORT = 16
-"""Columns of cells with no more letters are not wrapped."""
+"""Columns whose cells have at most this number of characters are not wrapped."""
 _LONG = 30
-"""Words of more letters are broken."""
-_VERDICTS = ("pass", "warn", "fail")
+"""Words of more characters are broken."""
+_RESULTS = ("pass", "warn", "fail")
 """Cells of these words are coloured."""
 
 
 @dataclass(frozen=True)
 class PageSection:
-    """A part of a page, which its contents line links to.
+    """A section of a page, listed in its contents.
 
     Attributes:
-        title: its heading, unlike that of any other section of the page.
-        body: HTML pieces, made by the functions of this module.
-        figures: what the head of the page has of it, as (value, what it is).
-        script: JavaScript that runs when the page is there.
+        title: heading, unique in the page.
+        body: HTML elements, made by the functions of this module.
+        figures: key figures for the head of the page, as (value, description).
+        script: JavaScript that runs once the page is loaded.
     """
 
     title: str
@@ -60,22 +60,27 @@ class PageSection:
 
     @property
     def anchor(self) -> str:
-        """Its id in the page."""
+        """The id of its heading."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
 def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
-    """A whole HTML document: title, contents, key figures, sections.
+    """Return an HTML document: title, contents, key figures, sections.
 
-    Nothing is let in from elsewhere, and no script runs but those of the sections and of the page itself.
+    Its content security policy forbids content from elsewhere, and scripts other than its own.
+
+    Args:
+        title: of the page.
+        lead: first paragraph.
+        sections: in their order.
     """
-    scripts = [read_resource(_HERE, "page.js"), *(section.script for section in sections if section.script)]
+    scripts = [read_resource(TEMPLATES, "page.js"), *(section.script for section in sections if section.script)]
     content = {
         "title": title,
         "lead": lead,
         "sections": sections,
         "key_figures": [figure for section in sections for figure in section.figures],
-        "style": read_resource(_HERE, "page.css"),
+        "style": read_resource(TEMPLATES, "page.css"),
         "scripts": scripts,
         "digests": [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts],
     }
@@ -85,7 +90,7 @@ def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
 @cache
 def _templates() -> Environment:
     return Environment(
-        loader=PackageLoader(_HERE, ""),
+        loader=PackageLoader(TEMPLATES, ""),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -95,55 +100,69 @@ def _templates() -> Environment:
 
 
 def _element(kind: str, *content: object) -> str:
-    """An element of `elements.html`."""
+    """Render a macro of `elements.html`."""
     elements: Any = _templates().get_template("elements.html").module
     return getattr(elements, kind)(*content)
 
 
 def heading(text: str) -> str:
-    """A heading within a section."""
+    """Return a heading within a section."""
     return _element("heading", text)
 
 
 def paragraph(text: str) -> str:
-    """A paragraph of plain text."""
+    """Return a paragraph of plain text."""
     return _element("paragraph", text)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table; cells that say pass, warn or fail are coloured, columns of numbers stand flush right."""
+    """Return a table.
+
+    Cells of the words pass, warn and fail are coloured, and columns of numbers are right-aligned.
+
+    Args:
+        header: titles of the columns.
+        rows: values of the cells.
+    """
     cells = [[_text(value) for value in row] for row in rows]
-    kinds = [_kind(column) for column in zip(*cells, strict=True)] or [""] * len(header)
+    kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
-        [(text, text if text in _VERDICTS else kind) for text, kind in zip(row, kinds, strict=True)] for row in cells
+        [(text, text if text in _RESULTS else kind) for text, kind in zip(row, kinds, strict=True)] for row in cells
     ]
     return _element("table", list(zip(header, kinds, strict=True)), body)
 
 
 def columns(*columns: Sequence[str]) -> str:
-    """Pieces in columns, below each other where there is no room."""
-    return _element("beside", columns)
+    """Return elements in columns, which stack on a narrow screen."""
+    return _element("columns", columns)
 
 
 def collapsible(summary: str, body: Sequence[str]) -> str:
-    """Pieces that are seen once `summary` is clicked, and on paper."""
-    return _element("folded", summary, body)
+    """Return elements that are visible once `summary` is clicked, and on paper."""
+    return _element("collapsible", summary, body)
 
 
 def figures(pictures: Sequence[tuple[Path, str]]) -> str:
-    """Pictures (.png, .svg) side by side with their captions; those whose file is missing are left out.
+    """Return pictures side by side with their captions.
+
+    Args:
+        pictures: paths of .png and .svg files, and captions; missing files are skipped.
 
     Raises:
-        InputError: a file that is no such picture, or is torn.
+        InputError: a file is no such picture, or torn.
     """
-    found = [_picture(path, caption) for path, caption in pictures if path.is_file()]
-    return _element("figures", found) if found else ""
+    embedded = [_embed_picture(path, caption) for path, caption in pictures if path.is_file()]
+    return _element("figures", embedded) if embedded else ""
 
 
 def render_markdown(text: str) -> Iterator[str]:
-    """HTML of Markdown: paragraphs, lists, tables, headings, **bold** and `code`; its title is left out.
+    """Convert Markdown: paragraphs, lists, tables, headings, **bold** and `code`; anything else, HTML too, is text.
 
-    What is no such mark is text, HTML too.
+    Args:
+        text: Markdown; its title (level 1) is skipped.
+
+    Yields:
+        HTML elements.
     """
     reader = MarkdownIt("zero", {"html": False}).enable(["heading", "list", "table", "emphasis", "backticks"])
     for block in SyntaxTreeNode(reader.parse(text)).children:
@@ -157,19 +176,19 @@ def render_markdown(text: str) -> Iterator[str]:
             yield reader.renderer.render(block.to_tokens(), reader.options, {})
 
 
-def _picture(path: Path, caption: str) -> dict[str, Any]:
+def _embed_picture(path: Path, caption: str) -> dict[str, Any]:
     from PIL import Image
 
-    content = read_bytes(path, _MOST_PICTURE)
+    content = read_bytes(path, _MAX_PICTURE_BYTES)
     try:
-        size = None  # an SVG says its own; but it must be one
+        size = None  # an SVG states its own, but it must be valid
         if path.suffix == ".png":
             with Image.open(path, formats=["PNG"]) as picture:
                 size = picture.size
                 picture.verify()
         else:
             ElementTree.fromstring(content)
-    except Exception as error:  # readers of broken pictures raise whatever comes
+    except Exception as error:  # Pillow raises many kinds on torn pictures
         raise InputError(f"{path}: not a picture that can be read ({error})") from error
     source = f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode()}"
     return {"caption": caption, "size": size, "source": source}
@@ -183,8 +202,8 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _kind(column: Sequence[str]) -> str:
-    """How the cells of a column are set."""
+def _column_style(column: Sequence[str]) -> str:
+    """Return the CSS class of the cells of a column."""
     if any(column) and all(_NUMBER.fullmatch(text) for text in column if text not in ("", "-")):
         return "number"
     if max(map(len, column)) <= _SHORT:

@@ -1,7 +1,7 @@
-"""Spreading work over the cores of this machine or of a cluster, and keeping what is compiled.
+"""Parallel tasks on the cores of this machine or on a cluster, and the cache of compiled kernels.
 
-Threads serve here, since torch and the kernels let go of the interpreter while they work: nothing is copied, and
-compiled code is shared.
+Threads serve on one machine, since torch and the kernels release the interpreter lock while they compute: nothing is
+copied, and compiled code is shared.
 """
 
 import os
@@ -12,7 +12,7 @@ from hashlib import sha256
 from itertools import islice, pairwise
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,90 +22,87 @@ Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 SCHEDULER_S = 10.0
-"""How long a cluster's scheduler is waited for."""
-LOOK_S = 0.1
-"""Between two looks for Ctrl-C where the system does not wake a thread that waits."""
+"""Time limit for a cluster's scheduler to answer."""
+POLL_S = 0.1
+"""Interval at which Ctrl-C is noticed on systems where it does not wake a waiting thread."""
+
+active_threads: set[Thread] = set()
+"""Those of `DaemonThreads` that have not ended."""
 
 
 def run_tasks(
     tasks: Iterable[tuple[Key, Callable[[], Result]]],
     executor: Executor | None = None,
     *,
-    at_once: int | None = None,
-    then: Callable[[Key, Result], Callable[[], Result] | None] = lambda key, result: None,
-    given_up: Callable[[], bool] = lambda: False,
+    max_parallel: int | None = None,
+    follow_up: Callable[[Key, Result], Callable[[], Result] | None] = lambda key, result: None,
+    is_abandoned: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[Key, Result]]:
-    """Results of tasks as they come, in any order, each with its task's key.
+    """Run tasks in parallel, and yield their results as they complete, each with the key of its task.
 
-    The one way in which searches, studies and trainings spread work: `for key, result in run_tasks(...)`, the caller
-    keeping each result and telling of the progress. A task begins only while the caller listens: what an exception or
-    Ctrl-C in the caller leaves is kept, no further task begins, and those at work are not waited for. An exception in
-    a task comes out here, at once. Tasks may share torch under `one_torch_thread`.
+    Searches, studies and trainings share this loop: the caller keeps each result and reports the progress. Tasks start
+    only while the caller iterates. An exception or Ctrl-C in the caller starts no further task, and running ones are
+    not waited for; an exception in a task is raised here at once. Tasks may share torch under `one_torch_thread`.
 
     Args:
-        tasks: what to call, by key, in the order they begin; drawn one by one as there is room. For other processes,
-            such as those of a cluster, they must be picklable: `functools.partial` of a module's function.
+        tasks: functions by key, in the order in which they start; drawn one by one as there is room. For other
+            processes, such as those of a cluster, they must be picklable: `functools.partial` of a module's function.
         executor: of the `concurrent.futures` kind; daemon threads of this machine if None.
-        at_once: tasks at most; as many as there are cores if there is no executor, else as the executor has it.
-        then: the next task of the same key once a result has been listened to, None if there is none.
-        given_up: whether to leave behind what is at work, as where an executor hangs.
+        max_parallel: limit of running tasks; by default the number of cores, or none with an executor.
+        follow_up: returns the next task of the same key, once the caller has used a result; None if there is none.
+        is_abandoned: whether to leave running tasks behind, as where an executor hangs.
+
+    Yields:
+        Key and result.
     """
     pool = executor or DaemonThreads()
-    most = at_once or (None if executor else os.cpu_count() or 1)
+    limit = max_parallel or (None if executor else os.cpu_count() or 1)
     waiting, running = iter(tasks), dict[Future[Result], Key]()
     try:
         while True:
-            for key, work in islice(waiting, most and most - len(running)):
+            for key, work in islice(waiting, limit and limit - len(running)):
                 running[pool.submit(work)] = key
-            if not running or given_up():
+            if not running or is_abandoned():
                 return
-            for future in wait(running, LOOK_S, FIRST_COMPLETED).done:
+            for future in wait(running, POLL_S, FIRST_COMPLETED).done:
                 key, result = running.pop(future), future.result()
                 yield key, result
-                if next_one := then(key, result):
-                    running[pool.submit(next_one)] = key
+                if work := follow_up(key, result):
+                    running[pool.submit(work)] = key
     finally:
         for future in running:
             future.cancel()
 
 
 class DaemonThreads(Executor):
-    """A thread for whatever is submitted, which does not hold up the end of the program.
+    """A thread for each task, which, unlike those of `ThreadPoolExecutor`, does not delay the end of the program."""
 
-    Attributes:
-        at_work: the threads of all that have not come to their end.
-    """
-
-    at_work: ClassVar[set[Thread]] = set()
-
-    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Begin at once."""
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **keywords: Any) -> Future[Any]:
+        """Start a task at once."""
         future: Future[Any] = Future()
 
         def run() -> None:
             try:
-                result = work(*arguments, **named)
+                future.set_result(work(*arguments, **keywords))
             except BaseException as error:
                 future.set_exception(error)
-            else:
-                future.set_result(result)
             finally:
-                self.at_work.discard(thread)
+                active_threads.discard(thread)
 
         future.set_running_or_notify_cancel()
         thread = Thread(target=run, daemon=True)
-        self.at_work.add(thread)
+        active_threads.add(thread)
         thread.start()
         return future
 
 
 @contextmanager
 def cluster(address: str | None) -> Iterator[Executor | None]:
-    """The Dask cluster at `address` as an executor, or None for this machine.
+    """Connect to the Dask cluster at `address` as an executor; None stands for this machine.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers there.
-        Fault: in the body, once its scheduler is gone, or a task has ended one worker after another.
+        Fault: in the body, when the scheduler is lost, or a task has ended one worker after another.
     """
     if address is None:
         yield None
@@ -119,70 +116,76 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
         client = Client(address, timeout=SCHEDULER_S)
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler is {address}: no Dask scheduler answers there ({error})") from error
-    with client, client.get_executor(pure=False, retries=10) as there:
+    with client, client.get_executor(pure=False, retries=10) as executor:
         try:
-            yield there
+            yield executor
         except (CancelledError, KilledWorker) as error:
-            what = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
+            reason = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
             advice = "what was finished is kept: see why, and go on with --resume"
-            raise Fault(f"the cluster at {address} {what}; {advice}") from error
+            raise Fault(f"the cluster at {address} {reason}; {advice}") from error
 
 
-def map_chunks(work: Callable[[int, int], Result], count: int, grain: int) -> list[Result]:
-    """Results of work(begin, end) over chunks that make up 0..count, in order, one thread a core.
+def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -> list[Result]:
+    """Apply work(begin, end) to chunks that partition range(count), one thread a core.
 
     Args:
-        grain: items below which a chunk is not worth a thread; work that small runs where it is.
+        work: function of the bounds of a chunk.
+        count: number of items.
+        min_chunk: items below which a chunk is not worth a thread.
+
+    Returns:
+        Results in the order of the chunks.
     """
-    chunks = max(1, min(os.cpu_count() or 1, count // grain))
-    if chunks == 1:
+    n_chunks = max(1, min(os.cpu_count() or 1, count // min_chunk))
+    if n_chunks == 1:
         return [work(0, count)]
-    edges = np.linspace(0, count, chunks + 1).astype(int).tolist()
-    with ThreadPoolExecutor(chunks) as pool:
-        return list(pool.map(lambda ends: work(*ends), pairwise(edges)))
+    edges = np.linspace(0, count, n_chunks + 1).astype(int).tolist()
+    with ThreadPoolExecutor(n_chunks) as pool:
+        return list(pool.map(lambda bounds: work(*bounds), pairwise(edges)))
 
 
-class _OneThread:
-    """Who is within `one_torch_thread`, and the number of threads before: torch has one of them for all."""
+class _TorchThreads:
+    """Bodies of `one_torch_thread` that run, and the number of threads before the first: torch has one for all."""
 
-    lock, inside, before = Lock(), 0, 1
+    lock, n_bodies, n_before = Lock(), 0, 1
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread in the body, from any thread, several bodies beside each other or within.
+    """Limit torch to one thread in the body; from any thread, in parallel or nested, until the last body ends.
 
-    Small matrices gain little from more, where another program has a core threads that wait for each other take many
-    times as long, and sums in another order would give another result. The last one to leave sets it back.
+    Small matrices gain little from more threads, these slow each other down where another program uses the cores, and
+    sums in another order would give another result.
     """
     import torch
 
-    with _OneThread.lock:
-        if not _OneThread.inside:
-            _OneThread.before = torch.get_num_threads()
-        _OneThread.inside += 1
+    with _TorchThreads.lock:
+        if not _TorchThreads.n_bodies:
+            _TorchThreads.n_before = torch.get_num_threads()
+        _TorchThreads.n_bodies += 1
         torch.set_num_threads(1)
     try:
         yield
     finally:
-        with _OneThread.lock:
-            _OneThread.inside -= 1
-            if not _OneThread.inside:
-                torch.set_num_threads(_OneThread.before)
+        with _TorchThreads.lock:
+            _TorchThreads.n_bodies -= 1
+            if not _TorchThreads.n_bodies:
+                torch.set_num_threads(_TorchThreads.n_before)
 
 
 def clear_stale_kernels(package: Path) -> None:
-    """Delete the compiled kernels of a package, with the rooms in it, if its sources are not those of the last call.
+    """Delete the compiled kernels of a package if any of its sources has changed since the last call.
 
-    Does nothing where the folder cannot be written: what is compiled then is not kept in it either.
+    Numba compares the source of a kernel alone, not of those that it inlines. A folder that cannot be written is left
+    as it is: no kernels are cached there.
     """
-    kept = package / "__pycache__"
+    cache = package / "__pycache__"
     with suppress(OSError):
-        kept.mkdir(exist_ok=True)
-        now = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
-        stamp = kept / "kernels.sha256"
-        if stamp.exists() and stamp.read_bytes() == now:
+        cache.mkdir(exist_ok=True)
+        digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
+        stamp = cache / "kernels.sha256"
+        if stamp.exists() and stamp.read_bytes() == digest:
             return
         for compiled in package.rglob("__pycache__/*.nb[ic]"):
             compiled.unlink(missing_ok=True)
-        stamp.write_bytes(now)
+        stamp.write_bytes(digest)

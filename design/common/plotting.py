@@ -1,4 +1,4 @@
-"""The style all pictures share: a family is known by its colour on every page; and how they are written."""
+"""The style of all figures, in which each family of fibres has its colour, and how they are saved."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,13 +12,17 @@ if TYPE_CHECKING:
 HORIZONTAL, VERTICAL = "#0b6e99", "#d9730d"
 ALARM, INK, FAINT, PAPER = "#c4161c", "#37352f", "#d3d1cb", "#f7f6f3"
 CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")
-"""For the curves of a figure, in their order."""
+"""Colours of the curves of a figure, in their order."""
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
-    """Write a figure as `.png` or `.svg`, atomically and byte-reproducibly (no dates, stable ids).
+    """Save a figure atomically and byte-reproducibly (no dates, stable ids).
 
-    A PNG gets a palette of 256 colours, rare ones kept too: a third of the size, and no difference to be seen.
+    Args:
+        figure: the figure.
+        path: with the suffix .png or .svg. A PNG has a palette of 256 colours: a third of the size, and no visible
+            difference.
+        dpi: resolution of a PNG.
     """
     import matplotlib as mpl
     import numpy as np
@@ -34,12 +38,17 @@ def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
         figure.set_dpi(dpi)
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        few = picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-        few.save(temporary, format="PNG", optimize=True)
+        reduced = picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+        reduced.save(temporary, format="PNG", optimize=True)
 
 
 def new_figure(width_in: float, height_in: float) -> "tuple[Figure, Any]":
-    """A figure in the house's style, and its axes."""
+    """Create a figure with one pair of axes in the common style.
+
+    Args:
+        width_in: width, inches.
+        height_in: height, inches.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
@@ -49,7 +58,7 @@ def new_figure(width_in: float, height_in: float) -> "tuple[Figure, Any]":
 
 
 def style_axes(axes: Any) -> None:
-    """Put axes in the house's style."""
+    """Apply the common style to axes."""
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
@@ -59,12 +68,12 @@ def style_axes(axes: Any) -> None:
 
 
 def add_title(figure: "Figure", text: str) -> None:
-    """Say over a whole figure what it shows."""
+    """Add a title over all axes of a figure."""
     figure.suptitle(text, x=0.01, ha="left", color=INK, fontsize=11)
 
 
 def draw_confusions(axes: Any, counts: Sequence[Sequence[int]]) -> None:
-    """Draw how often what is true, by row, was taken for what, in per cent of each row."""
+    """Draw a confusion matrix, true classes by row, in per cent of each row."""
     import numpy as np
 
     percent = 100 * np.array(counts) / np.maximum(np.sum(counts, axis=1, keepdims=True), 1)
@@ -76,5 +85,5 @@ def draw_confusions(axes: Any, counts: Sequence[Sequence[int]]) -> None:
 
 
 def add_caption(axes: Any, text: str) -> None:
-    """Say under the title what the marks are."""
+    """Add an explanation of the marks under the title of axes."""
     axes.text(0, 1.015, text, transform=axes.transAxes, color=INK, fontsize=8.5)

@@ -1,4 +1,4 @@
-"""Where time goes and what is skipped, noted while somebody asks for it; else a note costs the look at a variable."""
+"""Profile of a command: wall time by stage, and how much of the work was skipped; costs nothing unless enabled."""
 
 import sys
 import threading
@@ -14,65 +14,60 @@ HEAVY = (
     *("build123d", "ezdxf", "h5py", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "pymoo", "rtde_control"),
     *("scipy", "serial", "shapely", "torch", "trimesh"),
 )
-"""Libraries whose import is worth telling of."""
+"""Libraries whose import takes noticeable time."""
+_OTHER = "elsewhere"
 
 
 class Profile:
-    """What has been noted.
+    """Times and counts.
 
     Attributes:
         seconds: wall time of the main thread by stage, without the stages within it.
-        counts: by name, how many there were to look at and how many were looked at.
+        counts: by name, [evaluated, total].
     """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.counts: dict[str, list[int]] = {}
-        self._stages = ["elsewhere"]
+        self.lock = threading.Lock()
+        self._stages = [_OTHER]
         self._since = time.perf_counter()
-        self._lock = threading.Lock()
 
-    def enter(self, stage: str) -> None:
-        """Begin a stage, within the one that runs."""
-        self._switch()
-        self._stages.append(stage)
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Attribute the time of the body to `name`."""
+        self._attribute_time()
+        self._stages.append(name)
+        try:
+            yield
+        finally:
+            self._attribute_time()
+            self._stages.pop()
 
-    def leave(self) -> None:
-        """End the stage that runs."""
-        self._switch()
-        self._stages.pop()
-
-    def _switch(self) -> None:
+    def _attribute_time(self) -> None:
         now = time.perf_counter()
         self.seconds[self._stages[-1]] = self.seconds.get(self._stages[-1], 0.0) + now - self._since
         self._since = now
 
-    def add(self, name: str, looked_at: int, of: int) -> None:
-        """Add to a count, from any thread."""
-        with self._lock:
-            count = self.counts.setdefault(name, [0, 0])
-            count[0] += looked_at
-            count[1] += of
-
     def lines(self) -> list[str]:
-        """The profile for people."""
-        self._switch()
-        whole = sum(self.seconds.values())
-        stages = sorted(self.seconds.items(), key=lambda item: (item[0] == "elsewhere", -item[1]))
+        """Format the profile as text."""
+        self._attribute_time()
+        total_s = sum(self.seconds.values())
+        stages = sorted(self.seconds.items(), key=lambda item: (item[0] == _OTHER, -item[1]))
         loaded = [name for name in HEAVY if name in sys.modules]
-        left = [name for name in HEAVY if name not in sys.modules]
+        skipped = [name for name in HEAVY if name not in sys.modules]
+        counts = {name: (total - evaluated, total) for name, (evaluated, total) in self.counts.items()}
         return [
-            f"where {whole:.2f} s went",
-            *(f"  {name:<24} {spent:8.2f} s {spent / whole:6.1%}" for name, spent in stages),
+            f"where {total_s:.2f} s went",
+            *(f"  {name:<24} {spent:8.2f} s {spent / total_s:6.1%}" for name, spent in stages),
             "what was skipped",
-            *(f"  {name:<24} {of - done} of {of}" + _share(of - done, of) for name, (done, of) in self.counts.items()),
-            f"  {'imports':<24} {len(left)} of {len(HEAVY)}: {', '.join(left) or 'none'}"
+            *(
+                f"  {name:<24} {n} of {total}" + (f" ({n / total:.1%})" if total >= 1000 else "")
+                for name, (n, total) in counts.items()
+            ),
+            f"  {'imports':<24} {len(skipped)} of {len(HEAVY)}: {', '.join(skipped) or 'none'}"
             + (f" (not {', '.join(loaded)})" if loaded else ""),
         ]
-
-
-def _share(part: int, whole: int) -> str:
-    return f" ({part / whole:.1%})" if whole >= 1000 else ""
 
 
 _active: Profile | None = None
@@ -80,56 +75,53 @@ _active: Profile | None = None
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Note what happens in the body, imports of HEAVY libraries as stages of their own."""
+    """Profile the body; imports of HEAVY libraries are stages of their own."""
     global _active
-    profile, clock = Profile(), _ImportClock()
-    _active = profile
-    sys.meta_path.insert(0, clock)
+    _active, finder = Profile(), _TimedImports()
+    sys.meta_path.insert(0, finder)
     try:
-        yield profile
+        yield _active
     finally:
-        sys.meta_path.remove(clock)
+        sys.meta_path.remove(finder)
         _active = None
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time of the body goes to `name`; in threads other than the main one, to whatever the main one does."""
-    profile = _active
-    if profile is None or threading.current_thread() is not threading.main_thread():
+    """Attribute the time of the body to `name` if it runs in the main thread of a profiled command."""
+    if _active is None or threading.current_thread() is not threading.main_thread():
         yield
         return
-    profile.enter(name)
-    try:
+    with _active.stage(name):
         yield
-    finally:
-        profile.leave()
 
 
-def looked_at(name: str, done: int, of: int) -> None:
-    """Note that `done` of `of` were looked at, the others skipped."""
+def add_count(name: str, evaluated: int, total: int) -> None:
+    """Count how many of `total` items were evaluated, the others skipped; from any thread."""
     if _active is not None:
-        _active.add(name, done, of)
+        with _active.lock:
+            count = _active.counts.setdefault(name, [0, 0])
+            count[0] += evaluated
+            count[1] += total
 
 
 def is_profiling() -> bool:
-    """Whether a profile is being taken, for notes that take work themselves."""
+    """Whether a profile is being taken, for counts that take time themselves."""
     return _active is not None
 
 
-class _ImportClock(MetaPathFinder):
+class _TimedImports(MetaPathFinder):
     """Makes the import of each of HEAVY a stage."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """The usual specification, its loader timed."""
         spec = PathFinder.find_spec(fullname, path, target) if fullname in HEAVY else None
         loader: Any = spec and spec.loader
         if loader is not None:
 
-            def timed(module: ModuleType) -> None:
-                del loader.exec_module  # which is its class's own again
+            def exec_timed(module: ModuleType) -> None:
+                del loader.exec_module  # uncovers the method of its class
                 with stage(f"import {fullname}"):
                     loader.exec_module(module)
 
-            loader.exec_module = timed
+            loader.exec_module = exec_timed
         return spec

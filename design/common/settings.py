@@ -1,4 +1,4 @@
-"""`pad.toml`: reading, validating and writing settings. Which sections there are is for those who own them to say."""
+"""Reading, validating and writing of `pad.toml`; the packages that own its sections define their models."""
 
 import math
 import sys
@@ -10,62 +10,62 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
 from padforge.design.common.files import read_bytes
-from padforge.design.common.validation import InputError, check_mapping, check_type, short_repr
-from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.validation import InputError, check_mapping, check_path, check_type, short_repr
 
 MAX_BYTES = 2**18
-"""Longer settings are none that anybody wrote, and would take long to be refused."""
+"""Size limit of a settings file."""
 MAX_DOTS = 200
-"""In a line: keys of very many parts take the reader of TOML time that grows with their square."""
+"""In a line: the time to parse a dotted key grows with the square of its parts."""
 MAX_DEPTH = 6
-"""Of lists and tables in a table; no setting has more, and a list may hold itself."""
+"""Of nested lists and tables; more than any setting has, while a list may contain itself."""
 MAX_ITEMS = 2**17
-"""Of an array; one of more is no setting, and a broadcast one may be larger than any memory once it is a list."""
+"""Size limit of an array: a broadcast one may not fit into memory as a list."""
 
 
 class Settings(BaseModel):
-    """One table of `pad.toml`: immutable, no unknown keys, no NaN; a field's description is its comment."""
+    """A table of `pad.toml`: immutable, without unknown keys and NaN; the description of a field is its comment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     MOVED: ClassVar[Mapping[str, str]] = {}
-    """Keys that were in this table once, and where they are now."""
+    """Former keys of this table, and where they are now."""
 
     def __init__(self, **values: Any) -> None:
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise _finding(error, type(self), f"[{self.section()}]") from error
+            raise _to_input_error(error, type(self), f"[{self.section()}]") from error
 
     @model_validator(mode="before")
     @classmethod
-    def _without_numpy(cls, given: object) -> object:
-        return to_builtins(given)
+    def _without_numpy(cls, values: object) -> object:
+        return to_builtins(values)
 
     @classmethod
     def section(cls) -> str:
-        """The name of its table: the model's, without `Settings`."""
+        """Return the name of the table: that of the model, without `Settings`."""
         return cls.__name__.removesuffix("Settings").lower()
 
-    __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]  else tables within go there too
+    # lets pydantic validate nested tables without this __init__, so that its errors name the whole path of a key
+    __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]
 
 
 AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
-    """Return a value with Python's numbers and lists in place of NumPy's scalars and arrays.
+    """Replace NumPy scalars and arrays by Python numbers and lists.
 
     Args:
-        value: that of a key, or a whole table.
+        value: of a key, or a table.
         depth: levels of lists and tables within which they are replaced.
 
     Returns:
-        The value; an array of more than MAX_ITEMS as it is, which no model takes.
+        The value; an array of more than MAX_ITEMS items unchanged, which no model accepts.
     """
-    numpy = sys.modules.get("numpy")  # whoever has such values has loaded it, and nobody else waits for it
+    numpy = sys.modules.get("numpy")  # without importing it: a caller who has such values has done so
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
-        # an axis of length 0 counts as 1: lists would be made for the others all the same
+        # an axis of length 0 counts as 1, since lists are made for the others all the same
         return value if math.prod(max(length, 1) for length in value.shape) > MAX_ITEMS else value.tolist()
     if depth and isinstance(value, list | tuple):
         items = [to_builtins(item, depth - 1) for item in value]
@@ -76,12 +76,12 @@ def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
 
 
 def as_tuple(value: object) -> object:
-    """A list, as files have it, as the tuple that a frozen model holds; anything else as it is."""
+    """Convert a list, as in files, to the tuple that a frozen model holds; return anything else unchanged."""
     return tuple(value) if isinstance(value, list) else value
 
 
 def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer]:
-    """For `Annotated[... | None, *none_as("unknown")]`: a key that is this word where the model holds None."""
+    """Annotate a key that is `word` in files where the model holds None: `Annotated[float | None, *null_as("any")]`."""
 
     def read(value: object) -> object:
         return None if isinstance(value, str) and value == word else value
@@ -90,12 +90,7 @@ def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer]:
 
 
 class Spec:
-    """The content of a `pad.toml`: `spec.section(PadSettings)` is that section, validated, with defaults filled in.
-
-    Args:
-        tables: sections by name. source: what errors call them.
-        sections: names that are allowed; any if None.
-    """
+    """The content of a `pad.toml`; `spec.section(PadSettings)` is a section of it, validated, with its defaults."""
 
     def __init__(
         self,
@@ -103,10 +98,20 @@ class Spec:
         source: str = "built-in defaults",
         sections: Collection[str] | None = None,
     ) -> None:
+        """Check the names of sections; their content is validated when it is used.
+
+        Args:
+            tables: sections by name.
+            source: what errors call them.
+            sections: names that are allowed; any if None.
+
+        Raises:
+            InputError: an unknown section, or one that is no table.
+        """
         check_mapping("tables", tables)
         try:
             allowed = tables if sections is None else [*check_type("sections", sections, Collection)]
-        except TypeError as error:  # an array of no dimension is a collection of nothing that could be gone through
+        except TypeError as error:  # an array of no dimension counts as a collection
             raise InputError(f"sections are {short_repr(sections)}, expected names") from error
         if not all(isinstance(name, str) for name in allowed):
             raise InputError(f"sections are {short_repr(sections)}, expected names")
@@ -122,40 +127,48 @@ class Spec:
 
     @classmethod
     def load(cls, path: Path | None, sections: Collection[str] | None = None) -> "Spec":
-        """Read a TOML file with the `sections` allowed, or any; None stands for the defaults.
+        """Read a TOML file.
+
+        Args:
+            path: the file; None for the defaults.
+            sections: names that are allowed; any if None.
 
         Raises:
-            InputError: the file is missing, is no TOML, or has an unknown section.
+            InputError: the file cannot be read, is not TOML, or has an unknown section.
         """
         if path is None:
             return cls({})
-        path = as_path("path", path)
+        path = check_path("path", path)
         content = read_bytes(path, MAX_BYTES)
         if any(line.count(b".") > MAX_DOTS for line in content.splitlines()):
             raise InputError(f"{path}: not a settings file (a line has more than {MAX_DOTS} dots)")
         try:
             tables = tomllib.loads(content.decode("utf-8-sig"))
-        except (ValueError, RecursionError) as error:  # tables within tables without end
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a TOML file ({error})") from error
         return cls(tables, str(path), sections)
 
     def section(self, model: type[AnySettings], **overrides: Any) -> AnySettings:
-        """The section `model` stands for; `overrides` that are not None win over the file.
+        """Validate the section of `model`.
+
+        Args:
+            model: of the section.
+            **overrides: values that replace those of the file, unless None.
 
         Raises:
-            InputError: an unknown key or a value out of range, naming the key, the value and what is allowed.
+            InputError: an unknown key or a value out of range, with key, value and what is allowed.
         """
-        given = {key: value for key, value in overrides.items() if value is not None}
-        return validate(model, {**self.given(model), **given}, f"{self.source}: [{model.section()}]")
+        changes = {key: value for key, value in overrides.items() if value is not None}
+        return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]")
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
-        """These settings, with the values in `tables`, by section, in place of their own."""
+        """Return these settings with the values of `tables`, by section, in place of their own."""
         Spec(tables, self.source)
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
 
-    def given(self, model: type[Settings]) -> Mapping[str, Any]:
-        """What the file states of the section `model` stands for, as it stands there."""
+    def stated(self, model: type[Settings]) -> Mapping[str, Any]:
+        """Return what the file states of the section of `model`, without defaults and not validated."""
         if not (isinstance(model, type) and issubclass(model, Settings)):
             raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
         return self._tables.get(model.section(), {})
@@ -164,22 +177,31 @@ class Spec:
 def or_default(
     name: str, value: AnySettings | None, model: type[AnySettings], default: AnySettings | None = None
 ) -> AnySettings:
-    """The argument `name` of a public function: a section, or for None `default`, the section's own if that is None."""
+    """Return an argument that is a section of the settings.
+
+    Args:
+        name: of the argument.
+        value: the section; None for its default.
+        model: of the section.
+        default: in place of the model's own default.
+
+    Raises:
+        InputError: `value` is of another type.
+    """
     return (default or model()) if value is None else check_type(name, value, model)
 
 
 def validate(model: type[AnySettings], values: Mapping[str, Any], where: str) -> AnySettings:
-    """`model(**values)`, with pydantic's findings as one InputError line that begins with `where`."""
+    """Return `model(**values)`; raise the first error of pydantic as an InputError that begins with `where`."""
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        raise _finding(error, model, where) from error
+        raise _to_input_error(error, model, where) from error
 
 
-def _finding(error: ValidationError, model: type[Settings], where: str) -> InputError:
-    """The first of pydantic's findings on a `model` as one line that begins with `where`."""
+def _to_input_error(error: ValidationError, model: type[Settings], where: str) -> InputError:
     first = error.errors()[0]
-    if not first["loc"]:  # a finding on the whole section names the key itself
+    if not first["loc"]:  # an error of the whole section names its keys itself
         return InputError(f"{where} {first['msg']}")
     key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
     if first["type"] == "extra_forbidden":
@@ -191,14 +213,19 @@ def _finding(error: ValidationError, model: type[Settings], where: str) -> Input
 
 
 def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:
-    """A `pad.toml` that states every default, or what a preset has in its place, with descriptions as comments."""
+    """Write a `pad.toml` that states every key, with the descriptions as comments.
+
+    Args:
+        models: of the sections, by name.
+        preset: sections that replace the defaults.
+    """
     head = "# padforge settings. Every key is optional; what stands here is the default"
     lines = [f"{head}, or of the preset." if preset else f"{head}."]
     for name, model in models.items():
         lines += ["", f"[{name}]"]
-        stated = ((preset or {}).get(name) or model()).model_dump()
+        values = ((preset or {}).get(name) or model()).model_dump()
         for key, field in model.model_fields.items():
-            lines.append(f"{key} = {_toml_value(stated[key])} ".ljust(36) + f"# {field.description}")
+            lines.append(f"{key} = {_toml_value(values[key])} ".ljust(36) + f"# {field.description}")
     return "\n".join(lines) + "\n"
 
 

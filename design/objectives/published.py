@@ -213,7 +213,7 @@ def published_terms(
     def work(begin: int, end: int) -> None:
         terms_kernel(travel, cross, ends.horizontals, places, shape, samples, levels, begin, end, found)
 
-    map_chunks(work, len(travel), grain=8)
+    map_chunks(work, len(travel), min_chunk=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in found.tolist()]
 
 

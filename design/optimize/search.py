@@ -177,7 +177,7 @@ def search(
     states = checkpoints.begin(run.resume) if checkpoints else {}
     stop = Stop(begin, run.time_budget)
     kept = sum(bool(state["done"]) for state in states.values())
-    profiling.looked_at("starts", len(problem.starts) - kept, len(problem.starts))
+    profiling.add_count("starts", len(problem.starts) - kept, len(problem.starts))
     with profiling.stage("search"), stopped_by_interrupt(stop), one_torch_thread():
         _advance(problem, states, stop, run, checkpoints)
         found = _found(problem, states, stop)
@@ -234,7 +234,7 @@ def _advance(
         return None if reached.done or stop else partial(advance_start, problem, start, reached.state)
 
     given_up = partial(stop.given_up, elsewhere=run.executor is not None)
-    for start, reached in run_tasks(first_slices(), run.executor, then=next_slice, given_up=given_up):
+    for start, reached in run_tasks(first_slices(), run.executor, follow_up=next_slice, is_abandoned=given_up):
         states[start] = reached.state
         if checkpoints:
             checkpoints.save(start, reached.state)

@@ -38,10 +38,10 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
     """
     twin = Twin.load(path)
-    if spec.given(Contact) and spec.section(Contact) != Contact():
+    if spec.stated(Contact) and spec.section(Contact) != Contact():
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
     own = twin.morphology.layout
-    stated = {**own.settings, **{key: spec.given(PadSettings)[key] for key in KEYS if key in spec.given(PadSettings)}}
+    stated = {**own.settings, **{key: spec.stated(PadSettings)[key] for key in KEYS if key in spec.stated(PadSettings)}}
     if pad is not None:
         stated = {**pad.layout.settings}
     size = spec.section(PadSettings, **stated, sensed_mm="beyond").layout
@@ -51,7 +51,7 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         {
             "pad": stated | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
             "contact": twin.contact().model_dump(),
-            "search": {**spec.given(SearchSettings), **_scatter(twin, size)},
+            "search": {**spec.stated(SearchSettings), **_scatter(twin, size)},
         }
     )
 

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import unchanged
+from padforge.design.common.files import find_unchanged
 from padforge.design.common.page import PageSection, collapsible, figures, heading, paragraph, render_markdown, table
 from padforge.design.common.validation import InputError
 
@@ -66,7 +66,7 @@ def _written_with(folder: Path, document: Mapping[str, Any]) -> set[str]:
         InputError: one of them is another one now.
     """
     digests = {name: document["sha256"][name] for name in _SHOWN if name in document["sha256"]}
-    own = unchanged(folder, digests)
+    own = find_unchanged(folder, digests)
     for name in digests.keys() - own:
         if (folder / name).exists():
             raise InputError(f"{folder / name}: is not the one fabrication.json was written with; fabricate again")

@@ -127,7 +127,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
     from .robustness import robustness_study
 
     settings = common.load_spec(spec)
-    contact = settings.section(Contact) if settings.given(Contact) else None
+    contact = settings.section(Contact) if settings.stated(Contact) else None
     return robustness_study(_pads(names, seed), seed=seed, contact=contact, **options)
 
 

@@ -158,7 +158,7 @@ def _done(
     states = kept.begin(resume)
     progress(len(states), len(tasks), "")
     missing = [(number, partial(_made, task.make)) for number, task in enumerate(tasks) if number not in states]
-    for number, state in run_tasks(missing, executor, at_once=jobs):
+    for number, state in run_tasks(missing, executor, max_parallel=jobs):
         states[number] = state
         kept.save(number, state)
         progress(len(states), len(tasks), tasks[number].name)

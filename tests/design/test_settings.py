@@ -82,7 +82,7 @@ def test_refusals_name_the_key_the_value_and_what_is_allowed(model, table, messa
 
 @pytest.mark.parametrize("other", [None, 3, "a", int, np.ones((2, 2)), [1], {1: 2}])
 def test_what_is_no_section_and_no_table_is_refused(other):
-    for ask in (Spec({}).section, Spec({}).given):
+    for ask in (Spec({}).section, Spec({}).stated):
         with pytest.raises(InputError, match=r"model is .*, expected a section"):
             ask(other)
     for tables in (other, {"pad": other}):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design.common.files import unchanged, write_json
+from padforge.design.common.files import find_unchanged, write_json
 from padforge.design.morphology import Morphology
 from tests.helpers.door import contents
 from tools.hostile_inputs.files import CHEAP, require_whole_file
@@ -139,7 +139,7 @@ def test_kill_while_writing_leaves_one_mould(room: Path, ending: signal.Signals)
         assert litter(room) == []
     digests = json.loads((room / "pad" / "fabrication.json").read_text()).get("sha256", {})
     there = {path.name for path in (room / "pad").iterdir() if path.is_file()}
-    assert there - {"morphology.json", "fabrication.json"} == digests.keys() == unchanged(room / "pad", digests)
+    assert there - {"morphology.json", "fabrication.json"} == digests.keys() == find_unchanged(room / "pad", digests)
     if litter(room):
         _, err = start(room, *COMMANDS["fabricate"]).communicate(timeout=60)
         assert litter(room) == [], err

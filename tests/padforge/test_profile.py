@@ -69,7 +69,7 @@ def test_failing_stage_ends_profile():
     assert "failing" in profile.seconds
     assert sys.meta_path == finders
     assert not profiling.is_profiling()
-    profiling.looked_at("nothing", 1, 2)  # no one listens
+    profiling.add_count("nothing", 1, 2)  # no one listens
     assert not profile.counts
 
 

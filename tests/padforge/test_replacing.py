@@ -151,9 +151,7 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Morphology.straight(2).save(folder / name / "morphology.json")
     (folder / "pad" / "recording.csv").write_text("time_s,fibre_1_v\n0,0\n1,0\n")
     (folder / "pad" / "thesis.txt").write_text("mine")
-    (folder / "pad" / EXCHANGE / ".unfinished-gone").write_text('["thesis.txt"]')
-    (folder / "pad" / EXCHANGE / ".unfinished-note").write_text('[["morphology.json"], ["thesis.txt"]]')
-    (folder / "pad" / EXCHANGE / ".unfinished-seal").write_text("1 2 3 4")
+    (folder / "pad" / EXCHANGE / ".unfinished-note").write_text('[[1, 2], ["morphology.json"], ["thesis.txt"]]')
     return folder
 
 

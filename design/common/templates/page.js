@@ -1,8 +1,8 @@
 "use strict"
-// Paper cannot be clicked: what is folded is open on it.
-let folded = []
+// On paper nothing can be clicked: collapsed details are opened for printing.
+let collapsed = []
 addEventListener("beforeprint", () => {
-  folded = [...document.querySelectorAll("details:not([open])")]
-  for (const each of folded) each.open = true
+  collapsed = [...document.querySelectorAll("details:not([open])")]
+  for (const details of collapsed) details.open = true
 })
-addEventListener("afterprint", () => { for (const each of folded) each.open = false })
+addEventListener("afterprint", () => { for (const details of collapsed) details.open = false })

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.files import atomic_file, reraise_write_error
-from padforge.design.common.mat_files import plain_datasets
+from padforge.design.common.mat_files import open_hdf5
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.recording import Recording
 
@@ -60,8 +60,8 @@ def import_hdf5(path: str | Path, mapping: str = "") -> Recording:
     path, mapping = file_and_mapping(path, mapping)
     if mapping:
         return _mapped(path, mapping)
-    with plain_datasets(path) as file:
-        kind = file.text("format")
+    with open_hdf5(path) as file:
+        kind = file.read_text("format")
         if kind != FORMAT:
             raise InputError(
                 f"format is {kind!r}, expected {FORMAT!r}; a mapping tells what other datasets hold, "
@@ -69,7 +69,7 @@ def import_hdf5(path: str | Path, mapping: str = "") -> Recording:
             )
         arrays: dict[str, Any] = {attribute: file.read(name) for name, attribute in _ARRAYS.items()}
         arrays |= {name: file.read(name) for name in _KNOWN if name in file.names}
-        source = file.text("source")
+        source = file.read_text("source")
     try:
         return Recording(**arrays, source=json.loads(source or ""))
     except (InputError, ValueError, RecursionError) as error:
@@ -78,6 +78,6 @@ def import_hdf5(path: str | Path, mapping: str = "") -> Recording:
 
 def _mapped(path: Path, mapping: str) -> Recording:
     parts = [part._replace(name=part.name.removeprefix("/")) for part in parse_mapping(mapping)]
-    with plain_datasets(path) as file:
+    with open_hdf5(path) as file:
         found = [(part, file.read(file.names[at])) for part, places in chosen(parts, file.names) for at in places]
     return assembled(path, found, {"kind": "hdf5", "file": path.name, "mapping": mapping})

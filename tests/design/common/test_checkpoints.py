@@ -58,7 +58,7 @@ def test_a_state_that_unpacks_to_much_is_not_unpacked_and_what_is_no_state_stays
         for name, each in content.items():
             packed.writestr(name, each)
     assert path.stat().st_size < 2000
-    monkeypatch.setattr("padforge.design.common.checkpoints.MOST_BYTES", 50_000)
+    monkeypatch.setattr("padforge.design.common.checkpoints.MAX_BYTES", 50_000)
     with pytest.raises(InputError, match=r"start_0000\.npz: .*unpacks to more than 50000 bytes"):
         kept.begin(resume=True)
     kept = Checkpoints(tmp_path / "search", {"search": {}})

@@ -61,7 +61,7 @@ def test_a_task_is_followed_by_the_next_of_its_key_and_results_come_as_they_are_
     def next_one(key, result):
         return partial(str.__add__, result, key) if len(result) < 3 else None
 
-    found = list(run_tasks([("a", lambda: "a"), ("b", lambda: "b")], then=next_one))
+    found = list(run_tasks([("a", lambda: "a"), ("b", lambda: "b")], follow_up=next_one))
     for key in ("a", "b"):
         assert [result for own, result in found if own == key] == [key, 2 * key, 3 * key]
     first, inside, most = threading.Event(), 0, 0
@@ -74,7 +74,7 @@ def test_a_task_is_followed_by_the_next_of_its_key_and_results_come_as_they_are_
         inside -= 1
 
     tasks = [("slow", first.wait), ("quick", lambda: None), ("last", first.set)]
-    found = [key for key, _ in run_tasks([(key, partial(counted, work)) for key, work in tasks], at_once=2)]
+    found = [key for key, _ in run_tasks([(key, partial(counted, work)) for key, work in tasks], max_parallel=2)]
     assert found[0] == "quick"
     assert most == 2
 
@@ -91,7 +91,7 @@ def test_nothing_begins_once_nobody_listens_and_a_task_at_work_is_not_waited_for
     kept = []
 
     def listen():
-        for key, _ in run_tasks([(number, partial(work, number)) for number in range(9)], at_once=2):
+        for key, _ in run_tasks([(number, partial(work, number)) for number in range(9)], max_parallel=2):
             kept.append(key)
             if len(kept) == 3:
                 raise KeyboardInterrupt
@@ -151,7 +151,7 @@ def train():
 @click.command()
 def work():
     print("begun")
-    for _ in run_tasks([(number, train) for number in range(5)], at_once=5):
+    for _ in run_tasks([(number, train) for number in range(5)], max_parallel=5):
         pass
 sys.exit(run_to_end(work, "padforge", {}))
 """

@@ -15,8 +15,8 @@ from padforge.design.common import files
 from padforge.design.common.files import EXCHANGE
 from padforge.design.common.validation import InputError
 
-CLAIM = "import sys\nfrom pathlib import Path\nfrom padforge.design.common.files import claimed\n"
-ANOTHER = CLAIM + "try:\n  with claimed(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
+LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.design.common.files import locked_folder\n"
+ANOTHER = LOCK + "try:\n  with locked_folder(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
@@ -96,7 +96,7 @@ def test_one_run_at_a_time_writes_to_a_folder_which_goes_again_if_made_for_nothi
         assert "another run is writing there" in another(folder)
         with pytest.raises(InputError, match="another run is writing there"), files.locked_folder(folder):
             pass
-    code = CLAIM + "import os\nwith claimed(Path(sys.argv[1])): os._exit(9)"
+    code = LOCK + "import os\nwith locked_folder(Path(sys.argv[1])): os._exit(9)"
     assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
     with files.locked_folder(folder), files.locked_folder(tmp_path / "out" / "other"):
         pass
@@ -127,35 +127,30 @@ def test_staged_files_come_together_or_not_at_all_and_others_go_with_them(tmp_pa
     assert (tmp_path / "out" / "mine").read_text() == "old"
 
 
-@pytest.mark.parametrize("linked", [True, False])
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError])
-def test_what_was_there_is_put_back_where_not_all_can_be_moved(tmp_path, monkeypatch, stop, linked):
-    for name in ("b", "d", "mine"):
+def test_files_that_cannot_all_be_moved_are_read_as_a_set_and_the_next_run_moves_them(tmp_path, monkeypatch, stop):
+    for name in ("b", "d", "mine", "removed"):
         (tmp_path / name).write_text("old")
     replace = Path.replace
+    stops = iter([stop])
 
     def stopped(self, target):
-        if self.name == "d" and self.read_text() == "new":
-            raise stop
+        if self.name == "d" and (error := next(stops, None)):
+            raise error
         return replace(self, target)
 
     monkeypatch.setattr(Path, "replace", stopped)
-    if not linked:  # as on disks that know no such
-        monkeypatch.setattr(Path, "hardlink_to", lambda path, target: Path(target).rmdir())
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError):
-        replaced(tmp_path, "a", "b", "c", "d", without=["mine"])
-    assert contents(tmp_path) == dict.fromkeys(("b", "d", "mine"), "old")
+        replaced(tmp_path, "a", "b", "c", "d", without=["removed"])
+    assert {files.read_bytes(tmp_path / name) for name in "abcd"} == {b"new"}
+    assert (tmp_path / EXCHANGE).exists() == (stop is PermissionError)  # an interrupt waits for the end of the move
+    with files.locked_folder(tmp_path):
+        assert contents(tmp_path) == dict.fromkeys("abcd", "new") | {"mine": "old"}
 
 
-def test_what_another_run_does_meanwhile_is_no_fault_and_is_put_back(tmp_path, monkeypatch):
-    """It takes a file away that is to be kept, and comes to its end as this run looks whether it has."""
-    link, rename, replace = Path.hardlink_to, Path.rename, Path.replace
+def test_another_run_that_commits_meanwhile_is_completed_first(tmp_path, monkeypatch):
+    rename = Path.rename
     busy = iter([OSError(errno.ENOTEMPTY, "Directory not empty")])
-
-    def taken_away(self, target):
-        if target.name == "gone":
-            target.unlink()
-        link(self, target)
 
     def late(self, target):
         if target.name == EXCHANGE and (error := next(busy, None)):
@@ -163,18 +158,24 @@ def test_what_another_run_does_meanwhile_is_no_fault_and_is_put_back(tmp_path, m
             raise error
         return rename(self, target)
 
-    def full(self, target):
-        if self.name == "b" and self.read_text() == "new":
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return replace(self, target)
+    monkeypatch.setattr(Path, "rename", late)
+    replaced(tmp_path, "a", "b")
+    assert contents(tmp_path) == {"a": "new", "b": "new", "e": "another's"}
 
-    for name in ("b", "gone"):
-        (tmp_path / name).write_text("old")
-    for name, stand_in in (("hardlink_to", taken_away), ("rename", late), ("replace", full)):
-        monkeypatch.setattr(Path, name, stand_in)
-    with pytest.raises(InputError, match="No space left"):
-        replaced(tmp_path, "a", "b", without=["gone"])
-    assert contents(tmp_path) == {"b": "another's", "e": "another's"}
+
+@pytest.mark.skipif(getattr(os, "geteuid", int)() != 0, reason="root alone may give files away")
+def test_nothing_moves_where_a_file_of_another_user_cannot_be_replaced(tmp_path, monkeypatch):
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    (folder / "b").write_text("another's")
+    os.chown(folder, 12346, 12346)
+    os.chown(folder / "b", 12345, 12345)
+    folder.chmod(0o1777)
+    monkeypatch.setattr(os, "geteuid", lambda: 12347)
+    with pytest.raises(InputError, match="b: cannot be written, it belongs to another user"):
+        replaced(folder, "a", "b")
+    assert (folder / "b").read_text() == "another's"
+    assert not (folder / "a").exists()
 
 
 def test_files_are_known_by_their_digests_in_one_folder_only_and_a_folder_by_its_content(tmp_path):
@@ -183,8 +184,8 @@ def test_files_are_known_by_their_digests_in_one_folder_only_and_a_folder_by_its
     digest = files.sha256(tmp_path / "a")
     (tmp_path / "b").write_text("changed")
     names = ["a", "b", "c", "../a", "/", "", "..", "in", "in/c", str(tmp_path / "a"), "a\0", "a" * 1000, "\ud800"]
-    assert files.unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
-    assert files.unchanged(tmp_path, {"a": None, "c": [1]}) == set()
+    assert files.find_unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
+    assert files.find_unchanged(tmp_path, {"a": None, "c": [1]}) == set()
     (tmp_path / "a").write_text("1")
     before = files.sha256(tmp_path)
     (tmp_path / "a").write_text("2")
@@ -215,9 +216,7 @@ def windows(monkeypatch):
         taken[handle] = (about.st_dev, about.st_ino)
 
     monkeypatch.setattr(files, "fcntl", None)
-    monkeypatch.setattr(files, "LOCKS", False)
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))  # pyright: ignore
-    monkeypatch.setattr(os, "O_TEMPORARY", 0, raising=False)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="it is no stand-in there")

@@ -122,7 +122,7 @@ def test_half_a_post_is_not_heard_and_no_address_refused_in_silence(
 def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are shown out however slowly they go on to ask; who was let in is not."""
     monkeypatch.setattr(listening, "ADMIT_S", 0.3)
-    monkeypatch.setattr(listening, "MOST_CONNECTIONS", 8)
+    monkeypatch.setattr(listening, "MAX_CONNECTIONS", 8)
     page.show({"at": 0})
     with ExitStack() as stack:
         browser = HTTPConnection(HOST, port_of(page), timeout=10)

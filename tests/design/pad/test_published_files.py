@@ -191,10 +191,10 @@ BOMBS = {
     "packed structures": (packed(variable(2, (MUCH, 1), *FIELDS)), "voltage is a structure, expected a full matrix"),
     "text": (variable(4, (MUCH, 1), element(4, b"")), "voltage is text, expected a full matrix"),
     "sparse": (variable(5, (MUCH, MUCH)), "voltage is a sparse matrix, expected a full matrix"),
-    "numbers": (variable(6, (MUCH, 1), element(9, bytes(8))), f"voltage claims {MUCH} values in 8 bytes of float64"),
+    "numbers": (variable(6, (MUCH, 1), element(9, bytes(8))), f"voltage claims {MUCH} values in 8 bytes"),
     "packed numbers": (
         packed(variable(6, (MUCH, MUCH), element(9, bytes(8)))),
-        f"voltage claims {MUCH**2} values in 8 bytes of float64",
+        f"voltage claims {MUCH**2} values in 8 bytes",
     ),
     "dimensions": (packed(variable(6, (MUCH,) * 2**17, element(9, bytes(8)))), "voltage has 131072 dimensions"),
     "a long element": (struct.pack("<II", 14, 2**31), "it ends early"),
