@@ -11,7 +11,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from padforge.design.common.files import provenance, read_json, write_json, write_text
 from padforge.design.common.plotting import CURVES, FAINT, INK, save_figure
@@ -200,7 +200,8 @@ def _draw(name: str, medians: Sequence[Row], error_label: str) -> Figure:
                 (handles[way],) = axes.loglog(times, errors, marker, color=colour, markersize=size, linewidth=1.4)
         axes.set_title(case, loc="left", color=INK)
         axes.set_xlabel(f"run time ({unit})")
-        for axis in (axes.xaxis, axes.yaxis):
+        for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.set_minor_formatter(NullFormatter())
         axes.grid(color=FAINT, linewidth=0.6)
