@@ -96,10 +96,10 @@ class _PublishedNetwork:
     def __init__(self, x: Array, y: Array) -> None:
         import torch
 
-        from padforge.design.networks import first_weights
+        from padforge.design.networks import initial_weights
 
         rng = np.random.default_rng(0)
-        weights = first_weights(np.ptp(x, axis=0) > 0, HIDDEN, rng), rng.uniform(-0.5, 0.5, (y.shape[1], HIDDEN + 1))
+        weights = initial_weights(np.ptp(x, axis=0) > 0, HIDDEN, rng), rng.uniform(-0.5, 0.5, (y.shape[1], HIDDEN + 1))
         self.weights = [torch.from_numpy(matrix).requires_grad_() for matrix in weights]
         self._x, self._y = torch.from_numpy(np.column_stack([x, np.ones(len(x))])), torch.from_numpy(y)
 

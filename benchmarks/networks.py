@@ -10,7 +10,15 @@ from padforge.benchmarks import harness
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import LEARN, VALIDATE, ColumnScale, Loss, Network, PressSets, first_weights
+from padforge.design.networks import (
+    TRAINING_SHARE,
+    VALIDATION_SHARE,
+    FailureSet,
+    Network,
+    RangeScaler,
+    SimulatedPresses,
+    initial_weights,
+)
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT
 
@@ -31,26 +39,28 @@ def trials() -> Iterator[harness.BenchTrial]:
     """
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
-            presses = PressSets.of(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
+            presses = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
             failures = failure_subsets(len(pad.knots), FAILED, SETS)
             evaluate = partial(_evaluate, presses, failures)
             for way, work in (
-                ("batched", partial(presses.learn, failures, HIDDEN)),
+                ("batched", partial(presses.fit, failures, HIDDEN)),
                 ("plain numpy", partial(_fit_all_plain, presses, failures)),
             ):
                 yield harness.BenchTrial(case, way, 0, work, evaluate, items=SETS)
 
 
-def _evaluate(presses: PressSets, failures: Sequence[Loss], networks: Sequence[Network]) -> Mapping[str, float]:
-    errors = [presses.errors(network, failed).mean() for network, failed in zip(networks, failures, strict=True)]
+def _evaluate(
+    presses: SimulatedPresses, failures: Sequence[FailureSet], networks: Sequence[Network]
+) -> Mapping[str, float]:
+    errors = [presses.test_errors(network, failed).mean() for network, failed in zip(networks, failures, strict=True)]
     return {"error": float(np.mean(errors))}
 
 
-def _fit_all_plain(presses: PressSets, failures: Sequence[Loss]) -> list[Network]:
+def _fit_all_plain(presses: SimulatedPresses, failures: Sequence[FailureSet]) -> list[Network]:
     networks = []
     for failed in failures:
-        inputs = np.delete(presses.recorded, list(failed), axis=1)
-        networks.append(fit_plain(inputs, presses.learned, np.random.default_rng([2, 0, len(failed), *failed])))
+        inputs = np.delete(presses.train_signals, list(failed), axis=1)
+        networks.append(fit_plain(inputs, presses.train_positions, np.random.default_rng([2, 0, len(failed), *failed])))
     return networks
 
 
@@ -62,13 +72,13 @@ def fit_plain(inputs: Array, targets: Array, rng: np.random.Generator) -> Networ
         targets: positions; shape (Q, 2).
         rng: draws the initial weights and the split into training and validation samples.
     """
-    input_scale, target_scale = ColumnScale.of(inputs), ColumnScale.of(targets)
+    input_scale, target_scale = RangeScaler.fit(inputs), RangeScaler.fit(targets)
     order = rng.permutation(len(inputs))
-    n_train = round(LEARN * len(inputs))
-    train, validation = order[:n_train], order[n_train : n_train + round(VALIDATE * len(inputs))]
-    x, y = np.column_stack([input_scale.there(inputs), np.ones(len(inputs))]), target_scale.there(targets)
+    n_train = round(TRAINING_SHARE * len(inputs))
+    train, validation = order[:n_train], order[n_train : n_train + round(VALIDATION_SHARE * len(inputs))]
+    x, y = np.column_stack([input_scale.transform(inputs), np.ones(len(inputs))]), target_scale.transform(targets)
     outputs, n_hidden_weights = y.shape[1], HIDDEN * x.shape[1]
-    first = first_weights(input_scale.half > 0, HIDDEN, rng)
+    first = initial_weights(input_scale.half > 0, HIDDEN, rng)
     weights = np.concatenate([first.ravel(), rng.uniform(-0.5, 0.5, outputs * (HIDDEN + 1))])
 
     def split(weights: Array) -> tuple[Array, Array]:

@@ -189,14 +189,14 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     padforge design score out/pad/morphology.json
     padforge design score out/pad/morphology.json --twin out/pad/twin.json
     """
-    from padforge.design.objectives.expected_error import error_terms, expected_errors
     from padforge.design.objectives.score import score as score_terms
     from padforge.design.settings import Contact, RulesSettings, SearchSettings
 
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec, twin)
     contact, search, rules = (settings.section(model) for model in (Contact, SearchSettings, RulesSettings))
-    terms = error_terms(expected_errors(pad, contact, search, pad_settings), pad.unit_mm)
-    terms |= score_terms(pad, contact, search.max_failures, rules=rules, size=pad_settings)
+    terms = score_terms(
+        pad, contact, search.max_failures, rules=rules, size=pad_settings, scatter=search.response_scatter
+    )
     show_result({"terms": terms, "violations": list(map(asdict, violations))}, [], as_json=True)
 
 

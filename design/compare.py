@@ -25,7 +25,7 @@ from padforge.design.common.plotting import (
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError, short_repr
-from padforge.design.contact_comparison import beside_straight, contact_of, errors_by_contact
+from padforge.design.contact_comparison import beside_straight, design_contact, errors_by_contact
 from padforge.design.design_run import run_design
 from padforge.design.morphology import Morphology
 from padforge.design.optimize.search import SearchOptions
@@ -147,8 +147,10 @@ def compare(
     for variant in variants:
         folder, pad = out / variant.folder, variant.pad
         if pad is None:
-            report = partial(_report_variant, options.report, variant.name)
-            result = run_design(variant.spec, folder, {"seed": seed}, options=replace(options, report=report))[1]
+            on_progress = partial(_report_variant, options.on_progress, variant.name)
+            result = run_design(
+                variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=on_progress)
+            )[1]
             if result.stopped == "interrupted":
                 raise KeyboardInterrupt  # ends the comparison, not only this search
             pad = result.morphology
@@ -160,19 +162,19 @@ def compare(
     return document
 
 
-def _report_variant(report: Callable[..., None], name: str, run: str, *step: Any) -> None:
-    report(f"{name}, {run}", *step)
+def _report_variant(on_progress: Callable[..., None], name: str, run: str, *step: Any) -> None:
+    on_progress(f"{name}, {run}", *step)
 
 
 def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
     search = variant.spec.section(SearchSettings, seed=seed)
     pad_settings = variant.spec.section(PadSettings, **pad.layout.settings)
-    contact = contact_of(variant.spec, search)
+    contact = design_contact(variant.spec, search)
     with stage("compare"):
         results = errors_by_contact(
-            beside_straight(pad), {"believed": contact}, pad_settings, search.response_scatter, search.seed
+            beside_straight(pad), {"assumed": contact}, pad_settings, search.response_scatter, search.seed
         )
-    errors_mm = {result.pad: [pad.unit_mm * error.mean for error in result.errors] for result in results}
+    errors_mm = {result.pad: list(result.errors_mm) for result in results}
     return {
         "name": variant.name,
         "fibres": list(pad.layout.counts),

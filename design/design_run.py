@@ -17,9 +17,10 @@ from padforge.design.common.files import (
 )
 from padforge.design.common.plotting import save_figure
 from padforge.design.common.profiling import stage
-from padforge.design.contact_comparison import contact_of
+from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
+from padforge.design.objectives.score import describe_terms
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
 from padforge.design.plan_drawing import draw_plan
@@ -79,6 +80,7 @@ def run_design(
     document = {
         "format": FORMAT,
         "terms": result.terms,
+        "descriptions": describe_terms(result.terms),
         "candidate": result.candidate,
         "straight": result.straight,
         "violations": [asdict(violation) for violation in result.violations],
@@ -142,7 +144,7 @@ def _read_request(
         inputs.append(Path(start_from))
         overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
-    contact = contact_of(spec, settings)
+    contact = design_contact(spec, settings)
     sections = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     origin = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
     origin["settings"] = {name: section.model_dump(mode="json") for name, section in sections.items()}

@@ -9,17 +9,6 @@ from padforge.design.common.page import PageSection, collapsible, columns, figur
 from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
 PAD = "morphology.json"
-TERMS = {
-    "information": "mutual information of position and signals, bits",
-    "idle_share": "share of presses that do not stretch a fibre, mean over fibres",
-    "sharpness": "mean second difference of the signals along a serpentine",
-    "published_entropy": "published: sum of the joint entropies of the signals of both families, bits",
-    "published_sharpness": "published: sharpness",
-    "published_disorder": "published: disorder",
-    "published_objective": "published: objective",
-    "published_joint_entropy": "joint entropy of the signals of all fibres, bits; 49 presses limit it to log2 49 ="
-    " 5.61, which straight fibres and all published pads reach",
-}
 Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
 """Name of a stage, its document, and the function that writes the sections on it."""
 
@@ -70,7 +59,8 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     if violations:
         rows = [_violation_row(violation) for violation in violations]
         body.append(table(["broken rule", "fibres", "position (mm)", "measured", "limit"], rows))
-    body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], _term_rows(terms))]))
+    rows = [[name, value, document["descriptions"].get(name, "")] for name, value in terms.items()]
+    body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], rows)]))
     key_figures = [
         (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
         (check, "design rules"),
@@ -92,16 +82,6 @@ def _violation_row(violation: Mapping[str, Any]) -> list[object]:
     fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
     position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
     return [violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]]
-
-
-def _term_rows(terms: Mapping[str, float]) -> list[list[object]]:
-    meanings = dict(TERMS)
-    for name in terms:
-        if "_mm_" in name:
-            meanings[name] = f"{name.split('_mm_')[0].replace('_', ' ')} with {name[-1]} failed fibres, mm"
-        elif name.startswith("penalty_"):
-            meanings[name] = f"penalty for breaking {name.removeprefix('penalty_')}, as in the search"
-    return [[name, value, meanings.get(name, "")] for name, value in terms.items()]
 
 
 def stage_sections(
@@ -184,3 +164,36 @@ def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
     return PageSection(
         "Provenance", [collapsible("Commands, seeds, versions and inputs of all stages", [table(header, rows)])]
     )
+
+
+def contact_line(document: Mapping[str, Any]) -> str:
+    """Summarise a `contacts.json`: errors with all fibres under the assumed contact, and their range under others."""
+    parts = []
+    for pad in ("designed", "straight"):
+        assumed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
+        parts.append(f"{assumed:.2f} mm under the assumed contact, {min(others):.2f} to {max(others):.2f} mm otherwise")
+    return f"contact: mean error of a small network {parts[0]}; of straight fibres {parts[1]}"
+
+
+def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+    """Return how the simulated errors in a `contacts.json` depend on the contact model.
+
+    Args:
+        folder: of the document.
+        document: as padforge writes it.
+
+    Raises:
+        KeyError, TypeError, ValueError: the document is not as padforge writes it.
+    """
+    rows, scatter = document["rows"], document["scatter"]
+    levels = range(max(len(row["errors_mm"]) for row in rows))
+    lead = (
+        "The contact is assumed until a printed pad is identified. Here the pad, and straight fibres of the same pad,"
+        " are simulated under other contacts as well: mean error in mm of a small network, trained afresh under each"
+        f" on one reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
+        f" {float(scatter['floor']):.1%} of full scale. Where rows differ, simulated errors depend on the contact as"
+        " much as on the pad; where straight fibres are better, optimising has not paid off."
+    )
+    head = ["contact", "fibres", *(f"{n_failed} failed" for n_failed in levels)]
+    body = [[row["contact"], row["pad"], *(f"{error:.2f}" for error in row["errors_mm"])] for row in rows]
+    return [PageSection("Contact model", [paragraph(lead), table(head, body)])]

@@ -22,8 +22,13 @@ def write_report(folder: Path) -> Path:
     """
     from padforge.design.common.files import recover, reraise_as_input_error, write_text
     from padforge.design.common.page import PageSection, page
-    from padforge.design.contact_comparison import contact_sections
-    from padforge.design.report import design_sections, provenance_row, provenance_section, stage_sections
+    from padforge.design.report import (
+        contact_sections,
+        design_sections,
+        provenance_row,
+        provenance_section,
+        stage_sections,
+    )
     from padforge.fabricate.report.sections import fabrication_sections
     from padforge.sense.report import sections as sense
     from padforge.sense.report.identification_results import identification_sections

@@ -260,8 +260,9 @@ def run_stages(
         The exit code: 0, 1 if a rule or a check of the mould fails, or 130 if the search was interrupted.
     """
     from padforge.design.contact_comparison import NAME as CONTACTS
-    from padforge.design.contact_comparison import compare_contacts, contact_line
+    from padforge.design.contact_comparison import compare_contacts
     from padforge.design.design_run import summary_lines
+    from padforge.design.report import contact_line
     from padforge.fabricate import FabricationSettings, build
     from padforge.fabricate.cli import mould_lines
     from padforge.sense.cli.calibration import run_calibration

@@ -9,9 +9,8 @@ import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.ambiguity_map import ambiguity_map
+from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguity_map, free_presses
 from padforge.design.objectives.rules import check_rules
-from padforge.design.objectives.score import AMBIGUITY_NOISE, free_presses
 from padforge.design.paths.curves import beziers
 from padforge.design.paths.fitting import add_spare_knots
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings

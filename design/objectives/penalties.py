@@ -1,11 +1,13 @@
-"""The rules of `[rules]` as differentiable penalties: 0 where a rule holds with a margin, and growing with the breach.
+"""The rules of `[rules]` as differentiable penalties, in the order of their exact checks in `rules`.
 
-Each has the unit of a share of its limit, averaged over the pad, so that they add. What counts is the exact check on
-the finished curves (`rules`); these are what leads there. A rule whose limit cannot be met or missed is not computed.
+A penalty is 0 where its rule holds with a margin, and grows with the breach. Each is relative to its limit and averaged
+over the pad, so that they add. The exact check on the finished curves decides; penalties lead the search there.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
@@ -15,108 +17,129 @@ from torch import Tensor
 
 from padforge.design.common.validation import InputError
 from padforge.design.kernels.geometry import sum_overlaps
+from padforge.design.paths.bends import FOLD
 from padforge.design.paths.curves import common_stretches
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 from padforge.design.torch_signals import pchip_sample, span_samples
 
 PER_SPAN = 12
-ORDER_PER_UNIT = 40
-BLUR = 0.1  # standard deviation of the mollified crossing count, grid units
-LEAST_CLEARANCE = 0.1  # from keep-outs, grid units, of which what comes nearer is a share
-FIBRES_AT_ONCE = 32  # that are sampled for their order
-COMMON = 0.2  # of what two tracks have in common: with all of it the search keeps fibres apart that may cross
-MOST_PAIRS = 10**8  # of samples that are compared at once: some GB
+"""Samples of a span between two knots."""
+ORDER_SAMPLES = 40
+"""Samples per grid unit at which the order of a family is compared."""
+BLUR = 0.1
+"""Standard deviation of the mollified crossing count, grid units."""
+MIN_CLEARANCE = 0.1
+"""From keep-outs, grid units, to which distances are relative where the rule asks for less."""
+MIN_ORDER_GAP = 0.01
+"""By which a fibre lies above its lower neighbour at least, grid units."""
+ORDER_BATCH = 32
+"""Fibres sampled at once for their order: what they take does not leave the processor's cache."""
+COMMON_WEIGHT = 0.2
+"""Of common tracks: at 1 the search keeps fibres apart that may cross."""
+MAX_COMPARISONS = 10**8
+"""Pairs of samples compared at once: some GB."""
 
 
 @dataclass(frozen=True)
-class SampledCurves:
-    """Fibres sampled densely: places (F, P, 2) along their travel and cross axes, slopes and arc lengths (F, P)."""
+class FibreSamples:
+    """Fibres sampled densely, with what their penalties depend on.
 
-    place: Tensor
+    Attributes:
+        along: coordinates of the knots along the fibres; shape (F, N + 2), grid units.
+        across: those at right angles to them.
+        points: samples along and across; shape (F, P, 2).
+        slope: shape (F, P).
+        arc: arc length from the start; shape (F, P).
+        pad: settings of the pad.
+        rules: the limits.
+        margin: factor on the limits, so that a curve with penalty 0 passes the exact check.
+    """
+
+    along: Tensor
+    across: Tensor
+    points: Tensor
     slope: Tensor
     arc: Tensor
+    pad: PadSettings
+    rules: RulesSettings
+    margin: float
 
     @property
-    def travelled(self) -> Tensor:
-        """How far fibres run along their travel axes, on average."""
-        return self.place[:, -1, 0].detach().mean()
+    def layout(self) -> Layout:
+        """Where the fibres end."""
+        return self.pad.layout
+
+    def scale(self, limit_mm: float) -> float:
+        """Return a lower limit with the margin, grid units."""
+        return self.margin * limit_mm / self.layout.unit_mm
 
     @property
-    def share(self) -> Tensor:
+    def mean_run(self) -> Tensor:
+        """Mean length of the fibres along their axes, without gradient."""
+        return self.points[:, -1, 0].detach().mean()
+
+    @cached_property
+    def shares(self) -> Tensor:
         """(F, P) arc length that belongs to each sample, without gradient."""
         return _shares(self.arc)
 
-    def take(self, fibres: list[int]) -> "SampledCurves":
-        """Those of some fibres."""
-        return SampledCurves(self.place[fibres], self.slope[fibres], self.arc[fibres])
-
-
-def _shares(arc: Tensor) -> Tensor:
-    """(F, P) how much of arc lengths (F, P) belongs to each, without gradient."""
-    step = arc.detach().diff(dim=1) / 2
-    return torch.nn.functional.pad(step, (1, 0)) + torch.nn.functional.pad(step, (0, 1))
+    @cached_property
+    def crossings(self) -> tuple[Tensor, Tensor]:
+        """`_crossing_density` of horizontals with verticals."""
+        pairs = list(product(*(range(rows.start, rows.stop) for rows in self.layout.families)))
+        check_comparisons(len(pairs), self.arc.shape[1])
+        horizontals, verticals = (self.points[list(side)] for side in zip(*pairs, strict=True))
+        return _crossing_density(horizontals, verticals.flip(-1))
 
 
 def penalties(
-    travel: Tensor, cross: Tensor, pad: PadSettings, rules: RulesSettings, margin: float = 1.0
+    along: Tensor, across: Tensor, pad: PadSettings, rules: RulesSettings, margin: float = 1.0
 ) -> dict[str, Tensor]:
-    """A penalty by name of each rule that may be broken, scalars with gradient by the knots.
+    """Compute the penalty of each rule that can be broken: scalars with gradient by the knots, by name.
 
     Args:
-        travel, cross: (F, N+2) coordinates of the knots, grid units.
-        margin: factor on the limits, so that a curve whose penalty is 0 also passes the exact check.
+        along: coordinates of the knots along their fibres; shape (F, N + 2), grid units.
+        across: those at right angles to them.
+        pad: settings of the pad.
+        rules: the limits.
+        margin: factor on the limits, so that a curve with penalty 0 passes the exact check.
 
     Raises:
-        InputError: so many fibres, of so many knots, that comparing their samples would not fit into memory.
+        InputError: so many fibres and knots that a comparison of their samples does not fit into memory.
     """
-    unit, layout = pad.layout.unit_mm, pad.layout
-    place, slope = span_samples(travel, cross, PER_SPAN)
-    step = torch.linalg.vector_norm(place.diff(dim=1), dim=-1)
-    fibres = SampledCurves(place, slope, torch.nn.functional.pad(step.cumsum(dim=1), (1, 0)))
-    radius, gap = margin * rules.min_bend_radius_mm / unit, margin * rules.min_gap_mm / unit
-    found = {}
-    if radius > 0:
-        around = rules.min_bend_radius_mm / 2 / (pad.bent_radius_mm or math.inf)
-        found["min_bend_radius_mm"] = _bend(fibres, radius, rules.min_bend_radius_mm / unit / 2, around)
-    if gap > 0 and max(layout.counts) > 1:
-        found["min_gap_mm"] = _gap(fibres, gap, layout)
-    if gap > radius:  # else fibres that bend by the rule keep their folds apart
-        found["folds"] = _folds(fibres, gap)
-    if max(layout.counts) > 1:
-        if rules.same_family_crossings == 0:
-            found["same_family_crossings"] = _disorder(travel, cross, max(gap, 0.01), layout)
-        else:
-            found["same_family_crossings"] = _too_many(
-                _family_crossings(fibres, layout), rules.same_family_crossings / margin
-            )
-    if min(layout.counts) and (rules.max_crossings is not None or rules.min_crossing_angle_deg > 0):
-        limit = math.radians(margin * rules.min_crossing_angle_deg)
-        count, flat = _crossings(fibres, limit, layout)
-        if rules.max_crossings is not None:
-            # every horizontal crosses every vertical: no margin may ask for fewer than that
-            found["max_crossings"] = _too_many(count, max(rules.max_crossings / margin, math.prod(layout.counts)))
-        if limit > 0:
-            found["min_crossing_angle_deg"] = flat / (layout.fibres / 2)
-    if min(layout.counts) and rules.max_common_track_mm is not None:
-        found["max_common_track_mm"] = _common_tracks(
-            fibres, TRACK_WIDTH_MM / unit, rules.max_common_track_mm / margin / unit, layout
+    points, slope = span_samples(along, across, PER_SPAN)
+    step = torch.linalg.vector_norm(points.diff(dim=1), dim=-1)
+    arc = torch.nn.functional.pad(step.cumsum(dim=1), (1, 0))
+    fibres = FibreSamples(along, across, points, slope, arc, pad, rules, margin)
+    values = {name: penalty(fibres) for name, penalty in PENALTIES.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def check_comparisons(fibres: int, samples: int) -> None:
+    """Check that all samples of some fibres, or pairs of fibres, can be compared in memory.
+
+    Raises:
+        InputError: they cannot.
+    """
+    if fibres * samples**2 > MAX_COMPARISONS:
+        raise InputError(
+            f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are "
+            f"{MAX_COMPARISONS}; take fewer, or no limit on crossings"
         )
-    if rules.border_mm > 0:
-        found["border_mm"] = _hugging(fibres, rules.border_mm / unit)
-    if pad.keep_out_mm:
-        found["keep_out_mm"] = _intruding(fibres, pad, margin * rules.keep_out_mm / unit)
-    found["max_length_mm"] = torch.relu(fibres.arc[:, -1] * unit * margin / rules.max_length_mm - 1).mean()
-    return found
 
 
-def _bend(fibres: SampledCurves, radius: float, window: float, around: float) -> Tensor:
-    """How much more than window / radius a fibre turns within `window` of arc, as a share of that angle.
+def _bends(fibres: FibreSamples) -> Tensor | None:
+    """Penalise turns of more than window / radius within a window of arc length, relative to that angle.
 
-    It goes on straight from both ends, by its leads, which it may meet at a corner.
-    Where the pad is worn bent it turns by `around` more at right angles to that, as a fibre does that runs along x;
-    leads are outside of the pad.
+    Fibres go on straight from both ends, by their leads, which they may meet at a corner. Where the pad is worn bent,
+    they turn by `rolled` more at right angles to that, as a fibre along x does; leads are outside the pad.
     """
+    radius_mm = fibres.rules.min_bend_radius_mm
+    if radius_mm == 0:
+        return None
+    radius, window = fibres.scale(radius_mm), radius_mm / fibres.layout.unit_mm / 2
+    rolled = radius_mm / 2 / (fibres.pad.bent_radius_mm or math.inf)
     start, end = torch.zeros_like(fibres.arc[:, :1]), fibres.arc[:, -1:]
     arc = torch.cat([start - window, start, fibres.arc, end, end + window], dim=1)
     headings = torch.nn.functional.pad(torch.atan(fibres.slope), (2, 2))
@@ -125,159 +148,215 @@ def _bend(fibres: SampledCurves, radius: float, window: float, around: float) ->
     after = torch.searchsorted(arc.detach(), until.detach()).clamp(1, until.shape[1] - 1)
     a0, a1, t0, t1 = (x.gather(1, i) for x in (arc, turned) for i in (after - 1, after))
     angle = t0 + ((until - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
-    if around > 0:
-        angle = torch.sqrt(angle**2 + torch.nn.functional.pad(torch.full_like(fibres.arc, around), (2, 2)) ** 2)
-    over = torch.relu(angle * radius / window - 1)
-    return (over * _shares(arc)).sum(dim=1).mean() / fibres.travelled
+    if rolled > 0:
+        angle = torch.sqrt(angle**2 + torch.nn.functional.pad(torch.full_like(fibres.arc, rolled), (2, 2)) ** 2)
+    excess = torch.relu(angle * radius / window - 1)
+    return (excess * _shares(arc)).sum(dim=1).mean() / fibres.mean_run
 
 
-def _gap(fibres: SampledCurves, gap: float, layout: Layout) -> Tensor:
-    """How much nearer than `gap` neighbours in a family come, as a share of it."""
-    _require_room(layout.fibres, fibres.arc.shape[1])
-    below = [f for rows in layout.families for f in range(rows.start, rows.stop - 1)]
-    lower, upper = fibres.take(below), fibres.take([f + 1 for f in below])
-    distances = torch.cdist(lower.place.detach().float(), upper.place.detach().float())
-    near = [_near(lower.place, upper, distances, gap), _near(upper.place, lower, distances.mT, gap)]
-    return _closeness(torch.cat(near), gap) / fibres.arc.numel()
+def _gaps(fibres: FibreSamples) -> Tensor | None:
+    """Penalise neighbours in a family that come nearer than the gap, relative to it."""
+    layout, gap = fibres.layout, fibres.scale(fibres.rules.min_gap_mm)
+    if gap == 0 or max(layout.counts) < 2:
+        return None
+    check_comparisons(layout.fibres, fibres.arc.shape[1])
+    lower = torch.tensor([f for rows in layout.families for f in range(rows.start, rows.stop - 1)])
+    below, above = fibres.points[lower], fibres.points[lower + 1]
+    distances = torch.cdist(below.detach().float(), above.detach().float())
+    near = [
+        _near_distances(fibres, below, lower + 1, distances, gap),
+        _near_distances(fibres, above, lower, distances.mT, gap),
+    ]
+    return _sum_closeness(torch.cat(near), gap) / fibres.arc.numel()
 
 
-def _folds(fibres: SampledCurves, gap: float) -> Tensor:
-    """How much nearer than `gap` a fibre comes to a part of itself that is pi / 2 gaps or more away along it."""
-    _require_room(*fibres.arc.shape)
-    arc = fibres.arc.detach().float()
-    place = fibres.place.detach().float()
-    alongside = (arc[:, :, None] - arc[:, None, :]).abs() < math.pi / 2 * gap
-    distances = torch.cdist(place, place).masked_fill(alongside, math.inf)
-    return _closeness(_near(fibres.place, fibres, distances, gap), gap) / fibres.arc.numel()
+def _folds(fibres: FibreSamples) -> Tensor | None:
+    """Penalise a fibre that comes nearer than the gap to a part of itself FOLD gaps or more away along it."""
+    gap = fibres.scale(fibres.rules.min_gap_mm)
+    if gap <= fibres.scale(fibres.rules.min_bend_radius_mm):  # fibres that keep the bend radius keep their folds apart
+        return None
+    check_comparisons(*fibres.arc.shape)
+    arc, points = fibres.arc.detach().float(), fibres.points.detach().float()
+    is_alongside = (arc[:, :, None] - arc[:, None, :]).abs() < FOLD * gap
+    distances = torch.cdist(points, points).masked_fill(is_alongside, math.inf)
+    near = _near_distances(fibres, fibres.points, torch.arange(len(arc)), distances, gap)
+    return _sum_closeness(near, gap) / fibres.arc.numel()
 
 
-def _near(place: Tensor, other: SampledCurves, distances: Tensor, gap: float) -> Tensor:
-    """Distances (K,) to `other` of those places (B, P, 2) that may be nearer than `gap`, given all (B, P, P).
+def _near_distances(fibres: FibreSamples, points: Tensor, others: Tensor, distances: Tensor, gap: float) -> Tensor:
+    """Return (K,) distances, with gradient, from those points that may lie nearer than `gap` to another fibre.
 
-    They are measured to the piece of tangent the nearest sample stands for, which reaches up to half a step beyond it.
+    They are measured to the piece of tangent that the nearest sample stands for, half a step to both sides.
+
+    Args:
+        fibres: all of them.
+        points: shape (B, P, 2).
+        others: index of the other fibre of each row; shape (B,).
+        distances: between samples, single precision; shape (B, P, P).
+        gap: grid units.
     """
-    reach = other.share.max().item()
-    least, at = distances.min(dim=2)
-    fibre, sample = (least < gap + reach).nonzero(as_tuple=True)
-    nearest = at[fibre, sample]
-    slope = other.slope.detach()[fibre, nearest]
+    least, index = distances.min(dim=2)
+    row, sample = (least < gap + fibres.shares[others].max().item()).nonzero(as_tuple=True)
+    nearest = others[row], index[row, sample]
+    slope = fibres.slope.detach()[nearest]
     tangent = torch.nn.functional.normalize(torch.stack([torch.ones_like(slope), slope], dim=-1), dim=-1)
-    away = place[fibre, sample] - other.place[fibre, nearest]
-    along = (away.detach() * tangent).sum(dim=-1, keepdim=True)
-    bound = other.share[fibre, nearest][:, None]
-    return torch.linalg.vector_norm(away - along.clamp(-bound, bound) * tangent + 1e-12, dim=-1)
+    offset = points[row, sample] - fibres.points[nearest]
+    along = (offset.detach() * tangent).sum(dim=-1, keepdim=True)
+    bound = fibres.shares[nearest][:, None]
+    return torch.linalg.vector_norm(offset - along.clamp(-bound, bound) * tangent + 1e-12, dim=-1)
 
 
-def _common_tracks(fibres: SampledCurves, width: float, length: float, layout: Layout) -> Tensor:
-    """How much nearer than `width` to fibres of the other family those are that lie longer than `length` beside them.
+def _family_crossings(fibres: FibreSamples) -> Tensor | None:
+    """Penalise fibres of a family in the wrong order, or, where some may cross, too many crossings."""
+    layout, limit = fibres.layout, fibres.rules.same_family_crossings
+    if max(layout.counts) < 2:
+        return None
+    if limit == 0:
+        return _disorder(fibres, max(fibres.scale(fibres.rules.min_gap_mm), MIN_ORDER_GAP))
+    pairs = [pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2)]
+    check_comparisons(len(pairs), fibres.arc.shape[1])
+    first, second = (fibres.points[list(side)] for side in zip(*pairs, strict=True))
+    return _excess(_crossing_density(first, second)[0].sum(), limit / fibres.margin)
 
-    Looked at are two places of every such stretch, `length` / 2 before and behind its middle. They are few: autograd
-    would take longer to follow them than a kernel takes for their gradient.
+
+def _disorder(fibres: FibreSamples, gap: float) -> Tensor:
+    """Penalise fibres that lie less than `gap` above their lower neighbour in the family, relative to it."""
+    layout = fibres.layout
+    points = math.ceil(ORDER_SAMPLES * max(layout.extent)) + 1
+    stations = torch.cat(
+        [
+            torch.linspace(0, extent, points, dtype=torch.float64).expand(count, -1)
+            for extent, count in zip(layout.extent, layout.counts, strict=True)
+        ]
+    )
+    parts = zip(*(x.split(ORDER_BATCH) for x in (fibres.along, fibres.across, stations)), strict=True)
+    above = torch.cat([pchip_sample(*part)[0] for part in parts]).diff(dim=0)
+    within = [row for rows in layout.families for row in range(rows.start, rows.stop - 1)]
+    return _sum_closeness(above[within], gap) / (len(within) * points)
+
+
+def _max_crossings(fibres: FibreSamples) -> Tensor | None:
+    """Penalise too many crossings of horizontals with verticals."""
+    limit, counts = fibres.rules.max_crossings, fibres.layout.counts
+    if limit is None or not min(counts):
+        return None
+    # every horizontal crosses every vertical: no margin may ask for fewer than that
+    return _excess(fibres.crossings[0].sum(), max(limit / fibres.margin, math.prod(counts)))
+
+
+def _crossing_angles(fibres: FibreSamples) -> Tensor | None:
+    """Penalise crossings flatter than the limit, relative to it."""
+    limit = math.radians(fibres.margin * fibres.rules.min_crossing_angle_deg)
+    if limit == 0 or not min(fibres.layout.counts):
+        return None
+    density, sine = fibres.crossings
+    flatness = torch.relu(1 - torch.asin(sine.clamp(max=1 - 1e-9)) / limit)
+    return (density * flatness).sum() / (fibres.layout.fibres / 2)
+
+
+def _common_tracks(fibres: FibreSamples) -> Tensor | None:
+    """Penalise stretches longer than the limit in which fibres of both families lie nearer than a track's width.
+
+    Two points of every such stretch count, limit / 2 before and behind its middle. They are few: autograd takes longer
+    to follow them than a kernel takes for their gradient.
     """
-    place, slope, arc = (x.detach().numpy() for x in (fibres.place, fibres.slope, fibres.arc))
-    lines = np.concatenate([place[: layout.horizontals], place[layout.horizontals :, :, ::-1]])
-    total, gradient = 0.0, np.zeros_like(place)
+    layout, rules = fibres.layout, fibres.rules
+    if rules.max_common_track_mm is None or not min(layout.counts):
+        return None
+    width, limit = TRACK_WIDTH_MM / layout.unit_mm, rules.max_common_track_mm / fibres.margin / layout.unit_mm
+    points, slope, arc = (x.detach().numpy() for x in (fibres.points, fibres.slope, fibres.arc))
+    lines = np.concatenate([points[: layout.horizontals], points[layout.horizontals :, :, ::-1]])
+    total, gradient = 0.0, np.zeros_like(points)
     for one, other in (layout.families, layout.families[::-1]):
-        shared = common_stretches([*lines[one]], [*lines[other]], width)
-        long = shared.length > length
-        middle = (shared.begin[long] + shared.end[long]) / 2
-        pairs = one.start + shared.line[long], other.start + shared.other[long]
-        total += sum_overlaps(place, slope, arc, *pairs, middle, length / 2, width, gradient)
-    weight = COMMON * length / 4 / len(arc) / fibres.travelled.item()  # the mean of two places, along either fibre
-    value = weight * (total - (gradient * place).sum())
-    return (torch.from_numpy(weight * gradient) * fibres.place).sum() + value
+        stretches = common_stretches([*lines[one]], [*lines[other]], width)
+        long = stretches.length > limit
+        middle = (stretches.begin[long] + stretches.end[long]) / 2
+        pairs = one.start + stretches.line[long], other.start + stretches.other[long]
+        total += sum_overlaps(points, slope, arc, *pairs, middle, limit / 2, width, gradient)
+    weight = COMMON_WEIGHT * limit / 4 / len(arc) / fibres.mean_run.item()  # the mean of two points, along either fibre
+    value = weight * (total - (gradient * points).sum())
+    return (torch.from_numpy(weight * gradient) * fibres.points).sum() + value
 
 
-def _closeness(near: Tensor, gap: float) -> Tensor:
-    close = torch.relu(1 - near / gap)
+def _borders(fibres: FibreSamples) -> Tensor | None:
+    """Penalise slopes of more than 45 degrees in the zone by the wall that fibres come from."""
+    zone = fibres.rules.border_mm / fibres.layout.unit_mm
+    if zone == 0:
+        return None
+    along = fibres.points[..., 0].detach()
+    in_zone = (along < zone) | (along > along[:, -1:] - zone)
+    return (torch.relu(fibres.slope.abs() - 1) * in_zone * fibres.shares).sum(dim=1).mean() / fibres.mean_run
+
+
+def _keep_outs(fibres: FibreSamples) -> Tensor | None:
+    """Penalise fibres nearer than the clearance to a keep-out, or inside, relative to it."""
+    if not fibres.pad.keep_out_mm:
+        return None
+    clearance, split = max(fibres.scale(fibres.rules.keep_out_mm), MIN_CLEARANCE), fibres.layout.horizontals
+    plan = torch.cat([fibres.points[:split], fibres.points[split:].flip(-1)]).flatten(0, 1)
+    positions, total = plan.detach().numpy(), fibres.points.new_zeros(())
+    for polygon in keep_outs(fibres.pad):
+        x0, y0, x1, y1 = polygon.bounds
+        is_beside = (positions < (x0 - clearance, y0 - clearance)) | (positions > (x1 + clearance, y1 + clearance))
+        near = np.flatnonzero(~is_beside.any(axis=1))
+        points = np.asarray(shapely.points(positions[near]))
+        is_close = shapely.distance(polygon, points) < clearance
+        near, points = near[is_close], points[is_close]
+        if not len(near):
+            continue
+        edge = polygon.exterior
+        nearest = shapely.line_interpolate_point(edge, shapely.line_locate_point(edge, points))
+        offset = plan[torch.from_numpy(near)] - torch.tensor(shapely.get_coordinates(nearest))
+        outward = 1 - 2 * torch.from_numpy(shapely.contains(polygon, points).astype(float))
+        signed = outward * torch.linalg.vector_norm(offset + 1e-12, dim=-1)
+        total = total + torch.relu(1 - signed / clearance).sum()
+    return total / fibres.arc.numel()
+
+
+def _lengths(fibres: FibreSamples) -> Tensor:
+    """Penalise fibres longer than the limit, relative to it."""
+    limit_mm = fibres.rules.max_length_mm
+    return torch.relu(fibres.arc[:, -1] * fibres.layout.unit_mm * fibres.margin / limit_mm - 1).mean()
+
+
+PENALTIES: dict[str, Callable[[FibreSamples], Tensor | None]] = {
+    "min_bend_radius_mm": _bends,
+    "min_gap_mm": _gaps,
+    "folds": _folds,
+    "same_family_crossings": _family_crossings,
+    "max_crossings": _max_crossings,
+    "min_crossing_angle_deg": _crossing_angles,
+    "max_common_track_mm": _common_tracks,
+    "border_mm": _borders,
+    "keep_out_mm": _keep_outs,
+    "max_length_mm": _lengths,
+}
+"""By the key of `[rules]`; None where the limit cannot be met or missed."""
+
+
+def _shares(arc: Tensor) -> Tensor:
+    """Return how much of the arc lengths (F, P) belongs to each sample, without gradient."""
+    step = arc.detach().diff(dim=1) / 2
+    return torch.nn.functional.pad(step, (1, 0)) + torch.nn.functional.pad(step, (0, 1))
+
+
+def _sum_closeness(distances: Tensor, gap: float) -> Tensor:
+    close = torch.relu(1 - distances / gap)
     return (close + 10 * close**2).sum()
 
 
-def _disorder(travel: Tensor, cross: Tensor, least: float, layout: Layout) -> Tensor:
-    """How much less than `least` a fibre lies above its lower neighbour in the family, as a share of it."""
-    points = math.ceil(ORDER_PER_UNIT * max(layout.extent)) + 1
-    along = [
-        torch.linspace(0, extent, points, dtype=torch.float64).expand(count, -1)
-        for extent, count in zip(layout.extent, layout.counts, strict=True)
-    ]
-    at = torch.cat(along)
-    # a few fibres at a time: what a large pad's take does not leave the processor's cache then
-    parts = zip(travel.split(FIBRES_AT_ONCE), cross.split(FIBRES_AT_ONCE), at.split(FIBRES_AT_ONCE), strict=True)
-    above = torch.cat([pchip_sample(*part)[0] for part in parts]).diff(dim=0)
-    within = [row for rows in layout.families for row in range(rows.start, rows.stop - 1)]
-    return _closeness(above[within], least) / (len(within) * points)
-
-
-def _too_many(count: Tensor, limit: float) -> Tensor:
+def _excess(count: Tensor, limit: float) -> Tensor:
     return torch.relu(count - limit) / max(1.0, limit)
 
 
-def _family_crossings(fibres: SampledCurves, layout: Layout) -> Tensor:
-    """Soft number of crossings within the families."""
-    pairs = [pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2)]
-    _require_room(len(pairs), fibres.arc.shape[1])
-    first, second = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
-    return _mollified(first, second, 0.0)[0]
+def _crossing_density(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the density of crossings of polylines p and q (B, P, 2) pair by pair, and the sines of their angles.
 
-
-def _crossings(fibres: SampledCurves, limit: float, layout: Layout) -> tuple[Tensor, Tensor]:
-    """Soft number of horizontal x vertical crossings, and of those flatter than `limit` radians, by how much."""
-    pairs = list(product(*(range(rows.start, rows.stop) for rows in layout.families)))
-    _require_room(len(pairs), fibres.arc.shape[1])
-    horizontal, vertical = (fibres.place[list(side)] for side in zip(*pairs, strict=True))
-    return _mollified(horizontal, vertical.flip(-1), limit)
-
-
-def _mollified(p: Tensor, q: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Number of crossings of polylines p and q (B, P, 2) pair by pair, with a gradient.
-
-    By Kac and Rice it is the sum of |dp x dq| delta(p - q), with a narrow Gaussian for delta. Also the same sum
-    weighted by how far the angle falls short of `limit`, as a share of it.
+    By the Kac-Rice formula the number of crossings is the sum of |dp x dq| delta(p - q), here with a narrow Gaussian
+    for delta, so that it has a gradient.
     """
     dp, dq = p.diff(dim=1)[:, :, None], q.diff(dim=1)[:, None]
-    apart = (p[:, 1:] + p[:, :-1])[:, :, None] / 2 - (q[:, 1:] + q[:, :-1])[:, None] / 2
+    offset = (p[:, 1:] + p[:, :-1])[:, :, None] / 2 - (q[:, 1:] + q[:, :-1])[:, None] / 2
     area = (dp[..., 0] * dq[..., 1] - dp[..., 1] * dq[..., 0]).abs()
-    here = area * torch.exp((apart**2).sum(dim=-1) / (-2 * BLUR**2)) / (2 * math.pi * BLUR**2)
-    if limit == 0:
-        return here.sum(), here.new_zeros(())
-    sine = area / (torch.linalg.vector_norm(dp, dim=-1) * torch.linalg.vector_norm(dq, dim=-1) + 1e-12)
-    return here.sum(), (here * torch.relu(1 - torch.asin(sine.clamp(max=1 - 1e-9)) / limit)).sum()
-
-
-def _require_room(fibres: int, samples: int) -> None:
-    """Refuse to compare all `samples` of so many fibres, or pairs of them, where that takes too much memory."""
-    if fibres * samples**2 > MOST_PAIRS:
-        raise InputError(
-            f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are {MOST_PAIRS}; "
-            "take fewer, or no limit on crossings"
-        )
-
-
-def _hugging(fibres: SampledCurves, zone: float) -> Tensor:
-    """How steeper than 45 degrees fibres run in the `zone` by the wall they come from."""
-    travel = fibres.place[..., 0].detach()
-    edge = (travel < zone) | (travel > travel[:, -1:] - zone)
-    return (torch.relu(fibres.slope.abs() - 1) * edge * fibres.share).sum(dim=1).mean() / fibres.travelled
-
-
-def _intruding(fibres: SampledCurves, pad: PadSettings, clearance: float) -> Tensor:
-    """How much nearer than `clearance` to a keep-out fibres come, or how deep inside, as a share of it."""
-    layout = pad.layout
-    place = torch.cat([fibres.place[: layout.horizontals], fibres.place[layout.horizontals :].flip(-1)]).flatten(0, 1)
-    known = place.detach().numpy()
-    within, total = max(clearance, LEAST_CLEARANCE), fibres.place.new_zeros(())
-    for polygon in keep_outs(pad):
-        edge, (left, low, right, high) = polygon.exterior, polygon.bounds
-        beside = (known < (left - within, low - within)) | (known > (right + within, high + within))
-        near = np.flatnonzero(~beside.any(axis=1))
-        points = np.asarray(shapely.points(known[near]))
-        close = shapely.distance(polygon, points) < within
-        near, points = near[close], points[close]
-        if not len(near):
-            continue
-        nearest = shapely.line_interpolate_point(edge, shapely.line_locate_point(edge, points))
-        away = place[torch.from_numpy(near)] - torch.tensor(shapely.get_coordinates(nearest))
-        outward = 1 - 2 * torch.from_numpy(shapely.contains(polygon, points).astype(float))
-        signed = outward * torch.linalg.vector_norm(away + 1e-12, dim=-1)
-        total = total + torch.relu(1 - signed / within).sum()
-    return total / fibres.arc.numel()
+    density = area * torch.exp((offset**2).sum(dim=-1) / (-2 * BLUR**2)) / (2 * math.pi * BLUR**2)
+    return density, area / (torch.linalg.vector_norm(dp, dim=-1) * torch.linalg.vector_norm(dq, dim=-1) + 1e-12)

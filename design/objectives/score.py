@@ -1,17 +1,30 @@
-"""Every term of a pad by name: what the searches minimise, and what the literature reports."""
+"""Scores of a pad: the table of terms that `score`, the searches, design.json and the report have in common.
 
-from collections.abc import Sequence
-from dataclasses import asdict
+To add a term, write a function of a `ScoredPad` and add a row to TERMS; `score`, design.json and the report then have
+it. For a search to minimise it as well, name in the row the key of `[search]` that holds its weight (added to
+`SearchSettings`, 0 by default) and its differentiable form `loss`, a function of the signals.
 
+To add a rule, see `padforge.design.objectives.rules`.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_type
-from padforge.design.contact import grid_positions, relative_stretch, serpentine_presses, signals, signals_quantized
+from padforge.design.common.validation import check_type
+from padforge.design.contact import fibre_axes, serpentine_presses, signals, signals_quantized
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import failure_masks, loss_shares
+from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.expected_error import SEARCH_SIDE, expected_errors
+from padforge.design.objectives.fibre_loss import failure_shares
+from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
 from padforge.design.objectives.published import (
+    PublishedTerms,
     idle_share,
     information,
     joint_entropy,
@@ -19,91 +32,171 @@ from padforge.design.objectives.published import (
     published_terms,
     quantize,
 )
-from padforge.design.paths.keep_outs import is_outside
-from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
 
 
-def ambiguity(signals: Tensor, presses: Tensor, kept: Tensor, weight: Tensor, noise: float) -> Tensor:
-    """A of the module's formula, a scalar with gradient by the signals.
+@dataclass(frozen=True)
+class ScoredPad:
+    """A pad and what its terms depend on.
 
-    Args:
-        signals: (F, Q). presses: (Q, 2), grid units.
-        kept: (L, F), 1 for a fibre that works, 0 for a lost one. weight: (L,) share of each loss, sum 1.
-        noise: sigma of a signal, grid units, > 0.
+    Attributes:
+        pad: the fibres.
+        contact: what a press does to them.
+        search: says how many fibres may fail, and how responses scatter.
+        rules: limits of the penalties.
+        size: says what is pressed.
+        noise: of a signal in the ambiguity, share of full scale.
     """
-    scaled = kept.double()[:, None, :] * (signals.T.double() / (2 * noise))
-    # |s_a|^2 is the same for every b and falls out of the posterior; what is left is one product of matrices, in
-    # double precision since it cancels
-    likelihood = torch.baddbmm(-(scaled**2).sum(dim=-1)[:, None, :], scaled, scaled.mT, alpha=2)
-    posterior = torch.softmax(likelihood.to(presses.dtype), dim=-1)
-    spread = torch.einsum("lab,ab->l", posterior, torch.cdist(presses, presses)) / len(presses)
-    return spread @ weight
+
+    pad: Morphology
+    contact: Contact
+    search: SearchSettings
+    rules: RulesSettings
+    size: PadSettings
+    noise: float = AMBIGUITY_NOISE
+
+    def terms(self, names: Collection[str] = ()) -> dict[str, float]:
+        """Compute terms by name.
+
+        Args:
+            names: of rows of TERMS; all if empty.
+        """
+        values: dict[str, float] = {}
+        for term in TERMS:
+            if names and term.name not in names:
+                continue
+            value = term.compute(self)
+            if isinstance(value, Mapping):
+                values |= {f"{term.name}_{key}": part for key, part in value.items()}
+            else:
+                values[term.name] = value
+        return values
+
+    @property
+    def objective(self) -> float:
+        """What a search minimises: the geometric mean of the expected errors over failures, and the weighted terms."""
+        shares = failure_shares(self.search.max_failures)[: len(self.expected_errors)]
+        total = float(np.exp(np.log(self.expected_errors) @ shares / sum(shares)))
+        for weight, term in weighted_terms(self.search):
+            total += weight * self.terms([term.name])[term.name]
+        return total
+
+    @cached_property
+    def expected_errors(self) -> list[float]:
+        """Expected errors with 0, 1, ... fibres failed, grid units."""
+        return expected_errors(self.pad, self.contact, self.search, self.size)
+
+    @cached_property
+    def serpentine_signals(self) -> Array:
+        """(Q, F) signals of presses in an order of neighbours."""
+        return signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
+
+    @property
+    def published_contact(self) -> Contact:
+        """The contact of the published terms, which have no sensitivity profile."""
+        return PUBLISHED_CONTACT if self.contact.sensitivity_profile else self.contact
+
+    @cached_property
+    def published(self) -> PublishedTerms:
+        """The published objective and its parts."""
+        return published_terms(self.pad, self.published_contact)[0]
 
 
-def full_scale(signals: Tensor) -> float:
-    """Mean over the fibres that are touched at all of the largest of their signals (F, Q); 1 if none is."""
-    largest = signals.detach().amax(dim=1)
-    touched = largest[largest > 0]
-    return touched.mean().item() if len(touched) else 1.0
+ComputeSignals = Callable[[Array], Tensor]
+"""Signals (F, Q) of presses (Q, 2), with gradient by the knots."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A row of the table of terms.
+
+    Attributes:
+        name: of the value, or the beginning of the names of several.
+        description: for people; `{}` stands for the end of the name.
+        compute: its value, or several by the end of their name.
+        weight: key of `[search]` by which a search weighs it; None if it does not.
+        loss: its differentiable form.
+    """
+
+    name: str
+    description: str
+    compute: Callable[[ScoredPad], float | Mapping[object, float]]
+    weight: str | None = None
+    loss: Callable[[ComputeSignals, PadSettings], Tensor] | None = None
 
 
 def sharpness(signals: Tensor) -> Tensor:
-    """Mean |second difference| of signals (F, Q) along presses in an order of neighbours, grid units.
+    """Return the mean |second difference| of signals (F, Q) along presses in an order of neighbours, grid units.
 
-    The published term Z without the converter, which has no gradient.
+    The published term Z without the quantisation, which has no gradient.
     """
     return signals.diff(n=2, dim=1).abs().mean()
 
 
-SIDE, MOST_LOSSES = 20, 64
-AMBIGUITY_NOISE = 0.05
-"""Of a signal, share of full scale, under which pads are compared: under less, no good pad confuses anything."""
-MOST_PAIRS = 2**29
-"""Most pairs of points of one fibre, over all fibres, that are looked at for folds: 2 GiB of distances."""
+def _sharpness_loss(compute_signals: ComputeSignals, size: PadSettings) -> Tensor:
+    return sharpness(compute_signals(serpentine_presses(size.sensed, SEARCH_SIDE)))
 
 
-def ambiguities(
-    pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
-) -> list[float]:
-    """Localisation ambiguity (formula of `ambiguity`) with 0, 1, ... fibres lost, grid units, on a grid of presses.
-
-    Args:
-        max_failures: how many fibres may fail at most, or weights of 0, 1, ... failed.
-        noise: of a signal, share of full scale.
-        size: says what is pressed.
-    """
-    import torch
-
-    presses = free_presses(size)
-    found = torch.tensor(relative_stretch(pad, presses, contact).T, dtype=torch.float32)
-    touched = found.any(dim=1)  # no other fibre tells presses apart: on a large pad most are between the presses
-    found = found[touched]
-    places = torch.tensor(presses, dtype=torch.float32)
-    fibres = len(pad.knots)
-    spread = []
-    for k in range(min(len(loss_shares(max_failures)), fibres)):
-        kept = torch.tensor(failure_masks(fibres, k, MOST_LOSSES), dtype=torch.float32)[:, touched]
-        equal = torch.full((len(kept),), 1 / len(kept))
-        spread.append(ambiguity(found, places, kept, equal, noise * full_scale(found)).item())
-    return spread
+def _expected_errors_mm(scored: ScoredPad) -> dict[object, float]:
+    return {n_failed: scored.pad.unit_mm * error for n_failed, error in enumerate(scored.expected_errors)}
 
 
-def free_presses(size: PadSettings) -> Array:
-    """(Q, 2) up to SIDE x SIDE places over what is pressed, grid units, that lie in no keep-out.
-
-    Raises:
-        InputError: there is none.
-    """
-    presses = grid_positions(size.sensed, SIDE)
-    presses = presses[is_outside(presses, size)]
-    if not len(presses):
-        raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
-    return presses
+def _ambiguities_mm(scored: ScoredPad) -> dict[object, float]:
+    values = ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.size)
+    return {n_failed: scored.pad.unit_mm * value for n_failed, value in enumerate(values)}
 
 
-def ambiguity_terms(values: Sequence[float], unit_mm: float) -> dict[str, float]:
-    """Return `ambiguities`, in grid units of `unit_mm`, by name in mm, as `score` has them."""
-    return {f"ambiguity_mm_{n_failed}": unit_mm * value for n_failed, value in enumerate(values)}
+def _penalties(scored: ScoredPad) -> dict[object, float]:
+    along, across = (torch.tensor(axis[0]) for axis in fibre_axes(scored.pad)[:2])
+    return {rule: value.item() for rule, value in penalties(along, across, scored.size, scored.rules).items()}
+
+
+def _joint_entropy(scored: ScoredPad) -> float:
+    pad = scored.pad
+    return joint_entropy(quantize(signals_quantized(pad, published_presses(pad.layout), scored.published_contact)))
+
+
+TERMS = (
+    Term("expected_error_mm", "expected error with {} fibres failed, mm", _expected_errors_mm),
+    Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", _ambiguities_mm),
+    Term("information", "mutual information of positions and signals, bits", lambda s: information(s.pad, s.contact)),
+    Term("idle_share", "share of presses in which a fibre is idle", lambda s: idle_share(s.serpentine_signals)),
+    Term(
+        "sharpness",
+        "mean second difference of the signals along a serpentine, grid units",
+        lambda s: sharpness(torch.tensor(s.serpentine_signals.T)).item(),
+        weight="sharpness",
+        loss=_sharpness_loss,
+    ),
+    Term("penalty", "penalty of {} in the gradient search", _penalties),
+    Term(
+        "published_entropy", "joint entropy of the signals of each family, summed, bits", lambda s: s.published.entropy
+    ),
+    Term("published_sharpness", "sharpness Z as published", lambda s: s.published.sharpness),
+    Term("published_disorder", "disorder C as published", lambda s: s.published.disorder),
+    Term("published_objective", "objective as published", lambda s: s.published.objective),
+    Term(
+        "published_joint_entropy",
+        "joint entropy of the signals of all fibres, bits; its 49 presses limit it to log2 49 = 5.61, which straight "
+        "fibres and all published pads reach",
+        _joint_entropy,
+    ),
+)
+
+
+def weighted_terms(search: SearchSettings) -> Iterator[tuple[float, Term]]:
+    """Yield the terms that a search minimises beside the expected error, with their weights above 0."""
+    for term in TERMS:
+        if term.weight is not None and (weight := getattr(search, term.weight)) > 0:
+            yield weight, term
+
+
+def describe_terms(names: Iterable[str]) -> dict[str, str]:
+    """Return the descriptions of values by their names, as `ScoredPad.terms` has them."""
+    rows = {term.name: term.description for term in TERMS}
+    # the longest row name that a value's name begins with is its own
+    owners = {name: max((row for row in rows if name.startswith(row)), key=len, default="") for name in names}
+    return {name: rows[row].format(name[len(row) + 1 :]) for name, row in owners.items() if row}
 
 
 def score(
@@ -113,64 +206,34 @@ def score(
     noise: float = AMBIGUITY_NOISE,
     rules: RulesSettings | None = None,
     size: PadSettings | None = None,
+    scatter: Scatter | None = None,
 ) -> dict[str, float]:
-    """Every term of a pad, by name.
+    """Compute every term of a pad, by name; TERMS describes them.
 
-    `ambiguity_mm_k` is the expected localisation error in mm over failures of k fibres under the given noise
-    (formula of `ambiguity`); `sharpness` the signals' mean second difference along a serpentine; `penalty_RULE` how
-    far a rule is broken, as the gradient search has it (`penalties`); `information` that of the pad in bits
-    (`information`), `idle_share` the share of presses in which a fibre is idle; the rest are the published terms
-    (`published_objective`), of the published contact where `contact` is a measured one, and `published_joint_entropy`,
-    that of all fibres together in bits, which its 49 presses limit to log2 49 = 5.61: even straight fibres reach that.
+    Presses are where `size` says; those of the information and of the published terms lie between the outermost fibres,
+    as published. The published terms are of the published contact where `contact` has a sensitivity profile.
 
-    Presses are where `size` says, whose layout is the pad's whatever it says of that; those of the information and of
-    the published terms between the outermost fibres, as published.
+    Args:
+        pad: the fibres.
+        contact: what a press does to them; the measured one if None.
+        max_failures: most failed fibres, or weights of 0, 1, ... failed.
+        noise: of a signal in the ambiguity, share of full scale.
+        rules: limits of the penalties; the default ones if None.
+        size: says what is pressed; its layout is the pad's.
+        scatter: of responses in the expected error; that of a default search if None.
+
+    Returns:
+        Values by name. Expected errors and ambiguities are in mm and end in the number of failed fibres.
 
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.
     """
-    from .penalties import PER_SPAN
-
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
     size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
-    asked = SearchSettings(max_failures=max_failures, noise=noise)
-    pairs = len(pad.knots) * (PER_SPAN * (pad.knots.shape[1] - 1)) ** 2
-    if pairs > MOST_PAIRS:
-        raise InputError(f"pad has {len(pad.knots)} fibres of {pad.knots.shape[1]} knots, too many to score its folds")
-    return all_terms(pad, ambiguities(pad, contact, asked.max_failures, asked.noise, size), contact, rules, size)
-
-
-def sharpness_of(pad: Morphology, contact: Contact, size: PadSettings) -> float:
-    """Return the signals' mean second difference along a serpentine over what is pressed, grid units."""
-    import torch
-
-    return sharpness(torch.tensor(signals(pad, _serpentine(size), contact).T)).item()
-
-
-def _serpentine(size: PadSettings) -> Array:
-    return serpentine_presses(size.sensed, 32, 5 / 49)
-
-
-def all_terms(
-    pad: Morphology, spread: Sequence[float], contact: Contact, rules: RulesSettings, size: PadSettings
-) -> dict[str, float]:
-    """What `score` gives for a pad of that size, whose `ambiguities` are known to be `spread`."""
-    import torch
-
-    from padforge.design.contact import fibre_axes
-
-    from .penalties import penalties
-
-    found = signals(pad, _serpentine(size), contact)
-    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
-    broken = penalties(travel, cross, size, rules)
-    terms = ambiguity_terms(spread, pad.unit_mm) | {
-        "information": information(pad, contact),
-        "idle_share": idle_share(found),
-    }
-    terms["sharpness"] = sharpness_of(pad, contact, size)
-    shape = PUBLISHED_CONTACT if contact.sensitivity_profile else contact
-    terms |= {f"penalty_{rule}": value.item() for rule, value in broken.items()}
-    terms |= {f"published_{name}": value for name, value in asdict(published_terms(pad, shape)[0]).items()}
-    levels = quantize(signals_quantized(pad, published_presses(pad.layout), shape))
-    return terms | {"published_joint_entropy": joint_entropy(levels)}
+    noise = SearchSettings(noise=noise).noise
+    search = SearchSettings(max_failures=max_failures)
+    if scatter is not None:
+        stated = {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
+        search = SearchSettings(max_failures=max_failures, **stated)
+    check_comparisons(len(pad.knots), PER_SPAN * (pad.knots.shape[1] - 1) + 1)
+    return ScoredPad(pad, contact, search, rules, size, noise).terms()

@@ -1,4 +1,4 @@
-"""The published search: a genetic algorithm, bred by pymoo, on the published objective (formula (5))."""
+"""The published search: a genetic algorithm (pymoo's) on the published objective, formula (5)."""
 
 import json
 import math
@@ -18,19 +18,20 @@ from padforge.design.objectives.published import published_presses, published_te
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 
-AROUND_LEVEL, AROUND_ORIGIN = 1.0, 0.3
-"""Standard deviations of the first knots about a fibre's own level, and about those of a given pad; grid units."""
+LEVEL_STD, ORIGIN_STD = 1.0, 0.3
+"""Standard deviations of the first knots about a fibre's own level, and about those of an origin; grid units."""
 
 
 class GeneticSearch:
-    """Minimises the published objective, a generation of `search.population` pads at a time.
+    """Minimise the published objective, a generation of `search.population` pads at a time.
 
-    The same problem gives the same pads, whether or not the breeding was broken off and taken up from its state. An
+    The same problem gives the same pads, whether or not the search was interrupted and resumed from its state. An
     origin and mutated copies of it make up half of the first generation; knots of it within MARGIN of the pad's edge
     are moved to MARGIN, the bound of the search.
 
     Attributes:
-        step: generations done. objective: the best so far. done: whether all generations are.
+        step: generations done.
+        objective: the best so far.
     """
 
     def __init__(self, problem: SearchProblem, state: State | None = None) -> None:
@@ -39,10 +40,8 @@ class GeneticSearch:
         self._history: list[tuple[int, float]] = []
         self._generations = search.generations
         self._problem = _PublishedProblem(problem)
-        sampling = _FirstGeneration(
-            None if origin is None else refine(origin.knots, search.knots, problem.pad.layout)[:, 1:-1]
-        )
-        self._algorithm: Any = GA(pop_size=search.population, sampling=sampling, repair=_InOrder())
+        knots = None if origin is None else refine(origin.knots, search.knots, problem.pad.layout)[:, 1:-1]
+        self._algorithm: Any = GA(pop_size=search.population, sampling=_FirstGeneration(knots), repair=_SortKnots())
         self._algorithm.setup(self._problem, termination=NoTermination(), seed=search.seed)
         self._algorithm.pop = Population.empty()
         if state is not None:
@@ -50,11 +49,11 @@ class GeneticSearch:
 
     @property
     def done(self) -> bool:
-        """Whether all generations are bred."""
+        """Whether all generations are done."""
         return self.step >= self._generations
 
     def advance(self, generations: int) -> None:
-        """Breed up to so many generations, fewer if it is done before."""
+        """Breed up to `generations` generations, fewer if it is done before."""
         for _ in range(min(generations, self._generations - self.step)):
             self._algorithm.next()
             self.step += 1
@@ -62,22 +61,22 @@ class GeneticSearch:
             self._history.append((self.step, self.objective))
 
     def finish(self) -> None:
-        """Leave out the generations after the first that are not bred yet; there are no rules to repair by."""
+        """Skip the remaining generations, but for the first; there is no repair."""
         if self.step == 0:
             self.advance(1)
         self._generations = self.step
 
     def morphology(self) -> Morphology:
-        """The best pad so far; there is one once the first generation is done."""
+        """Return the best pad so far; there is one once the first generation is done."""
         # Survivors are the best of parents and offspring, so the best pad ever is among them.
         x, objective = self._algorithm.pop.get("X", "F")
-        return Morphology.from_layout(self._problem.fibres(x[objective.argmin()][None])[0], self._problem.layout)
+        return Morphology.from_layout(self._problem.knots(x[objective.argmin()][None])[0], self._problem.layout)
 
     def state(self) -> State:
-        """All that the next generations depend on, as arrays.
+        """Return everything that the next generations depend on, as arrays.
 
         Returns:
-            "done": (); "history": (k, 2) generation and best objective; "population": (P, 4MN) coordinates of the pads
+            "done": (); "history": (k, 2) generation and best objective; "population": (P, 2FN) coordinates of the pads
             and "objectives": (P,) theirs, both empty before the first generation; "random": (), the generator's state.
         """
         x, objective = self._algorithm.pop.get("X", "F")
@@ -102,44 +101,44 @@ class GeneticSearch:
 
 
 class _PublishedProblem(PymooProblem):
-    """2 F N free coordinates within the pad, one objective, evaluated a whole generation at a time."""
+    """2 F N free coordinates within the pad, one objective, evaluated a generation at a time."""
 
     def __init__(self, problem: SearchProblem) -> None:
         self.layout = problem.pad.layout
         self.shape = (self.layout.fibres, problem.search.knots, 2)
-        least, most = (
-            np.broadcast_to(each, self.shape).ravel() for each in (MARGIN, np.array(self.layout.extent) - MARGIN)
-        )
         self.contact, self.search = problem.contacts[0], problem.search
         self.presses = published_presses(self.layout, problem.search.presses)
-        self.limits = least, most
-        super().__init__(n_var=len(least), n_obj=1, xl=least, xu=most)
+        low, high = (
+            np.broadcast_to(bound, self.shape).ravel() for bound in (MARGIN, np.array(self.layout.extent) - MARGIN)
+        )
+        self.limits = low, high
+        super().__init__(n_var=len(low), n_obj=1, xl=low, xu=high)
 
-    def fibres(self, x: Array) -> Array:
-        """(P, F, N+2, 2) knots of a generation x (P, 2FN)."""
+    def knots(self, x: Array) -> Array:
+        """Return the knots (P, F, N + 2, 2) of a generation x (P, 2FN)."""
         return assemble_knots(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
         terms = published_terms(
-            self.fibres(x),
+            self.knots(x),
             self.contact,
             self.presses,
             weights=self.search.weights,
             layout=self.layout,
             levels=self.search.levels,
         )
-        out["F"] = np.array([[each.objective] for each in terms])
+        out["F"] = np.array([[pad.objective] for pad in terms])
 
 
 class _FirstGeneration(FloatRandomSampling):
-    """Half of the pads have knots anywhere, as the published search's; the others near a pad that is no tangle.
+    """Half of the pads with knots anywhere, as in the published search, and half near an untangled pad.
 
     Where all knots lie anywhere, fibres of a family stand in the wrong order so often, the more the more knots they
     have, that most generations go into setting that right (the C of formula (5)).
 
     Args:
-        origin: (F, N, 2) inner knots of one pad, the others being scattered about them; None to scatter the cross
-            coordinates about each fibre's own level.
+        origin: inner knots about which those of the other half are scattered; None to scatter the coordinates across
+            the fibres about their levels; shape (F, N, 2).
     """
 
     def __init__(self, origin: Array | None) -> None:
@@ -154,21 +153,21 @@ class _FirstGeneration(FloatRandomSampling):
         if self.origin is None:
             level = problem.layout.levels[:, None]
             for family, rows in enumerate(problem.layout.families):
-                cross = near[:, rows, :, 1 - family]
-                cross[:] = random_state.normal(level[rows], AROUND_LEVEL, cross.shape)
+                across = near[:, rows, :, 1 - family]
+                across[:] = random_state.normal(level[rows], LEVEL_STD, across.shape)
         else:
-            near[:] = random_state.normal(self.origin, AROUND_ORIGIN, near.shape)
+            near[:] = random_state.normal(self.origin, ORIGIN_STD, near.shape)
             near[0] = self.origin
         return x
 
 
-class _InOrder(Repair):
-    """Sorts the knots of every fibre along its travel axis, within the bounds.
+class _SortKnots(Repair):
+    """Sort the knots along every fibre, within the bounds.
 
     A pad is the same whatever the order of its knots, but crossover exchanges knots of the same number: sorted,
-    these are of about the same place.
+    these are at about the same position.
     """
 
     def _do(self, problem: _PublishedProblem, X: Array, **kwargs: object) -> Array:
-        inner = problem.fibres(X)[..., 1:-1, :]
+        inner = problem.knots(X)[..., 1:-1, :]
         return np.clip(inner.reshape(X.shape), *problem.limits)

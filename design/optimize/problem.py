@@ -1,74 +1,28 @@
-"""What a search is given."""
+"""The problem that a search solves."""
 
-import signal
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from padforge.design.common.validation import MAX_VALUES, InputError, check_type
 from padforge.design.morphology import Morphology
-from padforge.design.objectives.fibre_loss import loss_shares
+from padforge.design.objectives.ambiguity import free_presses
+from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.rules import Violation, check_rules
-from padforge.design.objectives.score import free_presses
 from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
-
-RESERVE = 0.15  # share of a time budget kept for repairing
-MENDING_S = 3.0  # of repair after Ctrl-C
-LATEST_S = 10.0  # after a deadline, for slices at work: one takes a second or so, but an executor may hang
-
-
-class Stop:
-    """Whether to go on: until Ctrl-C or a deadline of `time.perf_counter`."""
-
-    def __init__(self, begin: float, time_budget: float | None) -> None:
-        self.deadline = None if time_budget is None else begin + (1 - RESERVE) * time_budget
-        self.end = None if time_budget is None else begin + time_budget
-        self.reason = ""
-        self._again = False
-
-    def interrupt(self) -> None:
-        self._again = self.reason == "interrupted"
-        self.reason = "interrupted"
-
-    def given_up(self, elsewhere: bool) -> bool:
-        """Whether slices at work are not waited for any longer: after a second Ctrl-C, or long after the deadline.
-
-        Args:
-            elsewhere: whether they are on an executor, which may hang; here, they do end.
-        """
-        late = elsewhere and bool(self) and self.deadline is not None and time.perf_counter() > self.deadline + LATEST_S
-        return self._again or late
-
-    def mend_until(self) -> float:
-        """When to end the repair of the best so far."""
-        return self.end if self.reason == "out of time" and self.end else time.perf_counter() + MENDING_S
-
-    def __bool__(self) -> bool:
-        if not self.reason and self.deadline is not None and time.perf_counter() > self.deadline:
-            self.reason = "out of time"
-        return bool(self.reason)
-
-
-@contextmanager
-def stopped_by_interrupt(stop: Stop) -> Iterator[None]:
-    """Let Ctrl-C set `stop` instead of tearing down threads; outside the main thread, where none arrives, nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, lambda number, frame: stop.interrupt())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """A pad that serves all of `contacts` within `rules`, to be found as `search` says, from an origin or afresh."""
+    """A pad to be found that serves all contacts within the rules.
+
+    Attributes:
+        pad: settings of the pad.
+        contacts: what presses do to a fibre, the main one first.
+        search: how to search.
+        rules: the limits.
+        origin: morphology to start from; None for random starts.
+    """
 
     pad: PadSettings
     contacts: tuple[Contact, ...]
@@ -83,15 +37,15 @@ class SearchProblem:
 
     @property
     def steps(self) -> int:
-        """Steps of a start, or generations, as far as they are known beforehand."""
+        """Steps of a start, or generations, without repair."""
         return self.search.generations if self.search.method == "genetic" else self.search.steps
 
-    def broken(self, pad: Morphology) -> list[Violation]:
-        """The rules that a pad breaks, as far as they are asked for."""
+    def violations(self, pad: Morphology) -> list[Violation]:
+        """Return the rules that a pad breaks; none if rules are not enforced."""
         return check_rules(pad, self.rules, self.pad) if self.rules.enforce else []
 
     def settings(self) -> dict[str, Any]:
-        """Everything a result depends on, as JSON, by section."""
+        """Return everything a result depends on, as JSON, by section."""
         return {
             "pad": self.pad.model_dump(mode="json"),
             "contact": self.contacts[0].model_dump(mode="json"),
@@ -102,9 +56,20 @@ class SearchProblem:
 
 
 def build_problem(
-    pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None
+    pad: PadSettings,
+    contact: Contact,
+    settings: SearchSettings,
+    rules: RulesSettings,
+    origin: Morphology | None = None,
 ) -> SearchProblem:
-    """The problem that settings pose.
+    """Build the problem of some settings.
+
+    Args:
+        pad: settings of the pad.
+        contact: what a press does to a fibre.
+        settings: how to search.
+        rules: the limits.
+        origin: morphology to start from; None for random starts.
 
     Raises:
         InputError: settings that do not fit each other, the origin or this machine.
@@ -125,13 +90,13 @@ def build_problem(
             )
     if settings.method == "genetic":
         # Offspring are compared with all pads of the generation, and all their knots are held several times over.
-        room = settings.population * max(settings.population, 2 * fibres * settings.knots)
-        if room > MAX_VALUES // 4:
+        values = settings.population * max(settings.population, 2 * fibres * settings.knots)
+        if values > MAX_VALUES // 4:
             raise InputError(
-                f"population is {settings.population}: that takes {room} numbers for {fibres} fibres of "
+                f"population is {settings.population}: that takes {values} numbers for {fibres} fibres of "
                 f"{settings.knots} knots, allowed are {MAX_VALUES // 4}"
             )
-    if not any(loss_shares(settings.max_failures)[:fibres]):
+    if not any(failure_shares(settings.max_failures)[:fibres]):
         raise InputError(f"max_failures is {settings.max_failures}, allowed is what leaves some of the {fibres} fibres")
     if origin is not None:
         check_type("origin", origin, Morphology)

@@ -1,7 +1,7 @@
-"""The search for the next pad of a printed one, which never hands back what locates less well than plain pads do.
+"""The search for the next pad of a printed one, which never returns a pad that locates less well than plain ones do.
 
-What is minimised is a measure. Where a contact was measured, networks trained under it are the judge: they compare what
-was found for it with the usual pad, which needs no measurement, and with straight fibres.
+Where a contact was measured, networks trained under it decide: they compare what was searched for it with the default
+pad, which needs no measurement, and with straight fibres.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,15 +24,26 @@ from padforge.design.twin import Twin
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
-KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
-"""Of `[pad]`, that say where fibres end."""
+LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
+"""Keys of `[pad]` that say where fibres end."""
+TOLERANCE = 1.03
+"""Ratio of errors, to the better of the default pad and straight fibres, that counts as equal: that of trained networks
+is no more certain."""
+SUBSETS = 8
+"""Sets of failed fibres of a size by which pads are compared."""
+BUDGET_SHARES = {"usual": 0.35, "twin": 0.4, "from usual": 0.2}
+"""Of a time budget, by search."""
 
 
 def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
-    """The settings of `spec`, with the reach, the noise and the sensed rectangle of the `twin.json` at `path`.
+    """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
 
-    Its fibres and pitch are the pad's as well, where `spec` states none, or those of `pad`, if one is given. Reach and
-    rectangle stay as they are in mm on a pad of another pitch; of the rectangle what lies beyond a pad is left out.
+    Profile and rectangle stay as they are in mm on a pad of another pitch; the rectangle is cut to the pad.
+
+    Args:
+        spec: settings; where it states no fibres or pitch, those of the twin count.
+        path: of the `twin.json`.
+        pad: whose fibres and pitch count instead.
 
     Raises:
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
@@ -40,25 +51,27 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
     twin = Twin.load(path)
     if spec.stated(Contact) and spec.section(Contact) != Contact():
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
-    own = twin.morphology.layout
-    stated = {**own.settings, **{key: spec.stated(PadSettings)[key] for key in KEYS if key in spec.stated(PadSettings)}}
+    layout, stated = twin.morphology.layout, spec.stated(PadSettings)
+    keys = {**layout.settings, **{key: stated[key] for key in LAYOUT_KEYS if key in stated}}
     if pad is not None:
-        stated = {**pad.layout.settings}
-    size = spec.section(PadSettings, **stated, sensed_mm="beyond").layout
-    if pad is None and size.counts != own.counts:
-        raise InputError(f"{spec.source}: [pad] asks for {size}, but {path} is of a pad of {own}")
+        keys = {**pad.layout.settings}
+    size = spec.section(PadSettings, **keys, sensed_mm="beyond").layout
+    if pad is None and size.counts != layout.counts:
+        raise InputError(f"{spec.source}: [pad] asks for {size}, but {path} is of a pad of {layout}")
     return spec.replaced(
         {
-            "pad": stated | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
+            "pad": keys | {"sensed_mm": [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]},
             "contact": twin.contact().model_dump(),
-            "search": {**spec.stated(SearchSettings), **_scatter(twin, size)},
+            "search": {**spec.stated(SearchSettings), **_scatter_settings(twin, size)},
         }
     )
 
 
-def _scatter(twin: Twin, layout: Layout) -> dict[str, float]:
-    """How the responses of a held press scatter, in `[search]`'s shares of a full scale: that of straight fibres."""
-    gains_v, noises_v = np.array([(abs(each.gain_v), each.noise_v) for each in twin.channels if each.gain_v]).T
+def _scatter_settings(twin: Twin, layout: Layout) -> dict[str, float]:
+    """Return how the responses of a held press scatter, in `[search]`'s shares of the full scale of straight fibres."""
+    gains_v, noises_v = np.array(
+        [(abs(channel.gain_v), channel.noise_v) for channel in twin.channels if channel.gain_v]
+    ).T
     scale = straight_full_scale(layout, twin.contact(), "beyond")
     noise = twin.scatter.floor * np.median(noises_v) / (np.median(gains_v) * scale)
     return {
@@ -66,15 +79,6 @@ def _scatter(twin: Twin, layout: Layout) -> dict[str, float]:
         "scatter": twin.scatter.share,
         "scatter_common": twin.scatter.common,
     }
-
-
-TOLERANCE = 1.03
-"""Error with any number of fibres failed, of the better of the usual pad and straight ones, that is no worse: trained
-networks are not surer of it."""
-SUBSETS = 8
-"""Sets of failed fibres of a size by which pads are judged."""
-SHARES = {"usual": 0.35, "twin": 0.4, "from usual": 0.2}
-"""Of a time budget, what each search takes."""
 
 
 def search_for_twin(
@@ -87,47 +91,47 @@ def search_for_twin(
     origin: Morphology | None = None,
     run: SearchOptions | None = None,
 ) -> SearchResult:
-    """Find the fibres of a pad for a contact and a scatter that were measured.
+    """Find the fibres of a pad for a measured contact and scatter.
 
-    It searches afresh, and from the usual pad; of what is found, the usual pad and straight fibres it returns the pad
-    that trained networks locate best by.
+    It searches from random starts, and from the default pad. Of these, the default pad and straight fibres it returns
+    the pad with the least error of trained networks.
 
     Args:
-        pad: what the pad is.
+        pad: settings of the pad.
         contact: as measured.
         settings: of the search, with the scatter as measured.
-        rules: to be kept.
-        usual: settings of the search for the usual pad, which is for the usual contact.
+        rules: the limits.
+        usual: settings of the search for the default pad, which is for the default contact.
         origin: the morphology to start from; random if None.
-        run: whom it tells, what it keeps and how long it may take.
+        run: callbacks, checkpoints, time budget and executor.
 
     Returns:
         Its `candidate` is "twin", "from usual", "usual" or "straight fibres". A search that is stopped ends with the
-        best so far of what was begun.
+        best so far.
     """
     run = run or SearchOptions()
-    plain = search(pad, None, usual, rules, run=_part(run, "usual"))
+    plain = search(pad, None, usual, rules, run=_options(run, "usual"))
     if plain.stopped == "interrupted":
         return plain
-    afresh = search(pad, contact, settings, rules, origin=origin, run=_part(run, "twin"))
+    afresh = search(pad, contact, settings, rules, origin=origin, run=_options(run, "twin"))
     one = settings.model_copy(update={"starts": 1, "knots": max(settings.knots, usual.knots)})
-    further = search(pad, contact, one, rules, origin=plain.morphology, run=_part(run, "from usual"))
+    further = search(pad, contact, one, rules, origin=plain.morphology, run=_options(run, "from usual"))
+    problem = build_problem(pad, contact, settings, rules)
     pads = {
         "usual": plain.morphology,
         "straight fibres": Morphology.straight(pad.layout),
         "twin": afresh.morphology,
         "from usual": further.morphology,
     }
-    if rules.enforce:  # one that cannot be built is no use, unless none can
-        problem = build_problem(pad, contact, settings, rules, None)
-        pads = {name: each for name, each in pads.items() if not problem.broken(each)} or {"twin": afresh.morphology}
+    # a pad that cannot be built is no use, unless none can
+    pads = {name: each for name, each in pads.items() if not problem.violations(each)} or {"twin": afresh.morphology}
     with stage("judge"):
-        found = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
-    name = choose({each.pad: np.array([level.mean for level in each.errors]) for each in found})
+        rows = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
+    name = choose({row.pad: np.array(row.errors_mm) for row in rows})
     parts = {"usual": plain, "twin": afresh, "from usual": further}
     history = [entry | {"run": f"{part}, {entry['run']}"} for part, each in parts.items() for entry in each.history]
     return replace(
-        score_result(pads[name], name, pad, contact, settings, rules),
+        score_result(pads[name], name, problem),
         history=history,
         seconds=sum(each.seconds for each in parts.values()),
         stopped=next((each.stopped for each in parts.values() if each.stopped), ""),
@@ -135,11 +139,11 @@ def search_for_twin(
 
 
 def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("usual", "straight fibres")) -> str:
-    """Return the pad that errs least over all numbers of failed fibres, of those that are worse than plain at none.
+    """Return the pad of least mean error, among those that are worse than the plain ones with no number of failures.
 
     Args:
-        errors: by pad, with 0, 1, ... fibres failed.
-        plain: those to which the others are compared, as far as they are there.
+        errors: with 0, 1, ... fibres failed, by pad.
+        plain: pads that the others are compared to; missing ones are ignored.
     """
     best = np.min([errors[name] for name in plain if name in errors] or list(errors.values()), axis=0)
     ratios = {name: each / best for name, each in errors.items()}
@@ -149,16 +153,16 @@ def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("usual", "straig
 
 
 def state_folders(keep_in: Path) -> dict[str, Path]:
-    """Return where each of the searches keeps its states: beside each other, as none may lie in another's."""
-    return {name: keep_in.with_name(f"{keep_in.name}-{name}".replace(" ", "-")) for name in SHARES}
+    """Return the folder of states of each search: beside each other, as none may lie in another's."""
+    return {name: keep_in.with_name(f"{keep_in.name}-{name}".replace(" ", "-")) for name in BUDGET_SHARES}
 
 
-def _part(run: SearchOptions, name: str) -> SearchOptions:
-    """How one of the searches runs."""
+def _options(run: SearchOptions, name: str) -> SearchOptions:
+    """Return the options of one of the searches."""
     keep_in = None if run.keep_in is None else state_folders(run.keep_in)[name]
-    budget = None if run.time_budget is None else SHARES[name] * run.time_budget
-    return replace(run, keep_in=keep_in, time_budget=budget, report=_named(run.report, name))
+    budget = None if run.time_budget is None else BUDGET_SHARES[name] * run.time_budget
+    return replace(run, keep_in=keep_in, time_budget=budget, on_progress=_prefixed(run.on_progress, name))
 
 
-def _named(report: OnProgress, name: str) -> Callable[[str, int, int, float], None]:
-    return lambda start, done, total, objective: report(f"{name}, {start}", done, total, objective)
+def _prefixed(on_progress: OnProgress, name: str) -> Callable[[str, int, int, float], None]:
+    return lambda start, done, total, objective: on_progress(f"{name}, {start}", done, total, objective)

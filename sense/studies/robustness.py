@@ -13,7 +13,7 @@ from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.common.validation import InputError
 from padforge.design.contact import grid_positions, signals, signals_quantized
 from padforge.design.morphology import Morphology
-from padforge.design.networks import Loss, PressSets, batches
+from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from padforge.sense.recordings.processing.limits import Array
@@ -61,7 +61,7 @@ def robustness_study(
         (label, part)
         for label, pad in pads.items()
         for level in range(min(lost, pad.layout.fibres - 1) + 1)
-        for part in batches(failure_subsets(pad.layout.fibres, level, MOST_SETS))
+        for part in split_batches(failure_subsets(pad.layout.fibres, level, MOST_SETS))
     ]
     tasks = [
         Task(
@@ -84,7 +84,7 @@ def robustness_study(
 
 
 def _found(
-    pad: Morphology, contact: Contact, rule: str, losses: list[Loss], hidden: int, side: int, test: int, seed: int
+    pad: Morphology, contact: Contact, rule: str, losses: list[FailureSet], hidden: int, side: int, test: int, seed: int
 ) -> State:
     """Mean errors (L,) with each of some losses, grid units: on "fresh" presses, and on "own", those trained on among
     them; and (L, SIDE^2) errors over the pad, "maps"."""
@@ -92,18 +92,18 @@ def _found(
     def answer(places: Array) -> Array:
         return RULES[rule](pad, places, contact)
 
-    trial = PressSets.of(pad, side, test, seed, answer)
+    trial = SimulatedPresses.simulate(pad, side, test, seed, answer)
     places = grid_positions(between_fibres(pad.layout), SIDE)
     over = answer(places)
     repeats = -(-NETWORKS // math.comb(pad.layout.fibres, len(losses[0])))
     found = [
         (
-            trial.errors(network, loss).mean(),
-            trial.distances(network, loss, trial.recorded, trial.learned).mean(),
-            trial.distances(network, loss, over, places),
+            trial.test_errors(network, loss).mean(),
+            trial.position_errors(network, loss, trial.train_signals, trial.train_positions).mean(),
+            trial.position_errors(network, loss, over, places),
         )
         for repeat in range(repeats)
-        for network, loss in zip(trial.learn(losses, hidden, repeat), losses, strict=True)
+        for network, loss in zip(trial.fit(losses, hidden, repeat), losses, strict=True)
     ]
     fresh, own, maps = (np.array(part) for part in zip(*found, strict=True))
     by_loss = (repeats, len(losses), -1)
@@ -117,7 +117,7 @@ def _found(
 
 def _conclude(
     pads: Mapping[str, Morphology],
-    parts: list[tuple[str, list[Loss]]],
+    parts: list[tuple[str, list[FailureSet]]],
     settings: Mapping[str, Any],
     states: list[State],
 ) -> Findings:

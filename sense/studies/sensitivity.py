@@ -12,7 +12,7 @@ from padforge.design.common.checkpoints import State
 from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
-from padforge.design.networks import PressSets, fit_many
+from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact
 
 from .pads import described
@@ -64,13 +64,16 @@ def _name(contact: Contact) -> str:
 
 def _found(pad: Morphology, own: Contact, objects: list[Contact], seed: int) -> State:
     """Mean errors (MEMBERS, objects) of networks trained with the object `own`, grid units."""
-    trial = PressSets.of(pad, SIDE, TEST, seed, lambda places: signals(pad, places, own))
+    trial = SimulatedPresses.simulate(pad, SIDE, TEST, seed, lambda places: signals(pad, places, own))
     rngs = np.random.default_rng([5, seed]).spawn(MEMBERS)
-    networks = fit_many(trial.recorded, trial.learned, rngs, HIDDEN)
-    met = [signals(pad, trial.fresh, contact) for contact in objects]
+    networks = fit_batch(trial.train_signals, trial.train_positions, rngs, HIDDEN)
+    met = [signals(pad, trial.test_positions, contact) for contact in objects]
     return {
         "errors": np.array(
-            [[trial.distances(network, (), given, trial.fresh).mean() for given in met] for network in networks]
+            [
+                [trial.position_errors(network, (), given, trial.test_positions).mean() for given in met]
+                for network in networks
+            ]
         )
     }
 

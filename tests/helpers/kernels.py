@@ -50,7 +50,7 @@ def design_kernels() -> None:
         signals_quantized,
         signals_sparse,
     )
-    from padforge.design.objectives.ambiguity_map import ambiguity_map
+    from padforge.design.objectives.ambiguity import ambiguity_map
     from padforge.design.objectives.published import disorder, disorder_area
     from padforge.design.settings import PUBLISHED_CONTACT
     from padforge.fabricate import build, check_mesh

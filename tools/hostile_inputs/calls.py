@@ -22,7 +22,7 @@ from .values import ODD, spoiled
 
 TRUSTED = {"sense.HealthModel.refuse_other", "sense.Finder.follow"}
 """They are handed what those who call them have checked."""
-CALLBACKS = {"progress", "report", "warn", "executor", "keep_in"}
+CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
 """Parameters that are left alone: what is called back may raise what it likes."""
 
 

@@ -200,7 +200,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
         (3, W) times s, readings and filtered readings V; "marks": (SHOWN, 3, 2) times s and values V; and "levels":
         (L, 3) times s, and values V before and in presses.
     """
-    from padforge.design.networks import fit_many
+    from padforge.design.networks import fit_batch
 
     recording = source()
     begun, lifted, places_mm = recording.begun, recording.lifted, recording.presses_mm
@@ -215,7 +215,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
         inputs = scheme_inputs(scheme, filtered, begun, lifted, split.taught)
         rngs = np.random.default_rng([8, seed]).spawn(MEMBERS)
         check = np.broadcast_to(inputs[split.checked], (MEMBERS, len(split.checked), inputs.shape[1]))
-        networks = fit_many(
+        networks = fit_batch(
             inputs[split.taught], places_mm[split.taught], rngs, hidden, epochs, (check, places_mm[split.checked])
         )
         for kind, rows in (("test", split.test), ("last", split.last)):

@@ -120,9 +120,9 @@ def committee(
     inputs: Array, targets: Array, rng: np.random.Generator, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """The mean of networks that learnt from (Q, D) inputs and (Q, O) targets, each with its own split and weights."""
-    from padforge.design.networks import fit_many
+    from padforge.design.networks import fit_batch
 
-    members = fit_many(inputs, targets, rng.spawn(MEMBERS), hidden, epochs)
+    members = fit_batch(inputs, targets, rng.spawn(MEMBERS), hidden, epochs)
     return lambda given: np.mean([network(given) for network in members], axis=0)
 
 

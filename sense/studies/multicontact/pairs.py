@@ -81,8 +81,8 @@ def learnt(
     way: Way, given: Array, places: Array, rng: np.random.Generator, members: int, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """What finds pairs (T, 2, 2) from signals (T, D), having learnt from signals (Q, D) of pairs (Q, 2, 2)."""
-    from padforge.design.networks import fit_many
+    from padforge.design.networks import fit_batch
 
     targets = way.targets(places)
-    networks = fit_many(given, targets[0], rng.spawn(members), hidden, epochs, also=targets[1:])
+    networks = fit_batch(given, targets[0], rng.spawn(members), hidden, epochs, alternatives=targets[1:])
     return lambda signalled: way.pairs(np.stack([network(signalled) for network in networks]))

@@ -87,7 +87,7 @@ def _located(
 
 def _counted(pad: Morphology, presses: int, test: int, members: int, hidden: int, epochs: int, seed: int) -> State:
     """Confusions (MOST+1, MOST+1) on the test presses: how often i contacts, by row, were taken for j."""
-    from padforge.design.networks import fit_many
+    from padforge.design.networks import fit_batch
 
     rng = np.random.default_rng([6, seed])
     places = _drawn(pad, presses + test, MOST, rng)
@@ -95,7 +95,7 @@ def _counted(pad: Morphology, presses: int, test: int, members: int, hidden: int
     alone = signals(pad, places.reshape(-1, 2), PUBLISHED_CONTACT).reshape(*places.shape[:2], -1)
     signalled = (alone * (np.arange(MOST) < number[:, None])[:, :, None]).sum(axis=1)
     read = readings(signalled, signalled[:presses].max(axis=0), NOISE_COUNTS, rng)
-    networks = fit_many(read[:presses], np.eye(MOST + 1)[number[:presses]], rng.spawn(members), hidden, epochs)
+    networks = fit_batch(read[:presses], np.eye(MOST + 1)[number[:presses]], rng.spawn(members), hidden, epochs)
     found = np.mean([network(read[presses:]) for network in networks], axis=0).argmax(axis=1)
     confusions = np.zeros((MOST + 1, MOST + 1), dtype=np.int64)
     np.add.at(confusions, (number[presses:], found), 1)

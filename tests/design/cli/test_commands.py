@@ -14,10 +14,10 @@ from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
 from padforge.design.design_run import load_result, summary_lines
-from padforge.design.objectives.expected_error import error_terms, expected_errors, straight_full_scale
-from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
-from padforge.design.settings import PadSettings, SearchSettings
+from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nmax_failures = 1\n"
@@ -100,10 +100,7 @@ def test_settings_for_twin_take_profile_noise_area_and_layout(here, twin):
 def evaluate(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
     options = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
-    settings = SearchSettings(max_failures=1, noise=noise, scatter=0.05, scatter_common=0.5)
-    return score(pad, contact, **options) | error_terms(
-        expected_errors(pad, contact, settings, options["size"]), pad.unit_mm
-    )
+    return score(pad, contact, **options, scatter=Scatter(noise, 0.05, 0.5))
 
 
 @pytest.mark.slow

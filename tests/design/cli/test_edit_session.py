@@ -11,7 +11,7 @@ from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
 from padforge.design.editor.edits import PathEvaluator
 from padforge.design.editor.session import EditSession
-from padforge.design.objectives.score import AMBIGUITY_NOISE, ambiguities
+from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 
 
 def session(tmp_path, pad=None, **size):

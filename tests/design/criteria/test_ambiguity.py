@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from padforge.design import Contact, Morphology
 from padforge.design.contact import relative_stretch, signals
-from padforge.design.objectives.ambiguity_map import ambiguity_map
-from padforge.design.objectives.fibre_loss import failure_subsets, loss_shares, sample_failures
-from padforge.design.objectives.score import ambiguities, ambiguity, free_presses, full_scale, sharpness
+from padforge.design.objectives.ambiguity import ambiguities, ambiguity, ambiguity_map, free_presses, full_scale
+from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets, sample_failures
+from padforge.design.objectives.score import sharpness
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -58,29 +58,30 @@ def test_the_full_scale_is_the_mean_largest_signal_of_touched_fibres_and_sharpne
 
 
 def test_shares_of_losses_are_half_for_none_and_equal_or_as_weighted():
-    assert loss_shares(3) == (3 / 6, 1 / 6, 1 / 6, 1 / 6)
-    assert loss_shares(1) == (0.5, 0.5)
-    assert loss_shares(0) == (1.0,)
-    assert loss_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
+    assert failure_shares(3) == (3 / 6, 1 / 6, 1 / 6, 1 / 6)
+    assert failure_shares(1) == (0.5, 0.5)
+    assert failure_shares(0) == (1.0,)
+    assert failure_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
 
 
 @settings(max_examples=20)
 @given(st.integers(0, 4) | st.lists(st.sampled_from([0.0, 1.0, 3.0]), min_size=1, max_size=5).filter(sum).map(tuple))
 def test_drawn_losses_have_the_shares_that_are_asked_for(lost):
-    shares = loss_shares(lost)
+    shares = failure_shares(lost)
     masks, weights = sample_failures(8, shares, np.random.default_rng(0))
     n_lost = 8 - masks.sum(axis=1)
     assert [weights[n_lost == k].sum() for k in range(len(shares))] == pytest.approx(list(shares))
-    masks, weights = sample_failures(2, loss_shares(5), np.random.default_rng(0))
+    masks, weights = sample_failures(2, failure_shares(5), np.random.default_rng(0))
     assert masks.sum(axis=1).min() == 1  # a pad is never left without a fibre
     assert weights.sum() == pytest.approx(1)
 
 
 def test_losses_are_all_of_a_size_or_as_many_different_ones_as_wanted():
-    assert failure_subsets(4, 2) == failure_subsets(4, 2, most=6) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert failure_subsets(4, 2) == failure_subsets(4, 2, max_subsets=6) == pairs
     assert failure_subsets(3, 0) == [()]
-    drawn = failure_subsets(8, 3, most=20)
-    assert drawn == sorted(set(drawn)) == failure_subsets(8, 3, most=20)
+    drawn = failure_subsets(8, 3, max_subsets=20)
+    assert drawn == sorted(set(drawn)) == failure_subsets(8, 3, max_subsets=20)
     assert len(drawn) == 20
     assert all(0 <= a < b < c < 8 for a, b, c in drawn)
     assert {fibre for loss in drawn for fibre in loss} == set(range(8))

@@ -7,7 +7,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
 from padforge.design.contact import fibre_axes
-from padforge.design.objectives.penalties import COMMON, penalties
+from padforge.design.objectives.penalties import COMMON_WEIGHT, penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths, refine
 from padforge.design.settings import PadSettings, RulesSettings
@@ -214,7 +214,7 @@ def test_a_stretch_too_long_costs_by_how_near_it_is_at_two_places_as_far_apart_a
     sine = np.sin(np.arctan(0.4 / 3.0))  # half-way between turning points a PCHIP is half as steep again
     for margin in (1.0, 1.2):
         share = 1 - 0.8 / margin * sine / 0.4
-        expected = COMMON * share * 1.6 / margin / 11.25 / 8 / 5  # by its share of the length of all fibres
+        expected = COMMON_WEIGHT * share * 1.6 / margin / 11.25 / 8 / 5  # by its share of the length of all fibres
         assert found(pad, limit, margin)["max_common_track_mm"] == pytest.approx(expected, rel=0.05)
     assert found(pad, limit.model_copy(update={"max_common_track_mm": 7.0}))["max_common_track_mm"] == 0
 

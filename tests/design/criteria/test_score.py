@@ -54,7 +54,7 @@ def test_many_fibres_and_many_losses_are_scored_in_bounded_time():
     ("pad", "asked", "message"),
     [
         (Morphology.straight(3), {"size": PadSettings(sensed_mm=(46, 20))}, "the pad itself is 45 mm wide"),
-        (Morphology.random(16, 3000, seed=0), {"max_failures": 0}, "too many"),
+        (Morphology.random(16, 3000, seed=0), {"max_failures": 0}, "comparisons for so many fibres"),
         (Morphology.straight(2), {"max_failures": -1}, r"\[search\] max_failures"),
         (Morphology.straight(2), {"max_failures": (0.0, 0.0)}, r"\[search\] max_failures"),
         (Morphology.straight(2), {"noise": 0.0}, r"\[search\] noise"),

@@ -10,7 +10,7 @@ from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.published import disorder, disorder_area
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
-from padforge.design.optimize.gradient import Fibres
+from padforge.design.optimize.gradient import Parametrization
 from padforge.design.plan_drawing import draw_plan
 from padforge.design.settings import PadSettings, RulesSettings
 
@@ -82,11 +82,11 @@ def test_a_wild_pad_has_a_finite_score_and_is_checked_and_drawn(kind, seed):
 def test_penalties_of_a_wild_pad_and_their_gradients_are_finite(kind, seed):
     pad = wild_pad(kind, seed)
     for rules in RULES:
-        fibres = Fibres.through(pad.knots, pad.layout, 0.01)
+        fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.01)
         assert np.isfinite(fibres.knots()).all()
         terms = penalties(*fibres.axes(), PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
         torch.stack(list(terms.values())).sum().backward()
         assert all(value.isfinite() and value >= 0 for value in terms.values())
-        for variable in (fibres.spans, fibres.cross):
+        for variable in (fibres.spans, fibres.across):
             assert variable.grad is not None
             assert variable.grad.isfinite().all()

@@ -8,17 +8,17 @@ from padforge.design.contact import grid_positions, relative_stretch, signals
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import expected_error as module
 from padforge.design.objectives.expected_error import (
-    BY_LEARNING,
-    BY_NOISE,
+    BOUND_WEIGHT,
+    REGRESSION_WEIGHT,
     RIDGE,
     WIDTH,
     aggregate_failures,
     confusable,
-    drawn_window,
+    evaluation_windows,
     expected_error,
     expected_errors,
-    judged_windows,
     kernel_weights,
+    sample_window,
     straight_full_scale,
     window_presses,
 )
@@ -69,33 +69,33 @@ def leave_one_out_error(signals: np.ndarray, rows=None) -> float:
 
 def bound(signals: np.ndarray, scatter: Scatter) -> float:
     """What noise adds, with all fibres, by which the expected error is above that of learning."""
-    return (error(signals, scatter) - BY_LEARNING * leave_one_out_error(signals)) / BY_NOISE
+    return (error(signals, scatter) - REGRESSION_WEIGHT * leave_one_out_error(signals)) / BOUND_WEIGHT
 
 
 @pytest.mark.parametrize("size", [PadSettings(grid=4), PadSettings(grid=16), PadSettings(horizontals=3, verticals=12)])
 def test_windows_lie_within_what_is_pressed_and_tile_it(size):
     low, high = np.array(size.sensed)
-    windows = [np.array(window) for window in judged_windows(size.sensed)]
-    for window in (*windows, np.array(drawn_window(size.sensed, np.random.default_rng(1)))):
+    windows = [np.array(window) for window in evaluation_windows(size.sensed)]
+    for window in (*windows, np.array(sample_window(size.sensed, np.random.default_rng(1)))):
         assert (window[0] >= low - 1e-9).all()
         assert (window[1] <= high + 1e-9).all()
         assert np.ptp(window, axis=0).max() <= module.WINDOW + 1e-9
     area = sum(np.prod(window[1] - window[0]) for window in windows)
     assert area / np.prod(high - low) == pytest.approx(round(area / np.prod(high - low)))
-    assert len(windows) >= module.LATTICES
+    assert len(windows) >= module.GRIDS
 
 
 def test_the_rest_of_a_large_pad_is_looked_at_coarsely_and_of_a_small_one_there_is_none():
     size = PadSettings(grid=9)
-    window = drawn_window(size.sensed, np.random.default_rng(0))
+    window = sample_window(size.sensed, np.random.default_rng(0))
     presses = window_presses(size, window, SIDE, np.random.default_rng(2))
     each = presses.positions.reshape(SIDE, SIDE, 2)
     assert np.diff(each[..., 0], axis=1) == pytest.approx(presses.step[0])
     assert np.diff(each[..., 1], axis=0) == pytest.approx(presses.step[1])
     low, high = np.array(window)
-    assert ((presses.far < low - module.BESIDE) | (presses.far > high + module.BESIDE)).any(axis=1).all()
+    assert ((presses.far < low - module.WINDOW_MARGIN) | (presses.far > high + module.WINDOW_MARGIN)).any(axis=1).all()
     rest = np.prod(np.diff(np.array(size.sensed), axis=0)) - np.prod(high - low)
-    assert 0.5 * rest < len(presses.far) * module.COARSE**2 < rest
+    assert 0.5 * rest < len(presses.far) * module.COARSE_STEP**2 < rest
     assert not len(window_presses(PAD, PAD.sensed, SIDE, np.random.default_rng(2)).far)
     corner = np.array([(-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0)])
     holed = PadSettings(grid=9, keep_out_mm=(tuple(map(tuple, corner.tolist())),))
@@ -114,13 +114,13 @@ def test_presses_in_a_keep_out_do_not_count():
     scattered = [errors(each, kept, Scatter(0.02), presses.free) for each in (answers, changed)]
     assert scattered[0] == pytest.approx(scattered[1])
     rows = np.flatnonzero(presses.free)
-    expected = BY_LEARNING * leave_one_out_error(answers, rows)
+    expected = REGRESSION_WEIGHT * leave_one_out_error(answers, rows)
     assert errors(answers, kept, SILENT, presses.free)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_without_noise_it_is_the_error_of_regressions_that_each_lack_one_press():
     signals = random_responses()
-    assert error(signals) == pytest.approx(BY_LEARNING * leave_one_out_error(signals), rel=1e-6)
+    assert error(signals) == pytest.approx(REGRESSION_WEIGHT * leave_one_out_error(signals), rel=1e-6)
 
 
 def test_a_lost_fibre_tells_nothing():
@@ -170,7 +170,9 @@ def test_without_signals_nothing_is_known_but_that_the_place_is_on_the_pad():
     silent = np.zeros((2, SIDE**2))
     assert bound(silent, Scatter(0.1)) == pytest.approx(np.sqrt(2 * 16 / 12))
     # about the mean distance of a place of a square of side 4 from its middle, 0.3826 sides
-    assert error(silent) - BY_NOISE * np.sqrt(2 * 16 / 12) == pytest.approx(BY_LEARNING * 4 * 0.3826, rel=0.03)
+    assert error(silent) - BOUND_WEIGHT * np.sqrt(2 * 16 / 12) == pytest.approx(
+        REGRESSION_WEIGHT * 4 * 0.3826, rel=0.03
+    )
 
 
 @pytest.mark.parametrize("scatter", [SILENT, Scatter(0.05, 0.18, 0.36)])
@@ -223,13 +225,13 @@ def test_partners_are_those_that_all_differences_of_responses_tell():
     least = np.min(distances, axis=0) / WIDTH
     expected = np.sort(np.argsort(least)[: module.MAX_PARTNERS])
     found = confusable(*(torch.tensor(each) for each in (near, far, masks))).tolist()
-    assert found == [index for index in expected.tolist() if least[index] < module.ALIKE]
+    assert found == [index for index in expected.tolist() if least[index] < module.MAX_PARTNER_DISTANCE]
     assert 0 < len(found) <= module.MAX_PARTNERS
 
 
 def test_judging_a_huge_pad_looks_at_a_draw_of_windows_and_of_presses():
     size = PadSettings(grid=96)
-    windows = judged_windows(size.sensed)
+    windows = evaluation_windows(size.sensed)
     assert len(windows) == len(set(windows)) == module.MAX_WINDOWS
     presses = window_presses(size, windows[0], SIDE, np.random.default_rng(0))
     assert 0.9 * module.MAX_FAR < len(presses.far) <= module.MAX_FAR

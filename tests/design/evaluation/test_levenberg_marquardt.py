@@ -6,20 +6,16 @@ import torch
 
 from padforge.benchmarks import networks as benchmark
 from padforge.design.common.validation import InputError
-from padforge.design.networks import (
+from padforge.design.levenberg_marquardt import (
     RIDGE,
-    ColumnScale,
-    LmBatchState,
-    Network,
-    curvature,
-    dual_curvature,
-    first_weights,
-    fit,
-    fit_many,
-    neurons_of,
-    pull_back,
-    with_ones,
+    ProjectedFit,
+    activations,
+    append_ones,
+    dual_matrix,
+    gauss_newton_matrix,
+    jacobian_product,
 )
+from padforge.design.networks import Network, RangeScaler, fit, fit_batch, initial_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -39,15 +35,15 @@ def network_parts(networks, inputs, hidden, outputs, samples=40, alternatives=1)
     rng = np.random.default_rng(inputs)
     x = torch.from_numpy(rng.uniform(-1, 1, (networks, samples, inputs)))
     y = torch.from_numpy(rng.uniform(-1, 1, (networks, alternatives, samples, outputs)))
-    weights = [first_weights(np.ones(inputs, bool), hidden, rng).T for _ in range(networks)]
-    return torch.from_numpy(np.stack(weights)), with_ones(x), y
+    weights = [initial_weights(np.ones(inputs, bool), hidden, rng).T for _ in range(networks)]
+    return torch.from_numpy(np.stack(weights)), append_ones(x), y
 
 
 def jacobians(x, fit):
     """J and R J of one network, every column by automatic differentiation, and the output weights held."""
 
     def outputs(hidden):
-        return neurons_of(hidden[None], x[None])[0] @ fit.output[0]
+        return activations(hidden[None], x[None])[0] @ fit.output[0]
 
     jacobian = torch.autograd.functional.jacobian(outputs, fit.hidden[0]).flatten(2)
     gram = fit.neurons[0].mT @ fit.neurons[0]
@@ -59,8 +55,8 @@ def jacobians(x, fit):
 @pytest.mark.parametrize(("inputs", "hidden", "outputs"), [(3, 7, 2), (1, 1, 1), (9, 20, 3)])
 def test_both_forms_of_the_equations_are_those_of_the_whole_jacobian(inputs, hidden, outputs):
     weights, x, y = network_parts(2, inputs, hidden, outputs)
-    fit = LmBatchState.of(weights, x, y[:, 0])
-    slope, primal, dual = pull_back(x, fit, fit.error), curvature(x, fit), dual_curvature(x, fit)
+    fit = ProjectedFit.solve(weights, x, y[:, 0])
+    slope, primal, dual = jacobian_product(x, fit, fit.error), gauss_newton_matrix(x, fit), dual_matrix(x, fit)
     for network in range(2):
         alone = fit.rows(torch.tensor([network]))
         jacobian, projected = jacobians(x[network], alone)
@@ -75,17 +71,17 @@ def test_both_forms_of_the_equations_are_those_of_the_whole_jacobian(inputs, hid
 def test_the_slope_is_the_derivative_of_the_least_squares_over_the_output_weights(samples, hidden):
     weights, x, y = network_parts(1, 3, hidden, 2, samples)
     weights.requires_grad_()
-    fit = LmBatchState.of(weights, x, y[:, 0])
-    (slope,) = torch.autograd.grad(fit.squares.sum(), weights)
-    torch.testing.assert_close(slope.flatten(1), 2 * pull_back(x, fit, fit.error), atol=1e-6, rtol=1e-6)
+    fit = ProjectedFit.solve(weights, x, y[:, 0])
+    (slope,) = torch.autograd.grad(fit.loss.sum(), weights)
+    torch.testing.assert_close(slope.flatten(1), 2 * jacobian_product(x, fit, fit.error), atol=1e-6, rtol=1e-6)
 
 
 def test_a_network_does_not_depend_on_the_others_of_its_batch():
     rng = np.random.default_rng(8)
     inputs = rng.uniform(-1, 1, (3, 200, 2))
     targets = waves(inputs[0])
-    together = fit_many(inputs, targets, [np.random.default_rng(s) for s in (1, 2, 3)], hidden=8, epochs=30)
-    alone = fit_many(inputs[1:2], targets, [np.random.default_rng(2)], hidden=8, epochs=30)[0]
+    together = fit_batch(inputs, targets, [np.random.default_rng(s) for s in (1, 2, 3)], hidden=8, epochs=30)
+    alone = fit_batch(inputs[1:2], targets, [np.random.default_rng(2)], hidden=8, epochs=30)[0]
     assert [network.epochs > 0 for network in together] == [True] * 3
     np.testing.assert_allclose(together[1](inputs[1]), alone(inputs[1]), atol=0.05 * targets.std())
 
@@ -96,7 +92,7 @@ def test_a_sample_counts_by_the_nearest_of_its_targets():
     inputs = rng.uniform(0.1, 1, (400, 1))
     root = np.sqrt(inputs) * rng.choice([-1, 1], (400, 1))
     told = fit(inputs, root, np.random.default_rng(0), hidden=8)(inputs)
-    free = fit_many(inputs, root, [np.random.default_rng(0)], hidden=8, also=-root[None])[0](inputs)
+    free = fit_batch(inputs, root, [np.random.default_rng(0)], hidden=8, alternatives=-root[None])[0](inputs)
     assert rms(np.abs(free) - np.sqrt(inputs)) < 0.1
     assert rms(np.abs(told) - np.sqrt(inputs)) > 0.3
 
@@ -114,7 +110,7 @@ def test_a_map_is_learned_from_fewer_samples_than_weights(seed):
     """By the dual equations, whose steps are those of the others."""
     rng = np.random.default_rng(seed)
     samples, fresh = rng.uniform(-1, 1, (2, 60, 2))
-    network = fit(samples, waves(samples)[:, :1], rng, epochs=200, check=(fresh, waves(fresh)[:, :1]))
+    network = fit(samples, waves(samples)[:, :1], rng, epochs=200, validation=(fresh, waves(fresh)[:, :1]))
     assert rms(network(fresh) - waves(fresh)[:, :1]) < 0.05
 
 
@@ -179,7 +175,7 @@ def test_networks_of_degenerate_or_few_samples_are_finite(kind, scale):
             inputs[:, 0] = 0
         elif kind == "line":
             targets = inputs @ rng.normal(size=(2, 2))
-        for network in fit_many(inputs, targets, [np.random.default_rng(i) for i in range(2)], hidden, epochs=20):
+        for network in fit_batch(inputs, targets, [np.random.default_rng(i) for i in range(2)], hidden, epochs=20):
             assert np.isfinite(network(inputs)).all()
 
 
@@ -198,14 +194,14 @@ def test_networks_of_degenerate_or_few_samples_are_finite(kind, scale):
 )
 def test_what_cannot_be_learned_is_refused(inputs, targets, networks, hidden, message):
     with pytest.raises(InputError, match=message):
-        fit_many(inputs, targets, [np.random.default_rng(0)] * networks, hidden)
+        fit_batch(inputs, targets, [np.random.default_rng(0)] * networks, hidden)
 
 
 @pytest.mark.parametrize(("varying", "hidden"), [(1, 9), (2, 16), (3, 50)])
 def test_first_neurons_are_spread_as_nguyen_and_widrow_have_it(varying, hidden):
     """Slopes of one length, 0.7 H^(1 / D) by the inputs that vary, and biases evenly over it, of either sign."""
     varies = np.array([True] * varying + [False])
-    weights = first_weights(varies, hidden, np.random.default_rng(0))
+    weights = initial_weights(varies, hidden, np.random.default_rng(0))
     length = 0.7 * hidden ** (1 / varying)
     assert not weights[:, varying].any()
     np.testing.assert_allclose(np.linalg.norm(weights[:, :-1], axis=1), length)
@@ -217,15 +213,15 @@ def test_first_neurons_are_spread_as_nguyen_and_widrow_have_it(varying, hidden):
 
 def test_a_scale_fills_minus_one_to_one_and_comes_back():
     values = np.array([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0], [2.0, 5.0, 4.0]])
-    scale = ColumnScale.of(values)
-    np.testing.assert_allclose(scale.there(values), [[-1, 0, -1], [1, 0, 1 / 3], [0, 0, 1]])
-    np.testing.assert_allclose(scale.back(scale.there(values)), values)
-    np.testing.assert_allclose(scale.back(np.array([[0.5, 9.0, -2.0]])), [[2.5, 5.0, -5.0]])
+    scale = RangeScaler.fit(values)
+    np.testing.assert_allclose(scale.transform(values), [[-1, 0, -1], [1, 0, 1 / 3], [0, 0, 1]])
+    np.testing.assert_allclose(scale.inverse_transform(scale.transform(values)), values)
+    np.testing.assert_allclose(scale.inverse_transform(np.array([[0.5, 9.0, -2.0]])), [[2.5, 5.0, -5.0]])
 
 
 def test_a_network_is_its_formula():
     rng = np.random.default_rng(1)
-    inputs, targets = (ColumnScale(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
+    inputs, targets = (RangeScaler(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
     hidden, output = rng.normal(size=(4, 4)), rng.normal(size=(2, 5))
     x = rng.normal(size=(6, 3))
     neurons = np.tanh((x - inputs.middle) / inputs.half @ hidden[:, :3].T + hidden[:, 3])

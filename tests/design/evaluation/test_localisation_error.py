@@ -1,4 +1,4 @@
-"""Evaluation by simulation: the published order of the pads, fresh test presses, and errors by the contact believed."""
+"""Evaluation by simulation: the published order of the pads, fresh test presses, and errors by contact."""
 
 import math
 import os
@@ -9,8 +9,8 @@ import torch
 
 from padforge.design import Contact, Morphology, signals
 from padforge.design.common.validation import InputError
-from padforge.design.contact_comparison import beside_straight, contacts_in_question, errors_by_contact
-from padforge.design.networks import PressSets, fresh_presses, localisation_error, training_presses
+from padforge.design.contact_comparison import alternative_contacts, beside_straight, errors_by_contact
+from padforge.design.networks import SimulatedPresses, fresh_presses, localisation_error, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
 
 
@@ -107,12 +107,12 @@ def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
     def answer(places):
         return signals(pad, places) + 0.02 * rng.standard_normal((len(places), 4))
 
-    trial = PressSets.of(pad, 12, 300, 0, answer, sensed_mm="beyond")
-    for places, jitter in ((trial.learned, 5 / 49), (trial.fresh, 0)):
+    trial = SimulatedPresses.simulate(pad, 12, 300, 0, answer, sensed_mm="beyond")
+    for places, jitter in ((trial.train_positions, 5 / 49), (trial.test_positions, 0)):
         assert (places >= 0.5).all()
         assert (places <= 2.5 + jitter).all()
         assert (np.ptp(places, axis=0) > 1.97).all()
-    none, one = trial.loss_errors([[()], [(0,), (3,)]], hidden=10)
+    none, one = trial.failure_errors([[()], [(0,), (3,)]], hidden=10)
     assert (none.n_failed, none.subsets, one.n_failed, one.subsets) == (0, 1, 1, 2)
     assert 0.005 < none.mean < one.mean < 0.6
 
@@ -122,17 +122,17 @@ ASKED = PadSettings(grid=2), Scatter(0.02, 0.05, 0.36)
 """What is pressed, and the scatter of responses."""
 
 
-def test_the_contact_believed_comes_first_and_none_twice():
-    for believed in (Contact(), PUBLISHED_CONTACT, Contact(radius=0.9)):
-        contacts = contacts_in_question(believed)
-        assert next(iter(contacts.items())) == ("as believed", believed)
+def test_alternative_contacts_begin_with_the_assumed_one_and_have_none_twice():
+    for assumed in (Contact(), PUBLISHED_CONTACT, Contact(radius=0.9)):
+        contacts = alternative_contacts(assumed)
+        assert next(iter(contacts.items())) == ("as assumed", assumed)
         assert len({contact.model_dump_json() for contact in contacts.values()}) == len(contacts)
-    assert list(contacts_in_question(Contact(radius=0.9)))[1:] == [
-        *("reach of 5 mm", "reach of 6.2 mm", "reach of 7.9 mm"),
+    assert list(alternative_contacts(Contact(radius=0.9)))[1:] == [
+        *("profile of 5 mm", "profile of 6.2 mm", "profile of 7.9 mm"),
         "published disc, K = 0.6",
     ]
-    assert "reach of 6.2 mm" not in contacts_in_question(Contact())
-    assert "published disc, K = 0.6" not in contacts_in_question(PUBLISHED_CONTACT)
+    assert "profile of 6.2 mm" not in alternative_contacts(Contact())
+    assert "published disc, K = 0.6" not in alternative_contacts(PUBLISHED_CONTACT)
 
 
 def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press():
@@ -142,21 +142,21 @@ def test_both_pads_have_errors_under_every_contact_and_feel_more_of_a_wide_press
         (contact, pad) for contact in contacts for pad in ("designed", "straight")
     ]
     for each in found:
-        assert [error.n_failed for error in each.errors] == [0, 1, 2, 3]
-        assert all(math.isfinite(error.mean) and 0 < error.mean < 2 for error in each.errors)
-        assert each.errors[0].mean < each.errors[3].mean
-    wide, narrow = found[1].errors, found[3].errors
-    assert wide[0].mean < 0.5 * narrow[0].mean
+        assert len(each.errors_mm) == 4
+        assert all(math.isfinite(error) and 0 < error < 2 * 11.25 for error in each.errors_mm)
+        assert each.errors_mm[0] < each.errors_mm[3]
+    wide, narrow = found[1].errors_mm, found[3].errors_mm
+    assert wide[0] < 0.5 * narrow[0]
     assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
     two_fibres = {"pad": Morphology.straight(1)}
-    (small,) = errors_by_contact(two_fibres, {"as believed": Contact()}, PadSettings(grid=1), ASKED[1])
-    assert [error.n_failed for error in small.errors] == [0, 1]
+    (small,) = errors_by_contact(two_fibres, {"as assumed": Contact()}, PadSettings(grid=1), ASKED[1])
+    assert len(small.errors_mm) == 2
 
 
 def test_responses_that_scatter_more_are_localised_worse_and_presses_lie_in_no_keep_out():
     hole = PadSettings(grid=2, keep_out_mm=(((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0)),))
     means = [
-        errors_by_contact({"pad": PAD}, {"contact": Contact()}, size, scatter, subsets=1)[0].errors[0].mean
+        errors_by_contact({"pad": PAD}, {"contact": Contact()}, size, scatter, subsets=1)[0].errors_mm[0]
         for size, scatter in ((ASKED[0], Scatter(0.01)), (ASKED[0], Scatter(0.1)), (hole, Scatter(0.01)))
     ]
     assert means[1] > 1.5 * means[0] != means[2]

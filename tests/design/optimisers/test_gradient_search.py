@@ -12,7 +12,7 @@ from padforge.design.contact import fibre_axes
 from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
-from padforge.design.optimize.gradient import OTHER_START, Fibres, GradientSearch, border_of, first_course
+from padforge.design.optimize.gradient import ZIGZAG_START, GradientSearch, Parametrization, border_width, initial_paths
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.optimize.search import search
 from padforge.design.paths.curves import lengths, refine
@@ -47,7 +47,7 @@ def finished(search, rules, start=0):
 @given(st.integers(1, 5), st.integers(1, 9), st.integers(0, 99))
 def test_variables_of_a_pad_give_back_its_knots(grid, knots, seed):
     pad = Morphology.random(grid, knots, seed)
-    back = Morphology(Fibres.through(pad.knots, pad.layout, 1e-3).knots())
+    back = Morphology(Parametrization.from_knots(pad.knots, pad.layout, 1e-3).knots())
     clear = (pad.knots > 0.006 * (grid + 1)) & (pad.knots < 0.994 * (grid + 1))  # others are moved off the border
     assert np.abs(back.knots - pad.knots)[clear].max(initial=0) < 1e-9
     assert np.abs(back.knots - pad.knots).max() < 0.01 * (grid + 1)
@@ -75,9 +75,9 @@ def test_the_lengths_by_which_responses_are_divided_are_those_of_the_curves():
 @pytest.mark.parametrize("knots", [1, 2, 6, 7, 20, 64])
 @pytest.mark.parametrize("rules", [RulesSettings(), FREE])
 def test_every_start_is_a_pad_of_as_many_knots_and_depends_on_its_generator(knots, rules):
-    for grid, start in ((1, 0), (4, 0), (8, OTHER_START)):
+    for grid, start in ((1, 0), (4, 0), (8, ZIGZAG_START)):
         pad = PadSettings(grid=grid)
-        courses = [first_course(pad, rules, knots, None, start, np.random.default_rng(seed)) for seed in (0, 1)]
+        courses = [initial_paths(pad, rules, knots, None, start, np.random.default_rng(seed)) for seed in (0, 1)]
         assert Morphology(courses[0], pad.pitch_mm).knots.shape == (2 * grid, knots + 2, 2)
         assert not np.array_equal(courses[0], courses[1])
 
@@ -85,11 +85,12 @@ def test_every_start_is_a_pad_of_as_many_knots_and_depends_on_its_generator(knot
 def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
     origin = Morphology.random(4, 5, seed=3)
     courses = [
-        first_course(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start)) for start in (0, 1)
+        initial_paths(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start))
+        for start in (0, 1)
     ]
     assert np.array_equal(courses[0], origin.knots)
     assert 0 < np.abs(courses[1] - origin.knots).max() < 1
-    straight = first_course(PadSettings(), RulesSettings(), 5, Morphology.straight(4), 0, np.random.default_rng(0))
+    straight = initial_paths(PadSettings(), RulesSettings(), 5, Morphology.straight(4), 0, np.random.default_rng(0))
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 
@@ -98,14 +99,14 @@ def test_starts_have_nearly_straight_fibres_but_for_a_zigzag_or_the_other_way_ro
     """Within a tenth of a grid unit or so, and clear of the slopes without a gradient of fibres that are quite so."""
     starts = [begun(SearchSettings(), RulesSettings(), start, None, PadSettings(), contact) for start in range(5)]
     offsets = [np.abs(start.fibres.knots()[:4, :, 1] - np.arange(1, 5)[:, None]) for start in starts]
-    assert [each.max() < 0.5 for each in offsets] == [(start == OTHER_START) != gentle for start in range(5)]
+    assert [each.max() < 0.5 for each in offsets] == [(start == ZIGZAG_START) != gentle for start in range(5)]
     assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
 
 
 def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
     rules = RulesSettings(border_mm=400)
     pad = Morphology.random(4, 5)
-    knots = Fibres.through(pad.knots, pad.layout, border_of(PadSettings(), rules)).knots()
+    knots = Parametrization.from_knots(pad.knots, pad.layout, border_width(PadSettings(), rules)).knots()
     assert "border_mm" in {violation.rule for violation in check_rules(Morphology(knots), rules)}
 
 

@@ -19,7 +19,7 @@ from padforge.design import InputError, PadSettings, RulesSettings, SearchOption
 from padforge.design.common import parallel as computing
 from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.command_line import run_to_end
-from padforge.design.optimize import problem as stopping
+from padforge.design.optimize import search as stopping
 
 PAD = PadSettings(grid=1)
 SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, max_failures=1)
@@ -126,7 +126,7 @@ class Hung(Executor):
 
 
 def test_the_deadline_holds_on_an_executor_that_hangs(monkeypatch):
-    monkeypatch.setattr(stopping, "LATEST_S", 0.1)
+    monkeypatch.setattr(stopping, "GRACE_S", 0.1)
     result = search(PAD, None, SMALL, run=SearchOptions(time_budget=0.1, executor=Hung()))
     assert result.stopped == "out of time"
     assert len(result.morphology.knots) == 2

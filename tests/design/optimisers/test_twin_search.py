@@ -5,7 +5,6 @@ import pytest
 
 from padforge.design.contact_comparison import ContactErrors
 from padforge.design.morphology import Morphology
-from padforge.design.networks import FailureError
 from padforge.design.optimize import twin_search
 from padforge.design.optimize.search import SearchOptions
 from padforge.design.optimize.twin_search import choose, search_for_twin
@@ -44,14 +43,14 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
     def judged(pads, contacts, size, scatter, seed, subsets):
         assert set(pads) == ({"usual", "straight fibres", "twin", "from usual"} if expected != "twin" else {"twin"})
         for name in pads:
-            errors = [FailureError(k, 1, 1.0 if name == "straight fibres" else 2.0, 0.0, 2.0) for k in range(2)]
-            yield ContactErrors("", name, tuple(errors))
+            errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)
+            yield ContactErrors("", name, errors)
 
     monkeypatch.setattr(twin_search, "errors_by_contact", lambda *asked: list(judged(*asked)))
     quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
     pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []
-    run = SearchOptions(report=lambda name, done, total, objective: steps.append(name))
+    run = SearchOptions(on_progress=lambda name, done, total, objective: steps.append(name))
     found = search_for_twin(pad, contact, quick, RulesSettings(**rules), quick, run=run)
     assert found.candidate == expected
     assert bool(found.violations) == (expected == "twin")

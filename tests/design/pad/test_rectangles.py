@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized
 from padforge.design.contact import signals_sparse
 from padforge.design.indentation import Indenter, indented_signals
+from padforge.design.objectives.ambiguity import ambiguities
 from padforge.design.objectives.rules import check_rules
-from padforge.design.objectives.score import ambiguities
 from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 

@@ -30,6 +30,7 @@ def design_document() -> dict:
             "ambiguity_mm_1": 2.25,
             "information": 9.5,
         },
+        "descriptions": {"information": "mutual information, bits"},
         "straight": {
             "expected_error_mm_0": 1.35,
             "expected_error_mm_1": 2.7,
@@ -66,7 +67,7 @@ def calibration_document() -> dict:
 
 def contacts_document() -> dict:
     """Of a pad that errs by half as much as straight fibres, but not under the published disc."""
-    errors = {("as believed", "designed"): [0.5, 0.75], ("as believed", "straight"): [1.0, 1.5]}
+    errors = {("as assumed", "designed"): [0.5, 0.75], ("as assumed", "straight"): [1.0, 1.5]}
     errors |= {("published disc, K = 0.6", "designed"): [4.0, 6.0], ("published disc, K = 0.6", "straight"): [3.0, 5.0]}
     rows = [{"contact": contact, "pad": pad, "errors_mm": each} for (contact, pad), each in errors.items()]
     scatter = {"floor": 0.02, "share": 0.18, "common": 0.36}

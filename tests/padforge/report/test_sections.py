@@ -13,8 +13,8 @@ from markupsafe import escape
 
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import Fault, InputError
-from padforge.design.contact_comparison import contact_line
 from padforge.design.morphology import Morphology
+from padforge.design.report import contact_line
 from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recordings.recorder import Recorder
@@ -35,7 +35,7 @@ MOST_PAGE_BYTES = 8_000_000
 def test_every_stage_has_a_linked_section(page: Path) -> None:
     text = page.read_text()
     titles = re.findall(r'<h2 id="(.*?)">(.*?)</h2>', text)
-    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "The contact believed"]
+    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Contact model"]
     assert [title for _, title in titles] == [*names, "Studies", "Provenance"]
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
     assert text.count("data:image/") == 5  # plan, mould, tracks, which way round, and the study's figure
@@ -242,10 +242,10 @@ def test_report_omits_pictures_of_other_mould(pad: Path) -> None:
 
 def test_report_shows_errors_by_contact(page: Path) -> None:
     assert contact_line(contacts_document()) == (
-        "contact: a small network on one reading of each fibre errs by 0.50 mm as believed, 4.00 to 4.00 mm otherwise;"
-        " of straight ones by 1.00 mm as believed, 3.00 to 3.00 mm otherwise"
+        "contact: mean error of a small network 0.50 mm under the assumed contact, 4.00 to 4.00 mm otherwise;"
+        " of straight fibres 1.00 mm under the assumed contact, 3.00 to 3.00 mm otherwise"
     )
-    section = page.read_text().split("The contact believed</h2>")[1].split("</section>")[0]
+    section = page.read_text().split("Contact model</h2>")[1].split("</section>")[0]
     rows = [re.findall(r"<td.*?>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section, re.S)]
     assert ["published disc, K = 0.6", "designed", "4.00", "6.00"] in rows
     assert len([row for row in rows if row]) == 4

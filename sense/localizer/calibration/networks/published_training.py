@@ -26,7 +26,7 @@ def train_published(learn: TrainingPresses, check: TrainingPresses, rng: np.rand
         Weights as `network.forward` takes them, the scales of the published network folded in.
     """
     x, y, *checks = (_flat(part) for part in (learn.inputs, learn.targets, check.inputs, check.targets))
-    network = fit(x, y, rng, HIDDEN, check=(checks[0], checks[1]))
+    network = fit(x, y, rng, HIDDEN, validation=(checks[0], checks[1]))
     into, onto = network.inputs, network.targets
     plain = network.hidden[:, :-1]
     slope = np.divide(plain, into.half, out=np.zeros_like(plain), where=into.half > 0)

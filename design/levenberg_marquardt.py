@@ -1,0 +1,294 @@
+"""Batched Levenberg-Marquardt with variable projection: networks of one hidden layer trained side by side.
+
+The output weights that are best for given hidden ones solve a ridge regression, so only the hidden weights are searched
+for (G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973; the Jacobian J is that of L. Kaufman, BIT 15,
+1975: output weights held). With activations H, Z Z' = H (H'H + ridge)^-1 H' and the residual projector R = 1 - Z Z', a
+step solves (J'R J + damping) change = J'e, or the dual equations where there are fewer residuals than weights. The
+damping follows H. B. Nielsen (IMM-REP-1999-05, 1999).
+
+Shapes: S networks, Q samples, D inputs, H hidden neurons, O outputs, A alternative targets, P = (D + 1) H weights.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import torch
+from torch import Tensor
+
+MAX_STALLED_STEPS = 3
+"""Steps in a row without a new best on validation that end the training."""
+RIDGE = 1e-5
+"""Penalty of squared output weights per sample: keeps them finite where neurons are alike."""
+INITIAL_DAMPING = 3.0
+"""In units of the mean curvature: high, since small first steps lead to smoother networks."""
+MIN_DAMPING_FACTOR = 0.2
+"""Least factor by which an accepted step lowers the damping."""
+MIN_DAMPING, MAX_DAMPING = 1e-15, 1e10
+MIN_GRADIENT = 1e-7
+BLOCK = 64
+"""Columns of a symmetric product computed at once."""
+
+Samples = tuple[Tensor, Tensor]
+"""Scaled inputs (S, Q, D) and targets (S, A, Q, O)."""
+
+
+def train_batch(
+    hidden: Tensor, training: Samples, validation: Samples, max_steps: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Train every network until validation stalls for MAX_STALLED_STEPS, or no step lowers its loss.
+
+    Args:
+        hidden: initial hidden weights; shape (S, D + 1, H).
+        training: samples to fit.
+        validation: samples by which the best step is chosen.
+        max_steps: most accepted steps of a network.
+
+    Returns:
+        Hidden (S, D + 1, H) and output weights (S, H + 1, O) that did best on `validation`, and (S,) accepted steps.
+    """
+    batch = _Batch.start(hidden, training, validation)
+    best = batch.fit.hidden.clone(), batch.fit.output.clone()
+    steps = torch.zeros_like(batch.index)
+    while max_steps > 0 and len(batch.index):
+        improved, finished = batch.step()
+        for stored, current in zip(best, (batch.fit.hidden, batch.fit.output), strict=True):
+            stored[batch.index[improved]] = current[improved]
+        steps[batch.index] = batch.steps
+        finished |= batch.steps == max_steps
+        if finished.any():
+            batch = batch.rows(~finished)
+    return best[0], best[1], steps
+
+
+@dataclass
+class _Rows:
+    """Tensors that have a row for each network."""
+
+    def rows(self, index: Tensor) -> Self:
+        """Return those of the networks at `index`."""
+        parts = (getattr(self, field.name) for field in fields(self))
+        return type(self)(*(part.rows(index) if isinstance(part, _Rows) else part[index] for part in parts))
+
+    def replace_rows(self, other: Self, mask: Tensor) -> None:
+        """Take over the rows of `other` where `mask` (S,) is set."""
+        is_whole = bool(mask.all())
+        for field in fields(self):
+            current, new = getattr(self, field.name), getattr(other, field.name)
+            rows = mask.view(-1, *[1] * (current.dim() - 1))
+            setattr(self, field.name, new if is_whole else torch.where(rows, new, current))
+
+
+@dataclass
+class ProjectedFit(_Rows):
+    """Networks with the output weights that are best for their hidden ones.
+
+    Attributes:
+        hidden: hidden weights; shape (S, D + 1, H).
+        targets: of equally valid targets the ones nearest to the outputs; shape (S, Q, O).
+        neurons: activations, the last column 1; shape (S, Q, H + 1).
+        root: inverse Cholesky factor of the ridged Gram matrix, with Z = neurons root'; shape (S, H + 1, H + 1).
+        output: output weights; shape (S, H + 1, O).
+        error: residual; shape (S, Q, O).
+        loss: squared error with the ridge's penalty; shape (S,).
+    """
+
+    hidden: Tensor
+    targets: Tensor
+    neurons: Tensor
+    root: Tensor
+    output: Tensor
+    error: Tensor
+    loss: Tensor
+
+    @classmethod
+    def solve(cls, hidden: Tensor, x: Tensor, targets: Tensor) -> Self:
+        """Solve for the output weights.
+
+        Args:
+            hidden: hidden weights; shape (S, D + 1, H).
+            x: inputs with a last column of 1; shape (S, Q, D + 1).
+            targets: shape (S, Q, O).
+        """
+        neurons = activations(hidden, x)
+        ridge = RIDGE * x.shape[1]
+        gram = neurons.mT @ neurons
+        gram.diagonal(dim1=1, dim2=2).add_(ridge)
+        factor = torch.linalg.cholesky_ex(gram).L
+        root = torch.linalg.solve_triangular(factor, torch.eye(gram.shape[1]).to(gram), upper=False)
+        output = root.mT @ (root @ (neurons.mT @ targets))
+        error = torch.baddbmm(targets, neurons, output, beta=-1)
+        loss = _sum_squares(error) + ridge * _sum_squares(output)
+        return cls(hidden, targets, neurons, root, output, error, loss)
+
+    def reassign(self, x: Tensor, targets: Tensor) -> "ProjectedFit":
+        """Return the fit to those of the targets (S, A, Q, O) that are nearest to the outputs: never a worse one."""
+        if targets.shape[1] == 1:
+            return self
+        return ProjectedFit.solve(self.hidden, x, _nearest_targets(self.neurons @ self.output, targets)[0])
+
+    def basis(self, like: Tensor) -> Tensor:
+        """Return Z (S, Q, H + 1) in the precision of `like`."""
+        return self.neurons.to(like) @ self.root.mT.to(like)
+
+    @property
+    def slopes(self) -> Tensor:
+        """Derivatives of the activations, 1 - h^2; shape (S, Q, H)."""
+        return 1 - self.neurons[:, :, :-1].square()
+
+
+@dataclass
+class _Batch(_Rows):
+    """The networks still in training.
+
+    Attributes:
+        index: which of all networks they are; shape (L,).
+        steps: accepted steps of each; shape (L,).
+        fit: their weights and residuals.
+        x: training inputs; shape (L, Q, D + 1).
+        targets: training targets; shape (L, A, Q, O).
+        validation_x: validation inputs.
+        validation_targets: validation targets.
+        best_loss: least squared error on validation so far; shape (L,).
+        stalled: accepted steps since; shape (L,).
+        damping: shape (L,).
+        growth: factor on the damping if the next step fails; shape (L,).
+    """
+
+    index: Tensor
+    steps: Tensor
+    fit: ProjectedFit
+    x: Tensor
+    targets: Tensor
+    validation_x: Tensor
+    validation_targets: Tensor
+    best_loss: Tensor
+    stalled: Tensor
+    damping: Tensor
+    growth: Tensor
+
+    @classmethod
+    def start(cls, hidden: Tensor, training: Samples, validation: Samples) -> Self:
+        """Return the batch before the first step."""
+        (x, targets), (checked_x, checked) = ((append_ones(inputs), goal) for inputs, goal in (training, validation))
+        fit = ProjectedFit.solve(hidden, x, targets[:, 0]).reassign(x, targets)
+        loss = _sum_squares(_nearest_targets(activations(hidden, checked_x) @ fit.output, checked)[1])
+        index = torch.arange(len(hidden), device=hidden.device)
+        zero, unset, two = torch.zeros_like(index), torch.full_like(loss, torch.nan), torch.full_like(loss, 2.0)
+        return cls(index, zero, fit, x, targets, checked_x, checked, loss, zero, unset, two)
+
+    def step(self) -> tuple[Tensor, Tensor]:
+        """Try a step of every network; where it is rejected, the next one is damped more.
+
+        Returns:
+            (L,) whether it is the best on validation so far, and whether it was the last one to try.
+        """
+        gradient = jacobian_product(self.x, self.fit, self.fit.error)
+        change = self._solve(gradient)
+        candidate = ProjectedFit.solve(self.fit.hidden - change.view_as(self.fit.hidden), self.x, self.fit.targets)
+        predicted = (change * (self.damping[:, None] * change + gradient)).sum(dim=1)
+        ratio = (self.fit.loss - candidate.loss) / predicted
+        accepted = (ratio > 0) & candidate.loss.isfinite()
+        self.fit.replace_rows(candidate.reassign(self.x, self.targets), accepted)
+        factor = (1 - (2 * ratio - 1) ** 3).clamp(min=MIN_DAMPING_FACTOR)
+        self.damping = (self.damping * torch.where(accepted, factor, self.growth)).clamp(min=MIN_DAMPING)
+        self.growth = torch.where(accepted, 2.0, 2 * self.growth)
+        self.steps = self.steps + accepted
+        outputs = activations(self.fit.hidden, self.validation_x) @ self.fit.output
+        loss = _sum_squares(_nearest_targets(outputs, self.validation_targets)[1])
+        improved = accepted & (loss < self.best_loss)
+        self.best_loss = torch.where(improved, loss, self.best_loss)
+        self.stalled = torch.where(improved, 0, self.stalled + accepted)
+        unfinished = (gradient.norm(dim=1) >= MIN_GRADIENT) & (self.damping <= MAX_DAMPING)
+        return improved, ~(unfinished & (self.stalled < MAX_STALLED_STEPS))
+
+    def _solve(self, gradient: Tensor) -> Tensor:
+        """Return (L, P) by which hidden weights are lowered; NaN where a damped matrix is singular to rounding."""
+        is_dual = self.fit.error[0].numel() < gradient.shape[1]
+        # single precision serves: the loss decides, in double precision, whether the step is taken
+        matrix = (dual_matrix if is_dual else gauss_newton_matrix)(self.x.float(), self.fit)
+        right = (-self.fit.targets.flatten(1) if is_dual else gradient).float()
+        diagonal = matrix.diagonal(dim1=1, dim2=2)
+        if self.damping.isnan().any():
+            self.damping = INITIAL_DAMPING * diagonal.double().sum(dim=1) / gradient.shape[1]
+        diagonal += self.damping[:, None]
+        factor, failed = torch.linalg.cholesky_ex(matrix)
+        change = torch.cholesky_solve(right[:, :, None], factor)[:, :, 0].double()
+        change[failed != 0] = torch.nan
+        if not is_dual:
+            return change
+        residual, basis = change.view_as(self.fit.error), self.fit.basis(gradient)
+        return jacobian_product(self.x, self.fit, residual - basis @ (basis.mT @ residual))
+
+
+def append_ones(x: Tensor) -> Tensor:
+    """Return x (S, Q, D) with a last column of 1, for the biases."""
+    return torch.cat([x, torch.ones_like(x[:, :, :1])], dim=2)
+
+
+def activations(hidden: Tensor, x: Tensor) -> Tensor:
+    """Return (S, Q, H + 1) activations of the neurons for x (S, Q, D + 1), and 1."""
+    return append_ones(torch.tanh(x @ hidden))
+
+
+def jacobian_product(x: Tensor, fit: ProjectedFit, error: Tensor) -> Tensor:
+    """Return J'e (S, P) for errors (S, Q, O)."""
+    return (x.mT @ ((error @ fit.output[:, :-1].mT) * fit.slopes)).flatten(1)
+
+
+def gauss_newton_matrix(x: Tensor, fit: ProjectedFit) -> Tensor:
+    """Return J'R J (S, P, P), its lower triangle only, in the precision of x (S, Q, D + 1).
+
+    Output k responds to the weight of neuron i on input a by V_ki (1 - h_i^2) x_a: all but V_ki is common to the
+    outputs, so that one symmetric product serves all of them.
+    """
+    networks, samples, inputs = x.shape
+    slopes = fit.slopes.to(x)
+    parts = (x[..., None] * slopes[:, :, None, :]).view(networks, samples, -1)
+    size = parts.shape[2]
+    matrix = x.new_empty(networks, size, size)
+    # block by block, which spares almost half of the full product; what lies above the blocks is never read
+    for begin in range(0, size, BLOCK):
+        end = begin + BLOCK
+        matrix[:, begin:, begin:end] = parts[:, :, begin:].mT @ parts[:, :, begin:end]
+    projected = fit.basis(x).mT @ parts
+    matrix.baddbmm_(projected.mT, projected, alpha=-1)
+    weights = fit.output[:, :-1].to(x)
+    gram = weights @ weights.mT
+    by_neuron = matrix.view(networks, inputs, len(gram[0]), inputs, len(gram[0]))
+    by_neuron *= gram[:, None, :, None, :]
+    return matrix
+
+
+def dual_matrix(x: Tensor, fit: ProjectedFit) -> Tensor:
+    """Return R J J'R (S, Q O, Q O), in the precision of x (S, Q, D + 1).
+
+    Entry ((q, k), (r, l)) of J J' is (x_q . x_r) sum_i V_ki V_li b_qi b_ri with b = 1 - h^2.
+    """
+    networks, samples, outputs = fit.error.shape
+    slopes, basis = fit.slopes.to(x), fit.basis(x)
+    gram = x @ x.mT
+    matrix = x.new_empty(networks, samples, outputs, samples, outputs)
+    weighted = [slopes * fit.output[:, None, :-1, k].to(x) for k in range(outputs)]
+    for k in range(outputs):
+        for other in range(k + 1):
+            block = (weighted[k] @ weighted[other].mT).mul_(gram)
+            block.baddbmm_(basis, basis.mT @ block, alpha=-1)
+            block.baddbmm_(block @ basis, basis.mT, alpha=-1)
+            matrix[:, :, k, :, other] = block
+            if other < k:
+                matrix[:, :, other, :, k] = block.mT
+    return matrix.view(networks, samples * outputs, samples * outputs)
+
+
+def _nearest_targets(outputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """Return those of the targets (S, A, Q, O) nearest to the outputs (S, Q, O), and the errors."""
+    errors = outputs[:, None] - targets
+    if targets.shape[1] == 1:
+        return targets[:, 0], errors[:, 0]
+    nearest = errors.square().sum(dim=3, keepdim=True).argmin(dim=1, keepdim=True)
+    return targets.take_along_dim(nearest, dim=1)[:, 0], errors.take_along_dim(nearest, dim=1)[:, 0]
+
+
+def _sum_squares(values: Tensor) -> Tensor:
+    """Return (S,) sums of squares of (S, ...)."""
+    return values.square().sum(dim=(1, 2))

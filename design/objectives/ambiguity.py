@@ -1,0 +1,203 @@
+"""Localisation ambiguity: how far away the presses lie that noise makes a press be taken for.
+
+With signals s_a of presses a at positions p_a, and the set K of fibres that work, press a is read as b with the
+posterior
+
+    w_ab = exp(-|s_a - s_b|^2_K / 4 sigma^2) / sum_c exp(-|s_a - s_c|^2_K / 4 sigma^2),
+    A_K = mean_a sum_b w_ab |p_a - p_b|.
+
+4 sigma^2, and not 2 sigma^2, since both readings are noisy.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from padforge.design.common.validation import InputError
+from padforge.design.contact import fibre_axes, grid_positions, press_shape, relative_stretch, signals
+from padforge.design.kernels.measured_signals import element_signals, element_spacing, fibre_elements
+from padforge.design.kernels.pchip import population_slopes
+from padforge.design.morphology import Array, Morphology
+from padforge.design.objectives.fibre_loss import failure_masks, failure_shares, failure_subsets
+from padforge.design.paths.curves import lengths
+from padforge.design.paths.keep_outs import is_outside
+from padforge.design.settings import Contact, PadSettings
+
+SIDE, MAX_SUBSETS = 20, 64
+"""Presses along a side of the grid, and sets of failed fibres of a size."""
+AMBIGUITY_NOISE = 0.05
+"""Of a signal, share of full scale, under which pads are compared: under less, no good pad confuses anything."""
+MAX_NEG_LOG_LIKELIHOOD = 20.0
+"""Beyond it (2e-9 of the likelihood of the press itself) a press is not taken for another one."""
+MAX_EXPONENT = 300.0
+"""Up to here exp(-sum) is the product of the exponentials, without overflow."""
+
+
+def free_presses(size: PadSettings) -> Array:
+    """Return (Q, 2) up to SIDE x SIDE positions over what is pressed, grid units, that lie in no keep-out.
+
+    Raises:
+        InputError: there is none.
+    """
+    presses = grid_positions(size.sensed, SIDE)
+    presses = presses[is_outside(presses, size)]
+    if not len(presses):
+        raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
+    return presses
+
+
+def ambiguity(signals: Tensor, presses: Tensor, masks: Tensor, weights: Tensor, noise: float) -> Tensor:
+    """Compute A of the module's formula, weighted over sets of failed fibres; differentiable.
+
+    Args:
+        signals: shape (F, Q).
+        presses: shape (Q, 2), grid units.
+        masks: 1 for a fibre that works, 0 for a failed one; shape (L, F).
+        weights: of each set, sum 1; shape (L,).
+        noise: sigma of a signal, grid units, > 0.
+    """
+    scaled = masks.double()[:, None, :] * (signals.T.double() / (2 * noise))
+    # |s_a|^2 is the same for every b and cancels in the posterior; what remains is one product of matrices, in double
+    # precision since it cancels
+    log_likelihood = torch.baddbmm(-(scaled**2).sum(dim=-1)[:, None, :], scaled, scaled.mT, alpha=2)
+    posterior = torch.softmax(log_likelihood.to(presses.dtype), dim=-1)
+    distance = torch.einsum("lab,ab->l", posterior, torch.cdist(presses, presses)) / len(presses)
+    return distance @ weights
+
+
+def ambiguities(
+    pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
+) -> list[float]:
+    """Compute the ambiguity with 0, 1, ... fibres failed on a grid of presses.
+
+    Args:
+        pad: the fibres.
+        contact: what a press does to them.
+        max_failures: most failed fibres, or weights of 0, 1, ... failed.
+        noise: of a signal, share of full scale.
+        size: says what is pressed.
+
+    Returns:
+        Means over sets of failed fibres, grid units.
+    """
+    presses = free_presses(size)
+    stretch = torch.tensor(relative_stretch(pad, presses, contact).T, dtype=torch.float32)
+    touched = stretch.any(dim=1)  # the other fibres have no information; on a large pad they are most
+    stretch = stretch[touched]
+    positions = torch.tensor(presses, dtype=torch.float32)
+    fibres = len(pad.knots)
+    values = []
+    for n_failed in range(min(len(failure_shares(max_failures)), fibres)):
+        masks = torch.tensor(failure_masks(fibres, n_failed, MAX_SUBSETS), dtype=torch.float32)[:, touched]
+        equal = torch.full((len(masks),), 1 / len(masks))
+        values.append(ambiguity(stretch, positions, masks, equal, noise * full_scale(stretch)).item())
+    return values
+
+
+def full_scale(signals: Tensor) -> float:
+    """Return the mean over touched fibres of their largest signal, from signals (F, Q); 1 if none is touched."""
+    largest = signals.detach().amax(dim=1)
+    touched = largest[largest > 0]
+    return touched.mean().item() if len(touched) else 1.0
+
+
+def ambiguity_map(
+    pad: Morphology, presses: Array, contact: Contact, max_failures: int | tuple[float, ...], noise: float
+) -> Array:
+    """Compute the ambiguity of every press, fast enough to follow a person who draws.
+
+    Args:
+        pad: the fibres.
+        presses: positions, each of which may be taken for any other; shape (Q, 2), grid units.
+        contact: exact, but for a sensitivity profile within the PRECISION of `measured_signals`.
+        max_failures: most failed fibres, or weights of 0, 1, ... failed.
+        noise: of a signal, share of full scale.
+
+    Returns:
+        Means over sets of 0, 1, ... K - 1 failed fibres; shape (K, Q), grid units.
+    """
+    stretch = _fast_signals(pad, presses, contact) / lengths(pad)
+    largest = stretch.max(axis=0)
+    scale = largest[largest > 0].mean() if largest.any() else 1.0
+    fibres = stretch.shape[1]
+    most = min(len(failure_shares(max_failures)), fibres) - 1
+    subsets = [failure_subsets(fibres, n_failed, MAX_SUBSETS) for n_failed in range(most + 1)]
+    # rows of equal length, filled up with F
+    failed = np.array([(*row, *(fibres,) * (most - len(row))) for level in subsets for row in level], dtype=np.int64)
+    values = _press_ambiguities(np.ascontiguousarray(stretch / (2 * noise * scale)), presses, failed)
+    ends = np.cumsum([len(level) for level in subsets])
+    return np.stack([level.mean(axis=1) for level in np.split(values, ends[:-1], axis=1)])
+
+
+def _fast_signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
+    """Return signals (Q, F) as precise as a search needs them."""
+    if not contact.sensitivity_profile:
+        return signals(pad, presses, contact)
+    along, across, ends, _ = fibre_axes(pad)
+    slope = population_slopes(along, across)[0]
+    law = press_shape(contact, pad.unit_mm)[2]
+    spacing = element_spacing(contact.profile_points(pad.unit_mm))
+    elements = fibre_elements(along[0], across[0], slope, ends.horizontals, presses, law.radius, spacing, law.length)
+    out = np.empty((len(presses), len(slope)))
+    element_signals(along[0], across[0], elements, presses, law.radius, law.profile, out)
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
+    """Compute sum_b w_ab |p_a - p_b| for every press a and every set of failed fibres.
+
+    Exact, without the pairs of presses that add nothing.
+
+    Args:
+        signals: divided by twice their noise; shape (Q, F).
+        presses: shape (Q, 2).
+        failed: indices of failed fibres, F where there are fewer than K; shape (L, K).
+
+    Returns:
+        (Q, L).
+    """
+    count, fibres = signals.shape
+    sets, most = failed.shape
+    out, weight = np.zeros((count, sets)), np.ones((count, sets))
+    square, factor, largest = np.zeros(fibres + 1), np.ones(fibres + 1), np.empty(most)
+    likelihood = np.empty(sets)
+    for a in range(count):
+        for b in range(a):
+            # 1. squared distance of the signals, and its `most` largest terms in descending order
+            total = 0.0
+            largest[:] = 0.0
+            for f in range(fibres):
+                term = (signals[a, f] - signals[b, f]) ** 2
+                square[f] = term
+                total += term
+                for k in range(most):
+                    if term > largest[k]:
+                        term, largest[k] = largest[k], term
+            if total - largest.sum() > MAX_NEG_LOG_LIKELIHOOD:  # whichever fibres fail
+                continue
+            # 2. likelihood without the terms of the failed fibres
+            if total < MAX_EXPONENT:
+                factor[:fibres] = np.exp(square[:fibres])
+                product = math.exp(-total)
+                for k in range(sets):
+                    likelihood[k] = product
+                    for j in range(most):
+                        likelihood[k] *= factor[failed[k, j]]
+            else:
+                for k in range(sets):
+                    remaining = total
+                    for j in range(most):
+                        remaining -= square[failed[k, j]]
+                    likelihood[k] = math.exp(-remaining)
+            # 3. both presses of the pair
+            distance = math.hypot(presses[a, 0] - presses[b, 0], presses[a, 1] - presses[b, 1])
+            for press in (a, b):
+                for k in range(sets):
+                    weight[press, k] += likelihood[k]
+                    out[press, k] += likelihood[k] * distance
+    return out / weight
