@@ -120,9 +120,9 @@ class _PublishedNetwork:
 def _train_marquardt(x: Array, y: Array, epochs: int) -> Predict:
     from padforge.design.networks import fit
 
-    validation = np.arange(len(x)) % 12 == 0
-    check = x[validation], y[validation]
-    return fit(x[~validation], y[~validation], np.random.default_rng(0), HIDDEN, epochs, check=check)
+    held_out = np.arange(len(x)) % 12 == 0
+    train, validation = (x[~held_out], y[~held_out]), (x[held_out], y[held_out])
+    return fit(*train, np.random.default_rng(0), HIDDEN, epochs, validation=validation)
 
 
 def _train_lbfgs(x: Array, y: Array, iterations: int) -> Predict:
