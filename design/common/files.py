@@ -27,7 +27,7 @@ from functools import partial
 from importlib import metadata
 from itertools import count
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from padforge.design.common.validation import InputError, short_repr
 
@@ -140,7 +140,7 @@ def lock(file: IO[Any] | int, busy: str) -> None:
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Lock a file or folder during the body; do nothing on Windows, where nothing that is open can be renamed.
+    """Lock a file or folder during the body, as `lock`; do nothing on Windows, where nothing open can be renamed.
 
     Args:
         path: the file or folder.
@@ -305,7 +305,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
         return
     with reraise_write_error(path):
         if path.exists() and not path.is_file():
-            raise InputError(f"{path}: cannot be written (it is there and no file)")
+            raise InputError(f"{path}: cannot be written (it exists and is no file)")
         path.parent.mkdir(parents=True, exist_ok=True)
         recover(path.parent)  # else a later recovery would replace the new file by an older one
         with temporary_file(path.parent, path.suffix) as temporary:
@@ -327,20 +327,6 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         ValueError: it holds NaN or infinity, which JSON does not have.
     """
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
-def open_in_place(path: Path) -> BinaryIO:
-    """Open an existing file for reading and writing in place, unbuffered, without following a symbolic link.
-
-    Raises:
-        InputError: it is a symbolic link.
-        OSError: it cannot be opened.
-    """
-    file = path.open("r+b", buffering=0)
-    if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
-        file.close()
-        raise InputError(f"{path}: is a link, and none is followed where a file is gone on with")
-    return file
 
 
 def sync(path: Path) -> None:
@@ -443,9 +429,11 @@ def recover(folder: Path) -> None:
         InputError: it cannot be completed, or is of another user or folder.
     """
     exchange, deadline = folder / EXCHANGE, time.monotonic() + PATIENCE_S
-    while (note := _read_note(folder)) is not None:
+    while _read_note(folder) is not None:
         try:
             with reraise_write_error(folder), locked(exchange, f"{folder}: another run is moving its files there"):
+                if (note := _read_note(folder)) is None:  # read again under the lock, without which it may change
+                    return
                 user = getattr(os, "geteuid", int)()  # on Windows all files are of user 0
                 if {exchange.lstat().st_uid, (exchange / _NOTE).lstat().st_uid} != {user}:
                     raise InputError(f"{exchange}: left by a run of another user, who completes it by another run")
@@ -455,8 +443,9 @@ def recover(folder: Path) -> None:
                     with suppress(FileNotFoundError):  # it has moved
                         (exchange / name).replace(folder / name)
                 # One rename ends the exchange: if its folder is not removed then, it is a leftover like any other.
-                leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")
-                shutil.rmtree(leftover, ignore_errors=True)
+                with suppress(FileNotFoundError):  # on Windows, where another run may have ended it
+                    leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")
+                    shutil.rmtree(leftover, ignore_errors=True)
         except BusyError:
             if time.monotonic() > deadline:
                 raise

@@ -41,41 +41,36 @@ _COMPLEX = 0x800
 
 
 class Hdf5Reader:
-    """The datasets of an open HDF5 file, by their paths without the first slash.
+    """The datasets of an open HDF5 file, of which at most MAX_VALUES values together are read.
 
-    All that is read has at most MAX_VALUES values together.
+    Attributes:
+        names: paths, without the first slash, of all datasets that are reached without a link; in alphabetical order.
     """
 
     def __init__(self, file: Any) -> None:
-        self._file = file
-        self._remaining = MAX_VALUES
-        self._names: list[str] | None = None
-
-    @property
-    def names(self) -> list[str]:
-        """All datasets that no link leads to, in alphabetical order.
+        """List the datasets.
 
         Raises:
             InputError: the file has more than MAX_OBJECTS groups and datasets, or more than MAX_DEPTH nested groups.
         """
         import h5py
 
-        if self._names is None:
-            names, n_objects = list[str](), 0
+        self.names: list[str] = []
+        self._file = file
+        self._remaining = MAX_VALUES
+        n_objects = 0
 
-            def visit(name: str, node: Any) -> bool | None:
-                nonlocal n_objects
-                n_objects += 1
-                if name.count("/") >= MAX_DEPTH:
-                    raise InputError(f"it has groups within groups, more than {MAX_DEPTH} of them")
-                if isinstance(node, h5py.Dataset):
-                    names.append(name)
-                return True if n_objects > MAX_OBJECTS else None
-
-            if self._file.visititems(visit):
+        def visit(name: str, node: Any) -> None:
+            nonlocal n_objects
+            n_objects += 1
+            if n_objects > MAX_OBJECTS:
                 raise InputError(f"it holds more than {MAX_OBJECTS} groups and datasets")
-            self._names = names
-        return self._names
+            if name.count("/") >= MAX_DEPTH:
+                raise InputError(f"it has groups within groups, more than {MAX_DEPTH} of them")
+            if isinstance(node, h5py.Dataset):
+                self.names.append(name)
+
+        file.visititems(visit)
 
     @property
     def numeric_names(self) -> list[str]:

@@ -12,22 +12,22 @@ function setChildren(group, parts) { byId(group).replaceChildren(...parts) }
 function build(view, handlers) {
   const {scale, x, y} = frame(view), [wide, high] = view.cell_mm
   layers = {key: layerKey(view), cells: [], fibres: [], knots: []}
-  layers.cells = view.positions_mm.map(([px, py]) => drawn("rect", {
+  layers.cells = view.positions_mm.map(([px, py]) => svgElement("rect", {
     x: x(px - wide / 2), y: y(py + high / 2), width: wide * scale, height: high * scale,
   }))
   setChildren("map", layers.cells)
   const [left, low, right, top] = view.sensed_mm
-  setChildren("grid", [...gridParts(view), drawn("rect", {
+  setChildren("grid", [...gridElements(view), svgElement("rect", {
     class: "sensed", x: x(left), y: y(top), width: (right - left) * scale, height: (top - low) * scale,
   })])
-  setChildren("keep-outs", view.keep_out_mm.map(corners => drawn("polygon", {
+  setChildren("keep-outs", view.keep_out_mm.map(corners => svgElement("polygon", {
     class: "keep-out", points: corners.map(([px, py]) => `${x(px)},${y(py)}`).join(" "),
   })))
   layers.fibres = view.fibres.map((fibre, index) => {
-    const group = drawn("g", {class: `f${fibre.family}`})
-    const parts = ["halo", "path", "hit"].map(name => drawn("path", {class: name}))
+    const group = svgElement("g", {class: `f${fibre.family}`})
+    const parts = ["halo", "path", "hit"].map(name => svgElement("path", {class: name}))
     const [ex, ey] = fibre.knots.at(-1), horizontal = fibre.family === 0
-    const label = drawn("text", {
+    const label = svgElement("text", {
       x: x(ex) + (horizontal ? 5 : 0), y: y(ey) + (horizontal ? 4 : -6), "text-anchor": horizontal ? "start" : "middle",
     }, index + 1)
     parts[2].addEventListener("pointerdown", () => handlers.select(index))
@@ -39,8 +39,8 @@ function build(view, handlers) {
   const order = view.fibres.map((fibre, index) => [fibre.family === view.deep_family ? 0 : 1, index]).sort((a, b) => a[0] - b[0] || a[1] - b[1])
   setChildren("lines", order.map(([, index]) => layers.fibres[index].group))
   layers.knots = view.fibres.map((fibre, f) => fibre.knots.slice(1, -1).map((_, k) => {
-    const knot = drawn("g", {class: "knot", role: "button"})
-    knot.append(drawn("circle", {class: "grip", r: 13}), drawn("circle", {class: "dot", r: 4}))
+    const knot = svgElement("g", {class: "knot", role: "button"})
+    knot.append(svgElement("circle", {class: "grip", r: 13}), svgElement("circle", {class: "dot", r: 4}))
     knot.addEventListener("pointerdown", event => handlers.hold(f, k + 1, event))
     knot.addEventListener("focus", () => handlers.select(f, k + 1))
     return knot
@@ -71,7 +71,7 @@ function update(view, selected, limit, nFailed) {
   })
   setChildren("violations", view.rules.filter(rule => rule.place_mm).map(rule => {
     const cx = x(rule.place_mm[0]), cy = y(rule.place_mm[1])
-    return drawn("path", {class: "violation", d: `M${cx - 6},${cy - 6}l12,12m0,-12l-12,12`})
+    return svgElement("path", {class: "violation", d: `M${cx - 6},${cy - 6}l12,12m0,-12l-12,12`})
   }))
 }
 

@@ -145,10 +145,10 @@ function options(id, texts) {
 function showEvaluation() {
   const broken = view.rules, families = ["horizontal", "vertical"]
   byId("rules").className = broken.length ? "" : "hold"
-  byId("rules").replaceChildren(...(broken.length ? broken.map(rule => rule.text) : ["all rules hold"]).map(text => made("li", "", text)))
+  byId("rules").replaceChildren(...(broken.length ? broken.map(rule => rule.text) : ["all rules hold"]).map(text => htmlElement("li", "", text)))
   byId("ambiguity").replaceChildren(...view.ambiguity_mm.map((value, nFailed) => {
-    const row = made("tr", "", ""), straight = view.straight_mm[nFailed]
-    row.append(made("th", "", nFailed), made("td", value < straight ? "better" : value > straight ? "worse" : "", value.toPrecision(3)), made("td", "", straight.toPrecision(3)))
+    const row = htmlElement("tr", "", ""), straight = view.straight_mm[nFailed]
+    row.append(htmlElement("th", "", nFailed), htmlElement("td", value < straight ? "better" : value > straight ? "worse" : "", value.toPrecision(3)), htmlElement("td", "", straight.toPrecision(3)))
     return row
   }))
   options("failed", view.ambiguity_mm.map((_, nFailed) => `${nFailed}`))
@@ -179,7 +179,7 @@ function draw() {
 function show(next) {
   byId("title").textContent = next.title
   const link = byId("link")
-  link.className = next.ended ? "lost" : ""
+  link.className = next.ended ? "disconnected" : ""
   link.textContent = next.ended || (next.ready ? "ready" : "starting: the first start takes a minute")
   if (view && next.ended) view.ended = next.ended
   const isNewSession = view?.session !== next.session
@@ -194,4 +194,4 @@ function show(next) {
   }
 }
 for (const button of document.querySelectorAll("button")) button.disabled = true
-follow(show)
+subscribe(show)

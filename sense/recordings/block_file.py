@@ -6,6 +6,7 @@ CRC-32 covers all of the block but itself. A writer that dies leaves at worst a 
 off; damage before an intact block cannot come from that and is an error.
 """
 
+import os
 import re
 import struct
 import zlib
@@ -15,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import open_in_place, read_bytes
+from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_BYTES, MAX_FIBRES, Array, Mask
 
@@ -24,6 +25,20 @@ _UNIT = 256
 _COUNT_OFFSET, _CRC_OFFSET = 16, 20
 _COUNT = struct.Struct("<I")
 _HEADER = 24
+
+
+def open_in_place(path: Path) -> BinaryIO:
+    """Open an existing file for reading and writing in place, unbuffered, without following a symbolic link.
+
+    Raises:
+        InputError: it is a symbolic link.
+        OSError: it cannot be opened.
+    """
+    file = path.open("r+b", buffering=0)
+    if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
+        file.close()
+        raise InputError(f"{path}: is a link, and none is followed where a file is gone on with")
+    return file
 
 
 def block_dtype(fibres: int) -> np.dtype[np.void]:

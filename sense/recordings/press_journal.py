@@ -6,9 +6,11 @@ from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any, NamedTuple
 
-from padforge.design.common.files import open_in_place, read_bytes
+from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_INDEX, MAX_MM, MAX_N
+
+from .block_file import open_in_place
 
 
 class Press(NamedTuple):

@@ -22,7 +22,6 @@ from padforge.design.common.files import (
     UNFINISHED,
     check_writable,
     lock,
-    open_in_place,
     read_json,
     reraise_write_error,
     sync,
@@ -33,7 +32,7 @@ from padforge.design.common.validation import InputError, check_int, check_mappi
 from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
-from .block_file import BlockWriter, read_blocks, write_at
+from .block_file import BlockWriter, open_in_place, read_blocks, write_at
 from .press_journal import cut_torn_line, read_journal
 
 FORMAT = "padforge-recording/1"

@@ -1,23 +1,23 @@
 "use strict"
-// What the pages of a pad share: elements, the pad's frame and grid, and the news of the server.
+// Shared by the local pages: elements, the coordinate frame and grid of a pad, and the messages of the server.
 const SIDE = 480, MARGIN = 36, SVG = "http://www.w3.org/2000/svg"
 const byId = id => document.getElementById(id)
 
-// Whatever is shown comes in as attributes and text, never as markup.
-function drawn(name, attributes, text) {
+// Content is set as attributes and text, never as markup.
+function svgElement(name, attributes, text) {
   const element = document.createElementNS(SVG, name)
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value)
   if (text !== undefined) element.textContent = text
   return element
 }
-function made(name, className, text) {
+function htmlElement(name, className, text) {
   const element = document.createElement(name)
   element.className = className
   element.textContent = text
   return element
 }
 
-// Seen from above as the pad lies: with its tracks up, mirrored, x runs to the left.
+// The pad seen from above as it lies; with its tracks up it is mirrored, so that x points to the left.
 function frame(view) {
   const scale = (SIDE - 2 * MARGIN) / (2 * Math.max(...view.half_mm)), right = view.mirrored ? -scale : scale
   return {
@@ -27,25 +27,28 @@ function frame(view) {
   }
 }
 
-function gridParts(view) {
-  const {scale, x, y} = frame(view), [cx, cy] = view.middle_mm, [wide, high] = view.half_mm, half = Math.max(wide, high)
-  const left = x(cx) - wide * scale, below = y(cy - high) + MARGIN - 14, parts = []
-  const step = 10 ** Math.floor(Math.log10(half)) / (half / 10 ** Math.floor(Math.log10(half)) < 3 ? 2 : 1)
-  for (let at = Math.ceil((cx - wide) / step) * step; at <= cx + wide; at += step) {
-    parts.push(drawn("line", {class: "grid", x1: x(at), x2: x(at), y1: y(cy - high), y2: y(cy + high)}))
-    parts.push(drawn("text", {x: x(at), y: below, "text-anchor": "middle"}, +at.toFixed(3)))
+function gridElements(view) {
+  const {scale, x, y} = frame(view), [cx, cy] = view.middle_mm, [halfWidth, halfHeight] = view.half_mm
+  const left = x(cx) - halfWidth * scale, labelY = y(cy - halfHeight) + MARGIN - 14, elements = []
+  const half = Math.max(halfWidth, halfHeight), decade = 10 ** Math.floor(Math.log10(half))
+  const step = decade / (half / decade < 3 ? 2 : 1)
+  for (let mm = Math.ceil((cx - halfWidth) / step) * step; mm <= cx + halfWidth; mm += step) {
+    elements.push(svgElement("line", {class: "grid", x1: x(mm), x2: x(mm), y1: y(cy - halfHeight), y2: y(cy + halfHeight)}))
+    elements.push(svgElement("text", {x: x(mm), y: labelY, "text-anchor": "middle"}, +mm.toFixed(3)))
   }
-  for (let at = Math.ceil((cy - high) / step) * step; at <= cy + high; at += step) {
-    parts.push(drawn("line", {class: "grid", x1: x(cx - wide), x2: x(cx + wide), y1: y(at), y2: y(at)}))
-    parts.push(drawn("text", {x: left - 5, y: y(at) + 4, "text-anchor": "end"}, +at.toFixed(3)))
+  for (let mm = Math.ceil((cy - halfHeight) / step) * step; mm <= cy + halfHeight; mm += step) {
+    elements.push(svgElement("line", {class: "grid", x1: x(cx - halfWidth), x2: x(cx + halfWidth), y1: y(mm), y2: y(mm)}))
+    elements.push(svgElement("text", {x: left - 5, y: y(mm) + 4, "text-anchor": "end"}, +mm.toFixed(3)))
   }
-  parts.push(drawn("text", {x: left + 2 * wide * scale + MARGIN - 8, y: below, "text-anchor": "end"}, "mm"))
-  parts.push(drawn("rect", {class: "grid edge", x: left, y: y(cy + high), width: 2 * wide * scale, height: 2 * high * scale}))
-  return parts
+  elements.push(svgElement("text", {x: left + 2 * halfWidth * scale + MARGIN - 8, y: labelY, "text-anchor": "end"}, "mm"))
+  elements.push(svgElement("rect", {
+    class: "grid edge", x: left, y: y(cy + halfHeight), width: 2 * halfWidth * scale, height: 2 * halfHeight * scale,
+  }))
+  return elements
 }
 
-// Every message is the whole of what is to be shown.
-function follow(show) {
+// Calls show with each message, which is the whole of what the page shows.
+function subscribe(show) {
   let ended = false
   const source = new EventSource("/events" + location.search)
   source.onmessage = message => {
@@ -55,7 +58,7 @@ function follow(show) {
   }
   source.onerror = () => {
     if (ended) return
-    byId("link").className = "lost"
+    byId("link").className = "disconnected"
     byId("link").textContent = "connection lost, trying again"
   }
 }

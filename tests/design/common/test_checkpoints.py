@@ -1,4 +1,4 @@
-"""The states of a search on disk: what goes with them, and what stays."""
+"""Checkpoints of a search: resuming, damage, and removal."""
 
 import os
 import zipfile
@@ -32,7 +32,7 @@ def work(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_search_that_is_killed_at_any_moment_goes_on_and_leaves_no_litter(tmp_path: Path) -> None:
+def test_checkpoints_resume_after_a_kill_at_any_operation(tmp_path: Path) -> None:
     left = set()
     for number in count():
         folder = tmp_path / str(number) / "search"
@@ -46,7 +46,7 @@ def test_a_search_that_is_killed_at_any_moment_goes_on_and_leaves_no_litter(tmp_
     assert left >= {".unfinished", "search.json", "start_0000.npz"}
 
 
-def test_a_state_that_unpacks_to_much_is_not_unpacked_and_what_is_no_state_stays(
+def test_checkpoints_limit_the_unpacked_size_and_clear_only_states(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = Checkpoints(tmp_path, {"search": {}})
@@ -93,7 +93,7 @@ def searched(method: str, run: SearchOptions) -> SearchResult:
 
 @given(st.sampled_from(["descent", "genetic"]), damages)
 @settings(max_examples=5)
-def test_damaged_states_are_gone_on_with_or_refused(begun, tmp_path_factory, method, damage) -> None:
+def test_damaged_states_are_resumed_or_refused_in_one_line(begun, tmp_path_factory, method, damage) -> None:
     folder = tmp_path_factory.mktemp("search")
     for name, content in begun[method].items():
         (folder / name).write_bytes(content)

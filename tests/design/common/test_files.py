@@ -1,4 +1,4 @@
-"""Atomic writing, self-describing JSON, folders for results, locks, and what was made from a file."""
+"""Atomic writes of files and sets of files, locks, JSON documents, and dependents of a file."""
 
 import errno
 import json
@@ -19,7 +19,7 @@ LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.design.common.files 
 ANOTHER = LOCK + "try:\n  with locked_folder(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
+def test_atomic_file_keeps_the_old_file_when_writing_fails(tmp_path):
     path = tmp_path / "result.json"
     files.write_json(path, {"format": "x/1"})
 
@@ -37,7 +37,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
-def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
+def test_pipes_are_neither_read_nor_replaced(tmp_path):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
     with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
@@ -50,7 +50,7 @@ def test_a_pipe_is_neither_waited_for_nor_put_aside(tmp_path):
     assert list(tmp_path.iterdir()) == [pipe]
 
 
-def test_what_cannot_be_read_or_written_is_named(tmp_path):
+def test_errors_of_reading_and_writing_name_the_file(tmp_path):
     path = tmp_path / "file"
     path.write_text("123456")
     assert files.read_bytes(path, 6) == b"123456"
@@ -63,7 +63,7 @@ def test_what_cannot_be_read_or_written_is_named(tmp_path):
             taken(path / "deeper")
 
 
-def test_a_file_within_another_one_is_put_in_place_once_with_ordinary_permissions(tmp_path):
+def test_nested_atomic_file_is_renamed_once_with_ordinary_permissions(tmp_path):
     with files.atomic_file(tmp_path / "a.txt") as outer, files.atomic_file(outer) as inner:
         inner.write_text("whole")
         assert list(tmp_path.iterdir()) == [outer]
@@ -80,7 +80,7 @@ def another(folder):
     return subprocess.run([sys.executable, "-c", ANOTHER, folder], capture_output=True, text=True, check=True).stdout
 
 
-def test_one_run_at_a_time_writes_to_a_folder_which_goes_again_if_made_for_nothing(tmp_path):
+def test_locked_folder_admits_one_run_and_is_removed_again_if_created_and_empty(tmp_path):
     with pytest.raises(KeyError), files.locked_folder(tmp_path / "a" / "b"):
         raise KeyError
     assert list(tmp_path.iterdir()) == []
@@ -114,7 +114,7 @@ def contents(folder):
     return {path.name: path.read_text() for path in folder.iterdir()}
 
 
-def test_staged_files_come_together_or_not_at_all_and_others_go_with_them(tmp_path):
+def test_atomic_files_moves_and_removes_all_or_none(tmp_path):
     with pytest.raises(KeyError):
         replaced(tmp_path / "out", "one", "fails")
     assert contents(tmp_path / "out") == {}
@@ -128,7 +128,7 @@ def test_staged_files_come_together_or_not_at_all_and_others_go_with_them(tmp_pa
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError])
-def test_files_that_cannot_all_be_moved_are_read_as_a_set_and_the_next_run_moves_them(tmp_path, monkeypatch, stop):
+def test_interrupted_move_reads_as_the_new_set_and_the_next_run_completes_it(tmp_path, monkeypatch, stop):
     for name in ("b", "d", "mine", "removed"):
         (tmp_path / name).write_text("old")
     replace = Path.replace
@@ -148,7 +148,7 @@ def test_files_that_cannot_all_be_moved_are_read_as_a_set_and_the_next_run_moves
         assert contents(tmp_path) == dict.fromkeys("abcd", "new") | {"mine": "old"}
 
 
-def test_another_run_that_commits_meanwhile_is_completed_first(tmp_path, monkeypatch):
+def test_commit_waits_for_the_exchange_of_another_run(tmp_path, monkeypatch):
     rename = Path.rename
     busy = iter([OSError(errno.ENOTEMPTY, "Directory not empty")])
 
@@ -164,7 +164,7 @@ def test_another_run_that_commits_meanwhile_is_completed_first(tmp_path, monkeyp
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() != 0, reason="root alone may give files away")
-def test_nothing_moves_where_a_file_of_another_user_cannot_be_replaced(tmp_path, monkeypatch):
+def test_atomic_files_moves_nothing_over_a_protected_file_of_another_user(tmp_path, monkeypatch):
     folder = tmp_path / "shared"
     folder.mkdir()
     (folder / "b").write_text("another's")
@@ -178,7 +178,7 @@ def test_nothing_moves_where_a_file_of_another_user_cannot_be_replaced(tmp_path,
     assert not (folder / "a").exists()
 
 
-def test_files_are_known_by_their_digests_in_one_folder_only_and_a_folder_by_its_content(tmp_path):
+def test_find_unchanged_compares_digests_in_one_folder_and_sha256_covers_folders(tmp_path):
     for path in (tmp_path / "a", tmp_path / "b", tmp_path / "in" / "c"):
         files.write_json(path, {})
     digest = files.sha256(tmp_path / "a")
@@ -220,7 +220,7 @@ def windows(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="it is no stand-in there")
-def test_without_flock_two_runs_do_not_write_into_one_folder_and_a_locked_file_is_read_on(windows, tmp_path):
+def test_locks_on_windows_exclude_writers_but_not_readers(windows, tmp_path):
     for _ in range(2):
         with (
             files.locked_folder(tmp_path),
@@ -265,7 +265,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_dependents_are_found_through_others(folder: Path) -> None:
+def test_find_dependents_follows_chains(folder: Path) -> None:
     made = ["design.json", "fabrication.json", "fibre_loss.json", "localizer.json", "recording"]
     assert files.find_dependents(folder / PAD) == made
     assert files.find_dependents(folder / PAD, remade=["design.json", "recording"]) == made[1:4]
@@ -276,7 +276,7 @@ def test_dependents_are_found_through_others(folder: Path) -> None:
 @pytest.mark.parametrize(
     "content", ["", "3", "[]", '{"provenance": 3}', '{"provenance": {"inputs": [1]}}', "[" * 10**5]
 )
-def test_what_else_lies_there_is_passed_over(folder: Path, content: str) -> None:
+def test_find_dependents_ignores_other_files(folder: Path, content: str) -> None:
     before = files.find_dependents(folder / PAD)
     (folder / "other.json").write_text(content)
     (folder / "folder.json").mkdir()
@@ -285,7 +285,7 @@ def test_what_else_lies_there_is_passed_over(folder: Path, content: str) -> None
     assert files.find_dependents(folder / PAD) == before
 
 
-def test_a_file_that_others_were_made_from_is_replaced_by_force_alone(folder: Path) -> None:
+def test_check_replaceable_refuses_without_force(folder: Path) -> None:
     other = document(folder / "new" / PAD, ["another"])
     for by in (other, {"command": "another"}):
         line = r"morphology.json: fabrication.json, .* and recording were made from it; .* another --out, .* --force$"

@@ -1,4 +1,4 @@
-"""A kill between any two file operations leaves what was there, or what was to come, and litter that goes."""
+"""A kill between any two file operations leaves the old or the new set of files, and leftovers that are removed."""
 
 import errno
 import itertools
@@ -36,7 +36,7 @@ def renewed(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> None:
+def test_atomic_files_reads_all_old_or_all_new_after_a_kill_at_any_operation(tmp_path: Path) -> None:
     found = []
     for number in itertools.count():
         folder = made(tmp_path / str(number))
@@ -55,7 +55,7 @@ def test_files_are_all_old_or_all_new_to_whoever_reads_them(tmp_path: Path) -> N
     assert sum(one != other for one, other in itertools.pairwise(found)) == 1  # the moment in which they are renewed
 
 
-def test_the_next_run_clears_up_a_file_that_was_being_written(tmp_path: Path) -> None:
+def test_atomic_file_removes_the_leftover_of_a_killed_run(tmp_path: Path) -> None:
     def write() -> None:
         with files.atomic_file(tmp_path / "a.json") as temporary:
             temporary.write_bytes(b"new")
@@ -69,7 +69,7 @@ def test_the_next_run_clears_up_a_file_that_was_being_written(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_a_link_is_no_exchange(tmp_path: Path) -> None:
+def test_exchange_that_is_a_link_is_ignored_by_readers_and_refused_by_writers(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "a").write_bytes(b"another")
     folder = made(tmp_path / "out")
@@ -104,7 +104,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_who_reads_changes_nothing_and_the_next_run_puts_in_place_what_it_reads(broken_off: Path) -> None:
+def test_reading_changes_nothing_and_the_next_writer_completes_the_exchange(broken_off: Path) -> None:
     before = content(broken_off)
     assert {name: files.read_bytes(broken_off / name) for name in ("a", "b")} == NEW
     assert files.find_unchanged(broken_off, {name: files.sha256(broken_off / name) for name in ("a", "b", "mine")}) == {
@@ -135,7 +135,7 @@ def moved(folder: Path, elsewhere: Path) -> None:
 
 
 @pytest.mark.parametrize("carried", [copied, packed, moved])
-def test_an_exchange_is_worth_nothing_elsewhere(tmp_path: Path, broken_off: Path, carried: Callable) -> None:
+def test_exchange_is_refused_in_another_folder(tmp_path: Path, broken_off: Path, carried: Callable) -> None:
     """Neither who reads nor who writes there carries it out, and nobody takes its files for a set."""
     carried(broken_off, folder := tmp_path / "elsewhere")
     before = content(folder)
@@ -163,7 +163,7 @@ PLANTED: list[Callable[[Path], object]] = [
 ]
 
 
-def test_what_only_has_the_name_of_an_exchange_is_left_alone(tmp_path: Path) -> None:
+def test_exchange_with_a_forged_note_is_refused(tmp_path: Path) -> None:
     for number, plant in enumerate(PLANTED):
         folder = made(tmp_path / str(number))
         (folder / EXCHANGE).mkdir()
@@ -177,7 +177,7 @@ def test_what_only_has_the_name_of_an_exchange_is_left_alone(tmp_path: Path) -> 
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write everywhere")
-def test_who_may_not_put_files_in_place_reads_them_and_is_told_so(broken_off: Path) -> None:
+def test_exchange_in_a_read_only_folder_is_read_but_not_completed(broken_off: Path) -> None:
     broken_off.chmod(0o555)
     assert {name: files.read_bytes(broken_off / name) for name in ("a", "b")} == NEW
     with pytest.raises(InputError, match="cannot be written"):
@@ -189,7 +189,7 @@ def test_who_may_not_put_files_in_place_reads_them_and_is_told_so(broken_off: Pa
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() != 0, reason="root alone may give files away")
 @pytest.mark.parametrize("given", ["", ".unfinished-note"])
-def test_nobody_puts_files_of_another_user_in_place(broken_off: Path, given: str) -> None:
+def test_exchange_of_another_user_is_read_but_not_completed(broken_off: Path, given: str) -> None:
     """Whoever shares a folder reads them; as in /tmp, where anybody may put files, not even that."""
     os.chown(broken_off / EXCHANGE / given, 12345, 12345)
     before = content(broken_off)
@@ -234,7 +234,7 @@ def claim(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("work", [write_one, write_some, claim])
-def test_litter_goes_and_what_is_named_nearly_so_stays(tmp_path: Path, work: Callable) -> None:
+def test_leftovers_are_removed_and_similar_names_stay(tmp_path: Path, work: Callable) -> None:
     for name in FILES:
         (tmp_path / name).write_text("half")
     folder = tmp_path / f".unfinished-{NUMBER[::-1]}"
@@ -264,7 +264,7 @@ def test_leftovers_that_are_links_or_pipes_stay_and_links_are_not_followed(tmp_p
     assert names(tmp_path / "mine") == {"work"}
 
 
-def test_what_somebody_is_at_work_with_stays(tmp_path: Path) -> None:
+def test_leftovers_of_running_processes_stay(tmp_path: Path) -> None:
     with (
         files.temporary_folder(tmp_path),
         files.temporary_file(tmp_path, ".json"),
@@ -281,7 +281,7 @@ def test_what_somebody_is_at_work_with_stays(tmp_path: Path) -> None:
     assert names(tmp_path) == {"a.txt"}
 
 
-def test_what_is_another_ones_stays_and_all_where_there_are_no_locks(tmp_path: Path, monkeypatch) -> None:
+def test_leftovers_of_other_users_and_without_locks_stay(tmp_path: Path, monkeypatch) -> None:
     def none_here(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -1,4 +1,4 @@
-"""Pages of this machine that post: who is heard, and what becomes of the rest; elements of pages: text stays text."""
+"""Local pages: origins, tokens and limits of connections; elements of HTML pages: text stays text."""
 
 import json
 import re
@@ -52,7 +52,7 @@ def posted(page: LocalPage, body: bytes | None, path: str = "/double", **headers
     return connection.getresponse()
 
 
-def test_what_is_posted_is_answered_and_what_cannot_be_used_is_told_as_text(page: LocalPage) -> None:
+def test_posts_return_json_and_errors_return_text(page: LocalPage) -> None:
     answer = posted(page, b"4")
     assert (answer.status, answer.headers["Content-Type"]) == (200, "application/json")
     assert json.loads(answer.read()) == {"twice": 8}
@@ -80,11 +80,13 @@ ELSEWHERE = "http://elsewhere.example"
         (b"1" * 100, "/double", {}, 200),
     ],
 )
-def test_only_the_page_is_heard(page: LocalPage, body: bytes | None, path: str, headers: dict, status: int) -> None:
+def test_posts_of_other_origins_and_malformed_posts_are_refused(
+    page: LocalPage, body: bytes | None, path: str, headers: dict, status: int
+) -> None:
     assert posted(page, body, path, **headers).status == status
 
 
-def test_with_a_token_only_those_who_know_it_are_answered_by_whatever_name_they_ask() -> None:
+def test_token_is_required_under_any_host_name() -> None:
     token = "known to few & all"
     with LocalPage(0, PAGE, {"/double": doubled}, 100, host="0.0.0.0", token=token) as page:
         assert page.url.endswith("/?token=known+to+few+%26+all")
@@ -102,7 +104,7 @@ def test_with_a_token_only_those_who_know_it_are_answered_by_whatever_name_they_
             LocalPage(0, PAGE, host=host, token=token)
 
 
-def test_half_a_post_is_not_heard_and_no_address_refused_in_silence(
+def test_incomplete_posts_and_malformed_addresses_are_refused_silently(
     page: LocalPage, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Whoever asks for it knows no token yet, and would fill the terminal."""
@@ -119,7 +121,7 @@ def test_half_a_post_is_not_heard_and_no_address_refused_in_silence(
         assert browser.recv(100).split()[1] == b"400"
 
 
-def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unauthorised_connections_are_limited_and_cut_off(page: LocalPage, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are shown out however slowly they go on to ask; who was let in is not."""
     monkeypatch.setattr(listening, "ADMIT_S", 0.3)
     monkeypatch.setattr(listening, "MAX_CONNECTIONS", 8)
@@ -146,7 +148,7 @@ def test_strangers_do_not_take_up_all_connections_for_long(page: LocalPage, monk
         assert [json.loads(next(told)[6:])["at"] for _ in range(2)] == [0, 1]
 
 
-def test_markdown_becomes_elements_and_html_in_it_and_in_sections_is_text():
+def test_markdown_renders_elements_and_escapes_html():
     rows = "| a | b |\n| --- | --- |\n| 1.5 mm | fail |"
     steps = "1. Stir **well**.\n2. Read `x.json`."
     head, rows, steps, end = render_markdown(f"# Title\n\n## Mix\n\n{rows}\n\n{steps}\n\nDone.")

@@ -50,7 +50,7 @@ class Bare(MetaPathFinder):
         if fullname.partition(".")[0] in GONE:
             raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
 
-assert {"torch", "scipy", "matplotlib", "build123d", "shapely"} <= GONE and "numpy" not in GONE
+assert {"torch", "matplotlib", "build123d", "shapely"} <= GONE and "numpy" not in GONE
 sys.meta_path.insert(0, Bare())
 from padforge.cli import main
 ends = []

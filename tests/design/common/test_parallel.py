@@ -1,4 +1,4 @@
-"""Tasks on any executor, torch on one thread, kernels that are kept, and how a program ends that is at work."""
+"""Tasks on any executor, torch on one thread, the cache of kernels, and the end of a program with running tasks."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ def package(tmp_path):
     return folder
 
 
-def test_kernels_are_kept_until_a_source_of_their_package_changes(package):
+def test_clear_stale_kernels_deletes_when_a_source_changes(package):
     kept = [folder / "__pycache__" / "outer.py311.1.nbc" for folder in (package, package / "room")]
     clear_stale_kernels(package)
     for path in kept:
@@ -41,14 +41,14 @@ def test_kernels_are_kept_until_a_source_of_their_package_changes(package):
     assert not kept[0].exists()
 
 
-def test_a_folder_that_cannot_be_written_is_left_alone(package):
+def test_clear_stale_kernels_ignores_a_folder_that_cannot_be_written(package):
     (package / "__pycache__").touch()
     clear_stale_kernels(package)
     assert (package / "__pycache__").is_file()
 
 
 @pytest.mark.parametrize("threads", [None, 1, 3])
-def test_results_and_errors_of_tasks_come_out_with_their_keys(threads):
+def test_run_tasks_yields_results_by_key_and_raises_errors(threads):
     tasks = [(number, partial(pow, number, 2)) for number in range(20)]
     pool = ThreadPoolExecutor(threads) if threads else None
     assert dict(run_tasks(tasks, pool)) == {number: number**2 for number in range(20)}
@@ -57,7 +57,7 @@ def test_results_and_errors_of_tasks_come_out_with_their_keys(threads):
         list(run_tasks([("a", partial(pow, 0, -1)), ("b", partial(pow, 1, 2))], pool))
 
 
-def test_a_task_is_followed_by_the_next_of_its_key_and_results_come_as_they_are_done():
+def test_run_tasks_follows_up_and_yields_as_completed_within_max_parallel():
     def next_one(key, result):
         return partial(str.__add__, result, key) if len(result) < 3 else None
 
@@ -79,7 +79,7 @@ def test_a_task_is_followed_by_the_next_of_its_key_and_results_come_as_they_are_
     assert most == 2
 
 
-def test_nothing_begins_once_nobody_listens_and_a_task_at_work_is_not_waited_for():
+def test_run_tasks_starts_nothing_after_an_exception_and_does_not_wait():
     begun, never = [], threading.Event()
 
     def work(number):
@@ -104,7 +104,7 @@ def test_nothing_begins_once_nobody_listens_and_a_task_at_work_is_not_waited_for
 
 
 @pytest.mark.parametrize(("killed", "said"), [(False, "has lost its scheduler"), (True, "loses every worker")])
-def test_a_cluster_that_is_lost_is_one_line(monkeypatch, killed, said):
+def test_cluster_failure_is_a_fault_of_one_line(monkeypatch, killed, said):
     distributed = pytest.importorskip("distributed")
 
     class Client(nullcontext):
@@ -119,7 +119,7 @@ def test_a_cluster_that_is_lost_is_one_line(monkeypatch, killed, said):
         list(run_tasks([("a", lost)], pool))
 
 
-def test_torch_has_one_thread_until_the_last_one_leaves():
+def test_one_torch_thread_nests_and_restores():
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3)
@@ -134,7 +134,7 @@ def test_torch_has_one_thread_until_the_last_one_leaves():
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-def test_an_end_from_outside_is_told_and_crashes_nothing() -> None:
+def test_sigterm_during_torch_tasks_exits_130_without_a_crash() -> None:
     """Threads of torch that are at work when the interpreter ends do so."""
     code = """
 import os, signal, sys, threading

@@ -1,4 +1,4 @@
-"""What a caller hands over: bounds belong to what is allowed, and just beyond them is refused."""
+"""Checks of arguments: bounds are inclusive, and errors are one line."""
 
 import math
 from pathlib import Path
@@ -12,7 +12,7 @@ from padforge.design.common.validation import InputError, missing_extra
 LONGEST = "a" * errors.MAX_PATH
 
 
-def test_numbers_and_paths_within_their_bounds_are_taken_and_a_refusal_is_one_line():
+def test_checks_accept_values_at_their_bounds():
     assert str(InputError("pad\n.toml:\u2028none")) == "pad .toml: none"
     assert [errors.check_int("n", np.int8(n), 2, 5) for n in (2, 5)] == [2, 5]
     for value in (0.0, 2.5, 1, np.float32(0.5)):
@@ -40,7 +40,7 @@ def test_numbers_and_paths_within_their_bounds_are_taken_and_a_refusal_is_one_li
         (lambda x: errors.check_path("file", x), ("", "a\0b", LONGEST + "a", 3, None), "file is .*, expected a path"),
     ],
 )
-def test_what_is_just_beyond_them_or_of_another_kind_is_refused(check, values, message):
+def test_checks_refuse_values_beyond_their_bounds_and_of_other_types(check, values, message):
     for value in values:
         with pytest.raises(InputError, match=message):
             check(value)
@@ -57,5 +57,5 @@ def test_what_is_just_beyond_them_or_of_another_kind_is_refused(check, values, m
         *((name, "", None) for name in ("nothing_of_the_kind", "numpy", None)),
     ],
 )
-def test_what_is_missing_is_told_with_what_brings_it(module, wanted, said):
+def test_missing_extra_names_the_extra(module, wanted, said):
     assert missing_extra(ModuleNotFoundError(name=module), wanted) == (said and f"this needs {said}")
