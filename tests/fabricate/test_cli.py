@@ -121,7 +121,8 @@ def test_imports_and_a_build_without_step_and_png_stay_light(morphology, tmp_pat
         ("import padforge.fabricate.settings", [*always, "trimesh", "manifold3d", "shapely", "numpy"]),
         ("import padforge.fabricate.export, padforge.design", [*always, "trimesh", "manifold3d"]),
         (
-            f"padforge.fabricate.build(padforge.design.Morphology.load({str(morphology)!r}), {str(tmp_path)!r}, ['stl', 'svg'])",
+            f"padforge.fabricate.build(padforge.design.Morphology.load({str(morphology)!r}), "
+            f"{str(tmp_path)!r}, ['stl', 'svg'])",
             always,
         ),
     ]
