@@ -321,15 +321,15 @@ def import_(
         check_replaceable(path, folder / path.name, force=force)
     violations = check_rules(result.pad, rules, pad_settings)
     knots = result.pad.knots.shape[1] - 2
-    lines = [f"import: {len(result.fibres)} fibres of {knots} knots -> {path}", f"  {result.placed}"]
+    lines = [f"import: {len(result.fibres)} fibres of {knots} knots -> {path}", f"  {result.placement}"]
     for number, fibre in enumerate(result.fibres, 1):
-        moved = f", ends moved by {fibre.moved_mm:.3f} mm" if fibre.moved_mm >= MIN_SHOWN_MM else ""
-        lines.append(f"  fibre {number}: {fibre.name}, within {fibre.off_mm:.3f} mm{moved}")
+        moved = f", ends moved by {fibre.end_shift_mm:.3f} mm" if fibre.end_shift_mm >= MIN_SHOWN_MM else ""
+        lines.append(f"  fibre {number}: {fibre.name}, within {fibre.max_error_mm:.3f} mm{moved}")
     lines += [f"  broken: {violation}" for violation in violations] or ["  all rules hold"]
     document = {
         "fibres": [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)],
         "knots": knots,
-        "placed": result.placed,
+        "placement": result.placement,
         "violations": list(map(asdict, violations)),
     }
     show_result(document, lines, as_json)

@@ -1,6 +1,7 @@
-"""The contact model: what each fibre signals for a press (paper, section II-B).
+"""The contact model: the signal of each fibre for a press (paper, section II-B).
 
-A press deforms a regular polygon around its centre; a fibre signals the weighted length it has inside.
+A fibre's signal is the line integral of a weight along it: the measured sensitivity profile of the distance to the
+press centre, or the published weight inside a regular polygon.
 """
 
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from padforge.design.kernels.pchip import population_slopes
 from padforge.design.kernels.published import quantized_signals
 from padforge.design.morphology import (
     MAX_COORDINATE,
+    MAX_SAMPLES,
     MIN_SPAN,
     Array,
     Ints,
@@ -32,28 +34,28 @@ from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contac
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-MAX_SAMPLES = 2**20
-"""Most points a fibre is sampled at."""
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
+_NONE = np.empty(0, np.int64)
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
+"""Chains, extents and weight law of a press."""
 
 
 def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None) -> Array:
-    """Exact signals: the weighted length of each fibre's PCHIP curve inside the press, no sampling.
+    """Compute exact signals: the weighted length of each fibre's PCHIP curve in the press, without sampling.
 
-    The boundary belongs to the press: a straight fibre that runs along an edge counts with its whole length there.
+    The boundary belongs to the press: a straight fibre that runs along an edge counts with its full length there.
 
     Args:
-        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M, whose grid unit is the
-            default pitch, 11.25 mm.
-        presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, whose signals add; where their
-            shapes overlap a fibre counts once for each.
-        contact: what a press does to a fibre; the measured one, `Contact()`, if None.
+        pad: a morphology; or knots of a population of square pads of the default pitch, 11.25 mm; shape
+            (..., 2 M, N + 2, 2), grid units.
+        presses: centres; shape (Q, 2), grid units. Or C simultaneous presses whose signals add, shape (Q, C, 2); where
+            their shapes overlap a fibre counts once for each.
+        contact: contact model; the measured one, `Contact()`, if None.
 
     Returns:
-        (Q, F) signals, or (..., Q, F) for a population; with the default weight and length in grid units. Uniform
-        Manhattan signals are a closed form between roots found to rounding, others Gauss-Kronrod integrals to 1e-11.
+        Signals; shape (Q, F), or (..., Q, F) of a population; grid units for weights without unit. Uniform Manhattan
+        signals are a closed form between roots exact to rounding, others Gauss-Kronrod integrals to 1e-11.
 
     Raises:
         InputError: presses of the wrong shape or not finite.
@@ -62,31 +64,197 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
 
 
 def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
-    """Return what a voltage divider shows of a press: `signals` as shares of the length of each fibre.
+    """Compute the relative stretch of each fibre, which is what a voltage divider measures: signal over length.
 
-    A fibre is a strain gauge: its resistance grows by its relative stretch, so that the same stretch shows less on a
-    longer fibre.
+    A fibre is a strain gauge: its resistance grows with its relative stretch, so one stretch gives less on a longer
+    fibre.
 
     Args:
         pad: the fibres.
-        presses: (Q, 2) centres in grid units.
-        contact: what a press does to a fibre.
+        presses: centres; shape (Q, 2), grid units.
+        contact: contact model.
 
     Returns:
-        (Q, F), without unit.
+        Relative stretch; shape (Q, F).
     """
     return signals(pad, presses, contact) / lengths(pad)
 
 
 def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
-    """`signals`, and the number of spans that were looked at for them."""
-    travel, cross, ends, batch = fibre_axes(pad)
-    flat, places = check_presses(presses, several=True)
-    fibres = travel.shape[1]
-    check_memory(len(travel) * len(flat) * fibres)
-    out = np.zeros(len(travel) * len(flat) * fibres)
-    visited = _run_exact(travel, cross, ends, flat, press_shape(contact, grid_unit_mm(pad)), _NONE, _NONE, out)
-    return _summed(out, (*batch, *places, fibres)), visited
+    """Compute `signals` and the number of spans visited for them."""
+    along, across, ends, batch = fibre_axes(pad)
+    centres, press_counts = check_presses(presses, several=True)
+    fibres = along.shape[1]
+    check_memory(len(along) * len(centres) * fibres)
+    out = np.zeros(len(along) * len(centres) * fibres)
+    visited = _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _NONE, _NONE, out)
+    return _sum_simultaneous(out, (*batch, *press_counts, fibres)), visited
+
+
+def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
+    """Compute `signals` of one pad as a sparse matrix, in time and memory proportional to the fibres touched.
+
+    Args:
+        pad: the fibres.
+        presses: centres; shape (Q, 2), grid units.
+        contact: as in `signals`.
+
+    Returns:
+        Signals; shape (Q, F).
+    """
+    from scipy.sparse import csr_array
+
+    contact = or_default("contact", contact, Contact)
+    along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
+    centres, max_offsets = check_presses(presses)[0], geometry.max_offsets(across, ends)
+    shape = press_shape(contact, pad.unit_mm)
+    starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
+    check_memory(int(starts[-1]))
+    fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
+    _run_exact(along, across, ends, centres, shape, starts, fibre, signal)
+    matrix = csr_array((signal, fibre, starts), shape=(len(centres), len(pad.knots)))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def _run_exact(
+    along: Array,
+    across: Array,
+    ends: geometry.Ends,
+    presses: Array,
+    shape: PressShape,
+    starts: Ints,
+    fibre: Ints,
+    out: Array,
+) -> int:
+    """Run `exact_signals` on all cores; return the number of spans visited."""
+    slope, max_offsets = population_slopes(along, across), geometry.max_offsets(across, ends)
+
+    def compute(begin: int, end: int) -> int:
+        return exact_signals(along, across, slope, max_offsets, ends, presses, *shape, begin, end, starts, fibre, out)
+
+    visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
+    if profiling.is_profiling():
+        record_visits(along, max_offsets, ends, presses, shape[1], visited)
+    return visited
+
+
+def record_visits(
+    along: Array, max_offsets: Array, ends: geometry.Ends, presses: Array, extents: Array, visited: int
+) -> None:
+    """Record for the profile how many fibres and spans were visited, press by press.
+
+    Args:
+        along: knots along the axis; shape (P, F, n).
+        max_offsets: from `geometry.max_offsets`; shape (P, 2).
+        ends: positions of the fibre ends.
+        presses: centres; shape (Q, 2), grid units.
+        extents: of `press_shape`; shape (2, 5).
+        visited: number of spans visited.
+    """
+    pads, fibres, knots = along.shape
+    touched = sum(int(geometry.count_touched(offsets, presses, extents, ends)[-1]) for offsets in max_offsets)
+    profiling.add_count("fibres, press by press", touched, pads * len(presses) * fibres)
+    profiling.add_count("spans, press by press", visited, pads * len(presses) * fibres * (knots - 1))
+
+
+def _sum_simultaneous(signals: Array, shape: tuple[int, ...]) -> Array:
+    """Reshape signals to (..., Q, C, F) and sum them over the C simultaneous presses."""
+    signals = signals.reshape(shape)
+    return signals[..., 0, :] if shape[-2] == 1 else signals.sum(axis=-2)
+
+
+def fibre_axes(
+    pad: Morphology | Array, layout: Layout | None = None
+) -> tuple[Array, Array, geometry.Ends, tuple[int, ...]]:
+    """Split a pad or a population into coordinates along and across each fibre's axis.
+
+    Args:
+        pad: a morphology, or knots; shape (..., F, N + 2, 2), grid units.
+        layout: layout of the knots; that of a square pad if None.
+
+    Returns:
+        Coordinates along and across, both (P, F, N + 2); positions of the fibre ends; and the population's shape.
+
+    Raises:
+        InputError: knots of another shape, beyond MAX_COORDINATE, or not ascending along the axis.
+    """
+    is_pad = isinstance(pad, Morphology)
+    knots = pad.knots if is_pad else check_array("knots", pad, MAX_COORDINATE)
+    layout = pad.layout if is_pad else layout
+    fibres = knots.shape[-3] if knots.ndim >= 3 else 0
+    if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
+        raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
+    ends = fibre_ends(check_layout(fibres, layout))
+    # in C order, else kernels would be compiled anew for the memory order of a caller's array, which takes seconds
+    along, across = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
+    if not is_pad and not (np.diff(along) >= MIN_SPAN).all():
+        raise InputError(f"knots do not ascend by {MIN_SPAN:g} or more along the fibre's axis")
+    return along, across, ends, knots.shape[:-3]
+
+
+def grid_unit_mm(pad: Morphology | Array, layout: Layout | None = None) -> float:
+    """Return the grid unit of a pad or of knots, mm: the default pitch for knots without a layout."""
+    layout = pad.layout if isinstance(pad, Morphology) else layout
+    return layout.unit_mm if layout else DEFAULT_PITCH_MM
+
+
+def press_shape(contact: Contact, unit_mm: float) -> PressShape:
+    """Convert a contact to grid units, as the kernels take it.
+
+    Args:
+        contact: contact model.
+        unit_mm: the pad's grid unit, mm.
+
+    Returns:
+        Chains and extents in the frame of each family, and the weight law.
+    """
+    length = _LENGTHS[contact.length]
+    if contact.sensitivity_profile:
+        points = contact.profile_points(unit_mm)
+        end, profile = points[-1][0], geometry.profile_coefficients(points)
+        return *geometry.frame_shape(end, None), geometry.WeightLaw(end, geometry.PROFILE, length, profile)
+    law = geometry.WeightLaw(contact.radius, _WEIGHTS[contact.weight], length)
+    return *geometry.frame_shape(contact.radius, contact.sides), law
+
+
+def signals_quantized(
+    pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None, samples: int = 2000
+) -> Array:
+    """Compute signals by the published rule: segments of a sampled fibre count in full if they start in the press.
+
+    Args:
+        pad: as in `signals`.
+        presses: as in `signals`.
+        contact: contact model; PUBLISHED_CONTACT if None.
+        samples: points per fibre, uniform along its axis, at least 2 (published: 2000).
+
+    Returns:
+        Signals; shape (Q, F), or (..., Q, F) of a population; grid units for weights without unit.
+
+    Raises:
+        InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
+    """
+    contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
+    return quantized_signals_and_samples(pad, presses, contact, samples)[0]
+
+
+def quantized_signals_and_samples(
+    pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int
+) -> tuple[Array, int]:
+    """Compute `signals_quantized` and the number of samples visited for them."""
+    along, across, ends, batch = fibre_axes(pad)
+    pads, fibres, _ = along.shape
+    shape, samples = press_shape(contact, grid_unit_mm(pad)), check_samples(samples, fibres)
+    centres, press_counts = check_presses(presses, several=True)
+    check_memory(pads * len(centres) * fibres)
+    out = np.zeros((pads, len(centres), fibres))
+
+    def compute(begin: int, end: int) -> int:
+        return quantized_signals(along, across, ends.horizontals, centres, shape, samples, begin, end, out)
+
+    visited = sum(map_chunks(compute, pads * fibres, max(1, 200_000 // (samples + len(centres)))))
+    return _sum_simultaneous(out, (*batch, *press_counts, fibres)), visited
 
 
 def check_memory(values: int) -> None:
@@ -95,194 +263,60 @@ def check_memory(values: int) -> None:
         raise InputError(f"these are {values} signals, allowed at once are {MAX_VALUES}; signals_sparse takes less")
 
 
-def _summed(signals: Array, shape: tuple[int, ...]) -> Array:
-    """Signals in the shape (..., Q, C, F), summed over the C presses that were made at once."""
-    whole = signals.reshape(shape)
-    return whole[..., 0, :] if shape[-2] == 1 else whole.sum(axis=-2)
-
-
-def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
-    """`signals` of one pad as a sparse (Q, F) matrix: time and memory follow what is touched, not the pad's size.
-
-    Args:
-        pad, contact: as in `signals`. presses: (Q, 2) centres in grid units.
-    """
-    from scipy.sparse import csr_array
-
-    contact = or_default("contact", contact, Contact)
-    travel, cross, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
-    places, strays = check_presses(presses)[0], geometry.max_offsets(cross, ends)
-    shape = press_shape(contact, pad.unit_mm)
-    starts = geometry.count_touched(strays[0], places, shape[1], ends)
-    check_memory(int(starts[-1]))
-    fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
-    _run_exact(travel, cross, ends, places, shape, starts, fibre, signal)
-    found = csr_array((signal, fibre, starts), shape=(len(places), len(pad.knots)))
-    found.eliminate_zeros()
-    return found
-
-
-_NONE = np.empty(0, np.int64)
-
-
-def _run_exact(
-    travel: Array,
-    cross: Array,
-    ends: geometry.Ends,
-    places: Array,
-    shape: PressShape,
-    starts: Ints,
-    fibre: Ints,
-    out: Array,
-) -> int:
-    """`exact_signals` over the cores."""
-    slope, strays = population_slopes(travel, cross), geometry.max_offsets(cross, ends)
-
-    def work(begin: int, end: int) -> int:
-        return exact_signals(travel, cross, slope, strays, ends, places, *shape, begin, end, starts, fibre, out)
-
-    visited = sum(map_chunks(work, len(travel) * len(places), min_chunk=2000))
-    if profiling.is_profiling():
-        record_visits(travel, strays, ends, places, shape[1], visited)
-    return visited
-
-
-def record_visits(travel: Array, strays: Array, ends: geometry.Ends, places: Array, reach: Array, visited: int) -> None:
-    """Tell the profile how many fibres and spans were looked at, press by press."""
-    pads, fibres, knots = travel.shape
-    within = sum(int(geometry.count_touched(each, places, reach, ends)[-1]) for each in strays)
-    profiling.add_count("fibres, press by press", within, pads * len(places) * fibres)
-    profiling.add_count("spans, press by press", visited, pads * len(places) * fibres * (knots - 1))
-
-
-def fibre_axes(
-    pad: Morphology | Array, layout: Layout | None = None
-) -> tuple[Array, Array, geometry.Ends, tuple[int, ...]]:
-    """Travel and cross coordinates (P, F, n) of a pad or a population, where fibres end, and the population's shape.
-
-    Args:
-        pad: a morphology; or knots (..., F, N+2, 2), and their layout: that of a square pad if None.
-
-    Raises:
-        InputError: knots that are no (..., F, N+2, 2) numbers up to FARTHEST that ascend along the travel axis.
-    """
-    knots = pad.knots if isinstance(pad, Morphology) else check_array("knots", pad, MAX_COORDINATE)
-    layout = pad.layout if isinstance(pad, Morphology) else layout
-    fibres = knots.shape[-3] if knots.ndim >= 3 else 0
-    if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
-        raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
-    ends = fibre_ends(check_layout(fibres, layout))
-    # in C order, else the kernels would be compiled anew for the order of a caller's array, which takes many seconds
-    travel, cross = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
-    if not isinstance(pad, Morphology) and not (np.diff(travel) >= MIN_SPAN).all():
-        raise InputError(f"knots do not ascend by {MIN_SPAN:g} or more along the travel axis")
-    return travel, cross, ends, knots.shape[:-3]
-
-
-def grid_unit_mm(pad: Morphology | Array, layout: Layout | None = None) -> float:
-    """Return the grid unit of a pad or of knots, mm: the default pitch where no layout says another."""
-    layout = pad.layout if isinstance(pad, Morphology) else layout
-    return layout.unit_mm if layout else DEFAULT_PITCH_MM
-
-
-def press_shape(contact: Contact, unit_mm: float) -> PressShape:
-    """Return a contact as the kernels take it, in grid units.
-
-    Args:
-        contact: what a press does to a fibre.
-        unit_mm: the pad's grid unit, mm.
-
-    Returns:
-        Chains and extents in the frame of each family, and the law of its weight.
-    """
-    length = _LENGTHS[contact.length]
-    if contact.sensitivity_profile:
-        points = contact.profile_points(unit_mm)
-        end, profile = points[-1][0], geometry.profile_coefficients(points)
-        return *geometry.frames(end, None), geometry.WeightLaw(end, geometry.PROFILE, length, profile)
-    return *geometry.frames(contact.radius, contact.sides), geometry.WeightLaw(
-        contact.radius, _WEIGHTS[contact.weight], length
-    )
-
-
-def signals_quantized(
-    pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None, samples: int = 2000
-) -> Array:
-    """Signals by the published rule: segments of a sampled fibre count whole if they start inside the press.
-
-    Args:
-        pad: a morphology, or knots (..., F, N+2, 2) of a population of square pads, F = 2 M, as in `signals`.
-        presses: (Q, 2) centres in grid units, or (Q, C, 2) for C presses at once, as in `signals`.
-        contact: shape and weight; PUBLISHED_CONTACT if None.
-        samples: points per fibre, uniform along the travel axis, at least 2 (published: 2000).
-
-    Returns:
-        (Q, F) signals, or (..., Q, F) for a population; with the default weight and length in grid units.
-
-    Raises:
-        InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
-    """
-    return quantized_signals_and_samples(
-        pad, presses, or_default("contact", contact, Contact, PUBLISHED_CONTACT), samples
-    )[0]
-
-
-def quantized_signals_and_samples(
-    pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int
-) -> tuple[Array, int]:
-    """`signals_quantized`, and the number of samples that were looked at for them."""
-    travel, cross, ends, batch = fibre_axes(pad)
-    shape = press_shape(contact, grid_unit_mm(pad))
-    samples = check_samples(samples, travel.shape[1])
-    places, shape_of_presses = check_presses(presses, several=True)
-    check_memory(len(travel) * len(places) * travel.shape[1])
-    out = np.zeros((len(travel), len(places), travel.shape[1]))
-
-    def work(begin: int, end: int) -> int:
-        return quantized_signals(travel, cross, ends.horizontals, places, shape, samples, begin, end, out)
-
-    looked_at = sum(map_chunks(work, travel.shape[0] * travel.shape[1], max(1, 200_000 // (samples + len(places)))))
-    return _summed(out, (*batch, *shape_of_presses, travel.shape[1])), looked_at
-
-
 def check_samples(samples: int, fibres: int) -> int:
-    """Points a fibre is sampled at, as far as they may be so many."""
+    """Return the number of samples per fibre if it is allowed."""
     return check_int("samples", samples, 2, min(MAX_SAMPLES, MAX_VALUES // max(fibres, 1)))
 
 
 def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
-    """`presses` as contiguous, finite (Q C, 2) grid units, and (Q, C): C is 1 for (Q, 2).
+    """Return presses as a contiguous array of positions.
+
+    Args:
+        presses: shape (Q, 2), or (Q, C, 2) for C simultaneous presses; grid units.
+        several: whether simultaneous presses are allowed.
+
+    Returns:
+        Positions (Q C, 2), and (Q, C) with C = 1 for (Q, 2).
 
     Raises:
-        InputError: presses that are no (Q, 2), or (Q, C, 2) where `several` are allowed at once, or not finite.
+        InputError: presses of another shape or not finite.
     """
-    places = check_array("presses", presses, MAX_COORDINATE)
-    if places.shape == (0,):
-        places = places.reshape(0, 2)
-    if places.ndim not in ((2, 3) if several else (2,)) or places.shape[-1] != 2:
-        raise InputError(f"presses have shape {places.shape}, expected (Q, 2)" + (" or (Q, C, 2)" if several else ""))
-    return np.ascontiguousarray(places.reshape(-1, 2)), (len(places), places.shape[1] if places.ndim == 3 else 1)
+    positions = check_array("presses", presses, MAX_COORDINATE)
+    if positions.shape == (0,):
+        positions = positions.reshape(0, 2)
+    if positions.ndim not in ((2, 3) if several else (2,)) or positions.shape[-1] != 2:
+        allowed = "(Q, 2) or (Q, C, 2)" if several else "(Q, 2)"
+        raise InputError(f"presses have shape {positions.shape}, expected {allowed}")
+    simultaneous = positions.shape[1] if positions.ndim == 3 else 1
+    return np.ascontiguousarray(positions.reshape(-1, 2)), (len(positions), simultaneous)
 
 
 def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
-    """A serpentine of side x side presses, each moved by U(0, jitter) along both axes.
+    """Return side x side presses in serpentine order, so that presses next in order are neighbours.
 
     Args:
-        rectangle: over which, as `sensed_rectangle` and `between_fibres` give it.
-        side: presses per row and rows, Q = side^2. jitter: grid units.
-        seed: of numpy's legacy RandomState, by which the published values are stated.
+        rectangle: low and high corner, as from `sensed_rectangle`; grid units.
+        side: presses per row, and rows.
+        jitter: each press is moved by U(0, jitter) along both axes; grid units.
+        seed: seed of NumPy's legacy RandomState, which the published values were computed with.
 
     Returns:
-        (Q, 2) presses; x runs forth on even rows and back on odd ones, so that neighbours in order are neighbours
-        in place.
+        Presses; shape (side^2, 2), grid units; x ascends in even rows and descends in odd ones.
     """
     rows = grid_positions(rectangle, side).reshape(side, side, 2)
     rows[1::2] = rows[1::2, ::-1]
-    places = rows.reshape(-1, 2)
-    return places + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter
+    return rows.reshape(-1, 2) + np.random.RandomState(seed).random_sample((side * side, 2)) * jitter
 
 
 def grid_positions(rectangle: Rectangle, side: int) -> Array:
-    """(side^2, 2) places, side x side of them evenly from corner to corner of a rectangle, row by row from below."""
+    """Return evenly spaced positions from corner to corner of a rectangle, row by row from below.
+
+    Args:
+        rectangle: low and high corner.
+        side: positions per row, and rows.
+
+    Returns:
+        Positions; shape (side^2, 2), in the unit of the rectangle.
+    """
     x, y = (np.linspace(low, high, side) for low, high in zip(*rectangle, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

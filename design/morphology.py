@@ -19,7 +19,7 @@ from padforge.design.common.files import read_json, write_json
 from padforge.design.common.mat_files import load_mat
 from padforge.design.common.validation import InputError, check_array, check_int, check_mapping, check_type, short_repr
 from padforge.design.common.validation import check_path as as_path
-from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frames
+from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frame_shape
 from padforge.design.kernels.published import quantized_signals
 from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Counts, Layout, Pitch
 
@@ -41,7 +41,11 @@ MARGIN = 1e-3
 
 
 def check_layout(n_fibres: int, layout: Layout | None = None) -> Layout:
-    """Return the layout of a number of fibres: the one stated, or that of a square pad of the default pitch.
+    """Return the layout of a number of fibres.
+
+    Args:
+        n_fibres: number of fibres.
+        layout: their layout; that of a square pad of the default pitch if None.
 
     Raises:
         InputError: a number that is not the layout's, or without a layout no even number.
@@ -422,7 +426,7 @@ def _max_misfit(knots: Array, content: dict[str, Any], n_presses: int = 32) -> f
     misfits = []
     for weight in (UNIFORM, INVERSE_SQUARE):  # files do not say which of the two they used
         signals = np.zeros((1, len(presses), len(knots)))
-        shape = (*frames(contact.radius, contact.sides), WeightLaw(contact.radius, weight, MANHATTAN))
+        shape = (*frame_shape(contact.radius, contact.sides), WeightLaw(contact.radius, weight, MANHATTAN))
         quantized_signals(along, across, horizontals, presses, shape, samples, 0, len(knots), signals)
         misfits.append(float(np.abs(signals[0] - expected).max()))
     return min(misfits)

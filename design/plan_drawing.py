@@ -65,7 +65,9 @@ def draw_plan(
         ha, va, dx, dy = (("left", "center", 0.02, 0), ("center", "bottom", 0, 0.02))[family]
         axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
 
-    markers = [(pad.to_mm(c.place), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)]
+    markers = [
+        (pad.to_mm(c.position), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)
+    ]
     for same, size, color in ((False, 10, INK), (True, 40, ALARM)):
         points = np.array([position for position, is_same in markers if is_same == same]).reshape(-1, 2)
         axes.scatter(*points.T, s=size, facecolor="none" if same else color, edgecolor=color, linewidth=0.8, zorder=3)

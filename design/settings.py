@@ -417,7 +417,7 @@ class SearchSettings(Settings):
     contacts: Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="further contacts to serve as well, each a table like [contact]"
     )
-    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where presses are told apart")
+    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where the expected error is computed")
 
     @property
     def default_contact(self) -> Contact:

@@ -1,4 +1,4 @@
-"""The fibres and their signals in torch: what the gradient search differentiates."""
+"""Fibres and their signals in torch, for gradients in the search."""
 
 import math
 from typing import Any
@@ -9,22 +9,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from padforge.design.common import profiling
-from padforge.design.contact import press_shape, record_visits
+from padforge.design.contact import PressShape, press_shape, record_visits
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
-from padforge.design.kernels.geometry import Ends, WeightLaw, max_offsets
+from padforge.design.kernels.geometry import Ends
+from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
 from padforge.design.kernels.measured_signals import element_signals, element_spacing, elements_gradient, fibre_elements
 from padforge.design.settings import Contact
 
 Array = NDArray[np.float64]
-PressShape = tuple[tuple[Array, Array], Array, WeightLaw]
-"""Chains, extents and law of a press, as `press_shape` gives them."""
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
-    """PCHIP slopes (..., n) of values v at ascending t, both (..., n); differentiable almost everywhere.
+    """Compute the slopes of PCHIP interpolants; differentiable almost everywhere.
 
     The same rule as `pchip_slopes` of the kernels, to rounding.
+
+    Args:
+        t: ascending coordinates; shape (..., n).
+        v: values; shape (..., n).
+
+    Returns:
+        Slopes; shape (..., n).
     """
     h = t.diff(dim=-1)
     m = v.diff(dim=-1) / h
@@ -32,9 +38,9 @@ def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
         return m.expand(*m.shape[:-1], 2)
     h0, h1, m0, m1 = h[..., :-1], h[..., 1:], m[..., :-1], m[..., 1:]
     w0, w1 = 2 * h1 + h0, h1 + 2 * h0
-    alike = m0 * m1 > 0
-    safe0, safe1 = torch.where(alike, m0, 1.0), torch.where(alike, m1, 1.0)
-    inner = torch.where(alike, (w0 + w1) / (w0 / safe0 + w1 / safe1), 0.0)
+    is_monotone = m0 * m1 > 0
+    safe0, safe1 = torch.where(is_monotone, m0, 1.0), torch.where(is_monotone, m1, 1.0)
+    inner = torch.where(is_monotone, (w0 + w1) / (w0 / safe0 + w1 / safe1), 0.0)
     first = _end_slope(h[..., 0], h[..., 1], m[..., 0], m[..., 1])
     last = _end_slope(h[..., -1], h[..., -2], m[..., -1], m[..., -2])
     return torch.cat([first[..., None], inner, last[..., None]], dim=-1)
@@ -47,7 +53,16 @@ def _end_slope(h0: Tensor, h1: Tensor, m0: Tensor, m1: Tensor) -> Tensor:
 
 
 def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Values and slopes, both (..., F), of the PCHIP curves through (t, v), (..., n), at the points `at` (F,)."""
+    """Evaluate PCHIP interpolants.
+
+    Args:
+        t: ascending coordinates; shape (..., n).
+        v: values; shape (..., n).
+        at: coordinates to evaluate at; shape (F,).
+
+    Returns:
+        Values and slopes, both (..., F).
+    """
     d = pchip_slopes(t, v)
     inner = t[..., 1:-1].detach().contiguous()
     j = torch.searchsorted(inner, at.expand(*t.shape[:-1], -1).contiguous(), right=True)
@@ -61,9 +76,15 @@ def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
-    """Places (..., P, 2) and slopes (..., P) of the PCHIP curves through (t, v), (..., n), P = (n - 1) per_span + 1.
+    """Sample PCHIP interpolants, denser towards the ends of each span, where steep spans bend.
 
-    Every span gets as many samples, closer to its ends, since that is where a steep one bends.
+    Args:
+        t: ascending coordinates; shape (..., n).
+        v: values; shape (..., n).
+        per_span: samples per span.
+
+    Returns:
+        Points (..., P, 2) and slopes (..., P), P = (n - 1) per_span + 1.
     """
     d = pchip_slopes(t, v)
     t0, v0, d0, d1 = (x[..., None] for x in (t[..., :-1], v[..., :-1], d[..., :-1], d[..., 1:]))
@@ -78,94 +99,109 @@ def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
     return torch.stack([at, value], dim=-1), slope
 
 
-def arc_lengths(travel: Tensor, cross: Tensor, slope: Tensor) -> Tensor:
-    """Return the arc lengths (F,) of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep.
+def arc_lengths(along: Tensor, across: Tensor, slope: Tensor) -> Tensor:
+    """Compute the arc lengths of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep.
 
     Args:
-        travel, cross, slope: (F, n) knots and slopes.
+        along: knots along the axis; shape (F, n).
+        across: knots across it; shape (F, n).
+        slope: slopes at the knots; shape (F, n).
+
+    Returns:
+        Arc lengths; shape (F,).
     """
-    nodes, weights = (torch.from_numpy(each) for each in np.polynomial.legendre.leggauss(8))
+    nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(8))
     s = (nodes + 1) / 2
-    h, d0, d1 = travel.diff(dim=-1)[..., None], slope[:, :-1, None], slope[:, 1:, None]
-    m = cross.diff(dim=-1)[..., None] / h
-    along = d0 + s * (2 * (3 * m - 2 * d0 - d1) + 3 * s * (d0 + d1 - 2 * m))
-    return (h * (1 + along**2).sqrt() @ (weights / 2)).sum(dim=-1)
+    h, d0, d1 = along.diff(dim=-1)[..., None], slope[:, :-1, None], slope[:, 1:, None]
+    m = across.diff(dim=-1)[..., None] / h
+    dv_dt = d0 + s * (2 * (3 * m - 2 * d0 - d1) + 3 * s * (d0 + d1 - 2 * m))
+    return (h * (1 + dv_dt**2).sqrt() @ (weights / 2)).sum(dim=-1)
 
 
 def press_signals(
-    travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends, unit_mm: float
+    along: Tensor, across: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends, unit_mm: float
 ) -> Tensor:
-    """Signals of one pad with their analytic gradient: exact, but for a measured reach within the kernel's PRECISION.
+    """Compute the signals of one pad with their analytic gradient.
+
+    They are exact for a shape, and within PRECISION of `measured_signals` for a sensitivity profile.
 
     Args:
-        travel, cross, slope: (F, n) float64 knots and slopes, held independent. presses: (Q, 2) in grid units.
-        ends: where the fibres end.
+        along: knots along the axis; shape (F, n), float64.
+        across: knots across it; shape (F, n).
+        slope: slopes at the knots, held independent; shape (F, n).
+        presses: centres; shape (Q, 2), grid units.
+        contact: contact model.
+        ends: positions of the fibre ends.
         unit_mm: the pad's grid unit, mm.
 
     Returns:
-        (F, Q), with the default weight and length in grid units.
+        Signals; shape (F, Q), grid units for weights without unit.
     """
-    given, shape = (travel, cross, slope, presses, ends), press_shape(contact, unit_mm)
+    inputs, shape = (along, across, slope, presses, ends), press_shape(contact, unit_mm)
     if contact.sensitivity_profile:
-        spaced = shape, element_spacing(contact.profile_points(unit_mm))
-        return MeasuredSignals.apply(*given, spaced)  # pyright: ignore[reportReturnType]
-    return ExactSignals.apply(*given, shape)  # pyright: ignore[reportReturnType]
+        shape_and_spacing = shape, element_spacing(contact.profile_points(unit_mm))
+        return MeasuredSignals.apply(*inputs, shape_and_spacing)  # pyright: ignore[reportReturnType]
+    return ExactSignals.apply(*inputs, shape)  # pyright: ignore[reportReturnType]
 
 
 class ExactSignals(torch.autograd.Function):
-    """The exact signals of one pad as a torch function of its knots and slopes: `press_signals` of a disc."""
+    """Exact signals of one pad, as a torch function of its knots and slopes."""
 
     @staticmethod
     def forward(
-        ctx: Any, travel: Tensor, cross: Tensor, slope: Tensor, presses: Array, ends: Ends, shape: PressShape
+        ctx: Any, along: Tensor, across: Tensor, slope: Tensor, presses: Array, ends: Ends, shape: PressShape
     ) -> Tensor:
-        """Signals (F, Q)."""
-        t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        strays, none = max_offsets(v[None], ends), np.empty(0, np.int64)
-        ctx.inputs = (t, v, d, strays[0], ends, presses, shape)
+        """Compute signals (F, Q)."""
+        t, v, d = (x.detach().numpy() for x in (along, across, slope))
+        max_offsets, none = compute_max_offsets(v[None], ends), np.empty(0, np.int64)
+        ctx.inputs = (t, v, d, max_offsets[0], ends, presses, shape)
         out = np.zeros(len(presses) * len(t))
         begin, end = 0, len(presses)
-        visited = exact_signals(t[None], v[None], d[None], strays, ends, presses, *shape, begin, end, none, none, out)
+        visited = exact_signals(
+            t[None], v[None], d[None], max_offsets, ends, presses, *shape, begin, end, none, none, out
+        )
         if profiling.is_profiling():
-            record_visits(t[None], strays, ends, presses, shape[1], visited)
+            record_visits(t[None], max_offsets, ends, presses, shape[1], visited)
         return torch.from_numpy(out.reshape(-1, len(t)).T)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient by travel, cross and slope."""
-        t, v, d, strays, ends, presses, shape = ctx.inputs
-        found = signals_gradient(t, v, d, strays, ends, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape)
-        return (*torch.from_numpy(found), None, None, None)
+        """Compute the gradient with respect to along, across and slope."""
+        t, v, d, max_offsets, ends, presses, shape = ctx.inputs
+        gradient = signals_gradient(
+            t, v, d, max_offsets, ends, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape
+        )
+        return (*torch.from_numpy(gradient), None, None, None)
 
 
 class MeasuredSignals(torch.autograd.Function):
-    """The signals of one pad under a measured reach, from elements laid once a call: `press_signals` of a reach."""
+    """Signals of one pad under a sensitivity profile, from elements cut once a call."""
 
     @staticmethod
     def forward(
         ctx: Any,
-        travel: Tensor,
-        cross: Tensor,
+        along: Tensor,
+        across: Tensor,
         slope: Tensor,
         presses: Array,
         ends: Ends,
-        spaced: Any,
+        shape_and_spacing: tuple[PressShape, float],
     ) -> Tensor:
-        """Signals (F, Q)."""
-        t, v, d = (x.detach().numpy() for x in (travel, cross, slope))
-        (_, extents, law), spacing = spaced
+        """Compute signals (F, Q)."""
+        t, v, d = (x.detach().numpy() for x in (along, across, slope))
+        (_, extents, law), spacing = shape_and_spacing
         elements = fibre_elements(t, v, d, ends.horizontals, presses, law.radius, spacing, law.length)
         ctx.inputs = (t, v, d, elements, presses, law)
         out = np.empty((len(presses), len(t)))
-        looked_at = element_signals(t, v, elements, presses, law.radius, law.profile, out)
+        visited = element_signals(t, v, elements, presses, law.radius, law.profile, out)
         if profiling.is_profiling():
-            record_visits(t[None], max_offsets(v[None], ends), ends, presses, extents, looked_at)
+            record_visits(t[None], compute_max_offsets(v[None], ends), ends, presses, extents, visited)
         return torch.from_numpy(out.T)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient by travel, cross and slope."""
+        """Compute the gradient with respect to along, across and slope."""
         t, v, d, elements, presses, law = ctx.inputs
         up = np.ascontiguousarray(upstream[0].numpy().T)
-        found = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
-        return (*torch.from_numpy(found), None, None, None)
+        gradient = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
+        return (*torch.from_numpy(gradient), None, None, None)

@@ -1,6 +1,7 @@
-"""The twin of a printed pad: how it was laid and wired, and what a press really does to it, as presses have shown.
+"""The twin: the as-built model (digital twin) of a printed pad, identified from presses.
 
-`padforge sense identify` finds one from a recording; searches design for its reach, simulations answer like it.
+It describes how the pad was laid and wired, and what a press does to its fibres. `padforge sense identify` estimates it
+from a recording; searches design for its sensitivity profile, and simulations respond like it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,20 +34,36 @@ MAX_VOLTS, MAX_MM = 1e3, 1e4
 MAX_INFORMATION_GAIN = 1e3
 MAX_CHANNELS = 1024
 MAX_ELEMENT_LENGTH = 0.02
-"""Longest element by which a laid fibre is summed, grid units."""
-UNIFORM_SENSITIVITY_STD = 0.02
-"""Standard deviation of the logarithm of a fibre's sensitivity that is none."""
+"""Length of the elements that an as-built fibre is summed over, grid units."""
 MAX_ELEMENTS = 2**23
-"""Of all fibres: 256 + 256 of them, as many as a recording may have, are 6.6 million."""
+"""Elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million."""
+UNIFORM_SENSITIVITY_STD = 0.02
+"""Standard deviation of the log-sensitivity along a fibre up to which it counts as uniform."""
+
+
+def _check_fields(instance: object, **bounds: tuple[float, float]) -> None:
+    """Check numbers of a frozen dataclass, each with its (low, high), and store them as floats."""
+    for name, (low, high) in bounds.items():
+        object.__setattr__(instance, name, check_float(name, getattr(instance, name), low, high))
+
+
+def _check_pair(name: str, values: tuple[float, float]) -> tuple[float, float]:
+    pair = check_array(name, values, MAX_MM)
+    if pair.shape != (2,):
+        raise InputError(f"{name} is {short_repr(values)}, expected two numbers")
+    x, y = pair.tolist()
+    return x, y
 
 
 @dataclass(frozen=True)
 class PlanTransform:
-    """How a pad lay under the arm: a press at p mm was made at scale turn(mirror(p)) + shift of the plan.
+    """Similarity transform from the arm's frame to the plan: scale R(turn) mirror(p) + shift.
 
     Attributes:
-        mirrored: whether x counts the other way, as it does on a casting that was turned over.
-        turn_deg: counter-clockwise. shift_mm: from the pad's middle. scale: mm of the plan for a mm of the arm, > 0.
+        mirrored: whether x is reversed, as on a casting that was turned over.
+        turn_deg: rotation, counter-clockwise.
+        shift_mm: translation, from the middle of the pad.
+        scale: mm of the plan per mm of the arm, > 0.
     """
 
     mirrored: bool = False
@@ -56,34 +73,30 @@ class PlanTransform:
 
     def __post_init__(self) -> None:
         check_type("mirrored", self.mirrored, bool)
-        object.__setattr__(self, "turn_deg", check_float("turn_deg", self.turn_deg, -360, 360))
-        shift = check_array("shift_mm", self.shift_mm, MAX_MM)
-        if shift.shape != (2,):
-            raise InputError(f"shift_mm is {short_repr(self.shift_mm)}, expected two numbers")
-        object.__setattr__(self, "shift_mm", tuple(shift.tolist()))
-        object.__setattr__(self, "scale", check_float("scale", self.scale, 0.1, 10))
+        object.__setattr__(self, "shift_mm", _check_pair("shift_mm", self.shift_mm))
+        _check_fields(self, turn_deg=(-360, 360), scale=(0.1, 10))
 
-    def to_plan(self, places_mm: Array) -> Array:
-        """(Q, 2) mm as the arm counts to (Q, 2) mm on the plan, both from the middle."""
-        return self.scale * self.turned(places_mm) + self.shift_mm
+    def to_plan(self, positions_mm: Array) -> Array:
+        """Transform positions (Q, 2) of the arm to the plan, both in mm from the middle."""
+        return self.scale * self.rotate(positions_mm) + self.shift_mm
 
-    def turned(self, places_mm: Array) -> Array:
-        """(Q, 2) mm as the arm counts, mirrored and turned."""
+    def rotate(self, positions_mm: Array) -> Array:
+        """Mirror and rotate positions (Q, 2) of the arm, mm."""
         cos, sin = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
-        mirrored = places_mm * ([-1.0, 1.0] if self.mirrored else [1.0, 1.0])
+        mirrored = positions_mm * ([-1.0, 1.0] if self.mirrored else [1.0, 1.0])
         return mirrored @ np.array([[cos, sin], [-sin, cos]])
 
 
 @dataclass(frozen=True)
 class TwinChannel:
-    """What a channel of the recording reads.
+    """A channel of the recording.
 
     Attributes:
-        channel: from 0. fibre: which one it reads, from 0 as in the knots; None where no fibre explains it.
-        gain_v: V for a relative stretch of 1, the signal of the fibre over its length; below 0 where a press lowers
-            the reading.
-        noise_v: standard deviation of a response that neither place nor history explains, V.
-        explained: share of the variance of responses on presses held out; 0 where there is no fibre.
+        channel: index, from 0.
+        fibre: index of the fibre it reads, from 0 as in the knots; None where no fibre explains it.
+        gain_v: V for a relative stretch of 1; below 0 where a press lowers the reading.
+        noise_v: standard deviation of a response that neither position nor history explains, V.
+        explained: explained share of the variance of responses on held-out presses; 0 without a fibre.
     """
 
     channel: int
@@ -96,19 +109,17 @@ class TwinChannel:
         check_int("channel", self.channel, 0, MAX_CHANNELS)
         if self.fibre is not None:
             check_int("fibre", self.fibre, 0, MAX_CHANNELS)
-        for name, least in (("gain_v", -MAX_VOLTS), ("noise_v", 0.0)):
-            object.__setattr__(self, name, check_float(name, getattr(self, name), least, MAX_VOLTS))
-        object.__setattr__(self, "explained", check_float("explained", self.explained, -1e9, 1))
+        _check_fields(self, gain_v=(-MAX_VOLTS, MAX_VOLTS), noise_v=(0, MAX_VOLTS), explained=(-1e9, 1))
 
 
 @dataclass(frozen=True)
 class TwinScatter:
-    """What of the scatter of responses grows with them.
+    """Part of the scatter of responses that grows with them.
 
     Attributes:
-        share: standard deviation of a response from press to press, share of the response.
+        share: standard deviation of a response from press to press, as a share of the response.
         common: share of that variance that all channels have in common.
-        floor: standard deviation of what does not grow, share of a channel's `noise_v`.
+        floor: standard deviation of the additive part, as a share of a channel's `noise_v`.
     """
 
     share: float = 0.0
@@ -116,18 +127,18 @@ class TwinScatter:
     floor: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, most in (("share", 1), ("common", 0.99), ("floor", 1)):
-            object.__setattr__(self, name, check_float(name, getattr(self, name), 0, most))
+        _check_fields(self, share=(0, 1), common=(0, 0.99), floor=(0, 1))
 
 
 @dataclass(frozen=True)
 class TwinReadings:
-    """How the twin's readings run beside what presses answer, for simulations.
+    """Noise, drift and hysteresis of the readings, for simulations.
 
     Attributes:
-        noise_mv: white noise of a reading. drift_mv: spread of the drifting rest; both standard deviations.
-        hysteresis: share of its answer that a press leaves behind, the other way round. hysteresis_s: in which time
-            that goes.
+        noise_mv: standard deviation of the white noise of a reading.
+        drift_mv: standard deviation of the drifting baseline.
+        hysteresis: residual response after a press, of opposite sign, as a share of its response.
+        hysteresis_s: time constant of its decay.
         information_gain: Fisher information on the position in all readings of a press, as a multiple of that in the
             twin's responses with their `noise_v`; 1 or more.
     """
@@ -139,30 +150,34 @@ class TwinReadings:
     information_gain: float = 1.0
 
     def __post_init__(self) -> None:
-        limits = (("noise_mv", 0, 1e3), ("drift_mv", 0, 1e3), ("hysteresis", 0, 0.99), ("hysteresis_s", 0.01, 1e4))
-        for name, least, most in (*limits, ("information_gain", 1, MAX_INFORMATION_GAIN)):
-            object.__setattr__(self, name, check_float(name, getattr(self, name), least, most))
+        _check_fields(self, noise_mv=(0, 1e3), drift_mv=(0, 1e3), hysteresis=(0, 0.99), hysteresis_s=(0.01, 1e4))
+        _check_fields(self, information_gain=(1, MAX_INFORMATION_GAIN))
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A printed pad as presses have shown it.
+    """As-built model of a printed pad.
 
     Attributes:
-        morphology: as it was planned. channels: one for each channel of the recording. frame: how it lay.
-        distance_mm, weight: (n,) how a fibre element answers a press at that distance, 1 at its largest, 0 at the end.
-        as_built_mm: for each fibre of the plan its course as laid, (P, 2) mm on the plan from its middle; None where no
-            channel reads it.
-        angular_weight: (n,) what is added to `weight` times cos 2 phi, phi the angle between the fibre and the way to
-            the press; None where the answer does not depend on it.
-        sensitivity: for each fibre how much a piece of it counts, (P - 1,) about 1; None where all count alike.
-        noise: standard deviation of a response that neither place nor history explains, share of full scale.
+        morphology: the pad as planned.
+        channels: one for each channel of the recording.
+        frame: position of the pad under the arm.
+        distance_mm: distances of the sensitivity profile; shape (n,).
+        weight: sensitivity of a fibre element to a press at that distance, 1 at its largest, 0 at the end; shape (n,).
+        as_built_mm: centre line of each fibre as built, on the plan from its middle; shape (P, 2); None for a fibre
+            that no channel reads.
+        noise: standard deviation of a response that neither position nor history explains, as a share of full scale.
         sensed_mm: width and height of what was pressed, along the axes of the plan.
-        presses: learnt from. provenance: free JSON. readings: how they run, None where nobody measured that.
-        scatter: what of `noise` and of the channels' grows with the response.
+        presses: number of presses it was identified from.
+        angular_weight: amplitude of a term of `weight` in cos 2 phi, phi the angle between fibre and direction to the
+            press; shape (n,); None where the response does not depend on it.
+        sensitivity: sensitivity of each piece of each fibre, about 1; shape (P - 1,); None where it is uniform.
+        provenance: origin of the twin; free JSON.
+        readings: statistics of the readings; None where they were not measured.
+        scatter: part of `noise`, and of the channels' noise, that grows with the response.
 
     Raises:
-        InputError: what does not fit together, or is out of range.
+        InputError: values that do not fit together, or are out of range.
     """
 
     morphology: Morphology
@@ -182,67 +197,89 @@ class Twin:
 
     def __post_init__(self) -> None:
         fibres = len(check_type("morphology", self.morphology, Morphology).knots)
-        _refuse_wiring([channel.fibre for channel in self.channels if channel.fibre is not None], fibres)
+        wiring = [channel.fibre for channel in self.channels if channel.fibre is not None]
+        if wiring and max(wiring) >= fibres:
+            raise InputError(f"a channel reads fibre {max(wiring)}, allowed are 0 to {fibres - 1}")
+        if len(set(wiring)) < len(wiring):
+            raise InputError("two channels read the same fibre")
         for name in ("distance_mm", "weight", *(["angular_weight"] if self.angular_weight is not None else [])):
             object.__setattr__(self, name, check_array(name, getattr(self, name), MAX_MM))
             if getattr(self, name).shape != (len(self.distance_mm),):
-                raise InputError(f"{name} of reach must be a row of {len(self.distance_mm)} numbers, as distance_mm is")
-        laid = tuple(None if line is None else check_array("as_built_mm", line, MAX_MM) for line in self.as_built_mm)
-        if len(laid) != fibres or any(line is not None and line.shape[1:] != (2,) for line in laid):
-            raise InputError(f"as_built_mm must have a row of points or null for each of the {fibres} fibres")
-        length = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in laid if line is not None)
-        if length > (most := MAX_ELEMENTS * MAX_ELEMENT_LENGTH * self.morphology.unit_mm):
-            raise InputError(f"as_built_mm are {length:.3g} mm long in all, allowed are {most:.3g}")
-        object.__setattr__(self, "as_built_mm", laid)
-        if self.sensitivity is not None:
-            found = tuple(None if row is None else check_array("sensitivity", row, MAX_MM) for row in self.sensitivity)
-            pieces = [None if line is None else (len(line) - 1,) for line in laid]
-            if [None if row is None else row.shape for row in found] != pieces:
-                raise InputError("sensitivity must have a number for each piece of each course in as_built_mm")
-            object.__setattr__(self, "sensitivity", found)
-        object.__setattr__(self, "noise", check_float("noise", self.noise, 1e-9, 10))
-        sensed = check_array("sensed_mm", self.sensed_mm, MAX_MM)
-        if sensed.shape != (2,) or sensed.min() <= 0:
+                raise InputError(f"{name} of sensitivity_profile must be a row of {len(self.distance_mm)} numbers")
+        self._check_paths(fibres)
+        _check_fields(self, noise=(1e-9, 10))
+        object.__setattr__(self, "sensed_mm", _check_pair("sensed_mm", self.sensed_mm))
+        if min(self.sensed_mm) <= 0:
             raise InputError(f"sensed_mm is {short_repr(self.sensed_mm)}, expected width and height above 0")
-        object.__setattr__(self, "sensed_mm", tuple(sensed.tolist()))
         check_int("presses", self.presses, 1, 2**53)
         check_mapping("provenance", self.provenance)
         self.contact()
 
+    def _check_paths(self, fibres: int) -> None:
+        paths = tuple(None if path is None else check_array("as_built_mm", path, MAX_MM) for path in self.as_built_mm)
+        if len(paths) != fibres or any(path is not None and path.shape[1:] != (2,) for path in paths):
+            raise InputError(f"as_built_mm must have a row of points or null for each of the {fibres} fibres")
+        length_mm = sum(float(np.hypot(*np.diff(path, axis=0).T).sum()) for path in paths if path is not None)
+        limit_mm = MAX_ELEMENTS * MAX_ELEMENT_LENGTH * self.morphology.unit_mm
+        if length_mm > limit_mm:
+            raise InputError(f"as_built_mm are {length_mm:.3g} mm long in all, allowed are {limit_mm:.3g}")
+        object.__setattr__(self, "as_built_mm", paths)
+        if self.sensitivity is not None:
+            rows = tuple(None if row is None else check_array("sensitivity", row, MAX_MM) for row in self.sensitivity)
+            expected = [None if path is None else (len(path) - 1,) for path in paths]
+            if [None if row is None else row.shape for row in rows] != expected:
+                raise InputError("sensitivity must have a number for each piece of each path in as_built_mm")
+            object.__setattr__(self, "sensitivity", rows)
+
     def contact(self) -> Contact:
-        """The measured contact."""
+        """Return the measured contact."""
         points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
         return Contact(sensitivity_profile=tuple(points), length="euclidean")
 
     def ignored_effects(self) -> str | None:
-        """Say what of the measured pad no other pad is designed for, or simulated with; None if there is nothing."""
-        parts = ["that the angle between fibre and press counts"] if self.angular_weight is not None else []
-        uneven = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
-        if uneven and max(uneven) > UNIFORM_SENSITIVITY_STD:
-            parts.append(f"that fibres answer unevenly along themselves (by {np.mean(uneven):.0%})")
-        return f"left out of another pad than the one measured: {' and '.join(parts)}" if parts else None
+        """Describe effects measured on this pad that are ignored for any other pad; None if there are none."""
+        effects = ["that the angle between fibre and press counts"] if self.angular_weight is not None else []
+        stds = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
+        if stds and max(stds) > UNIFORM_SENSITIVITY_STD:
+            effects.append(f"that fibres respond unevenly along themselves (by {np.mean(stds):.0%})")
+        return f"left out of another pad than the one measured: {' and '.join(effects)}" if effects else None
 
-    def as_built_stretch(self, places_mm: ArrayLike) -> Array:
-        """(Q, F) relative stretch of the fibres as laid by presses at (Q, 2) mm as the arm counts.
+    def as_built_stretch(self, positions_mm: ArrayLike) -> Array:
+        """Compute the relative stretch of the as-built fibres: signal over planned length.
 
-        It is their signal over the length of the fibre on the plan; 0 for a fibre that no channel reads. Summed over
-        elements of at most LONGEST, within some 1e-4 of the integral.
+        Fibres are summed over elements of at most MAX_ELEMENT_LENGTH, within about 1e-4 of the integral.
+
+        Args:
+            positions_mm: presses in the arm's frame; shape (Q, 2), mm.
+
+        Returns:
+            Relative stretch; shape (Q, F); 0 for a fibre that no channel reads.
         """
-        if (pressed_mm := check_array("places_mm", places_mm, MAX_MM)).shape[1:] != (2,):
-            raise InputError(f"places_mm have shape {pressed_mm.shape}, expected (Q, 2)")
-        places, _ = check_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
-        reach = self.contact().profile_points(self.morphology.unit_mm)
-        profiles = [profile_coefficients(reach)]
+        pressed_mm = check_array("positions_mm", positions_mm, MAX_MM)
+        if pressed_mm.shape[1:] != (2,):
+            raise InputError(f"positions_mm have shape {pressed_mm.shape}, expected (Q, 2)")
+        presses, _ = check_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
+        points = self.contact().profile_points(self.morphology.unit_mm)
+        distances, end = [distance for distance, _ in points], points[-1][0]
+        profile, angular = profile_coefficients(points), None
         if self.angular_weight is not None:
-            points = zip((d for d, _ in reach), self.angular_weight.tolist(), strict=True)
-            profiles.append(profile_coefficients(tuple(points)))
-        out = np.zeros((len(places), len(self.as_built_mm)))
-        for fibre, line in enumerate(self.as_built_mm):
-            if line is not None:
-                counts = None if self.sensitivity is None else self.sensitivity[fibre]
-                elements = _elements(self.morphology.to_grid(line), counts)
-                for press, place in enumerate(places):
-                    out[press, fibre] = _answer(*elements, place, profiles, reach[-1][0])
+            angular = profile_coefficients(tuple(zip(distances, self.angular_weight.tolist(), strict=True)))
+        out = np.zeros((len(presses), len(self.as_built_mm)))
+        for fibre, path in enumerate(self.as_built_mm):
+            if path is None:
+                continue
+            sensitivity = None if self.sensitivity is None else self.sensitivity[fibre]
+            middles, weighted_lengths, tangents = _cut(self.morphology.to_grid(path), sensitivity)
+            for press, centre in enumerate(presses):
+                offset = middles - centre
+                distance = np.hypot(*offset.T)
+                near = distance < end
+                weights = profile_weights(profile, end, distance[near])
+                if angular is not None:
+                    along = (offset[near] * tangents[near]).sum(axis=1)
+                    cos_2phi = 2 * along**2 / (distance[near] ** 2 + 1e-6) - 1  # regular at the press centre
+                    weights = weights + profile_weights(angular, end, distance[near]) * cos_2phi
+                out[press, fibre] = float(weights @ weighted_lengths[near])
         return out / lengths(self.morphology)
 
     @classmethod
@@ -250,26 +287,24 @@ class Twin:
         """Read a `twin.json`.
 
         Raises:
-            InputError: the file is missing, torn, of another kind, or what it holds does not fit together.
+            InputError: the file is missing, torn, of another kind, or its values do not fit together.
         """
         document = read_json(path := as_path("path", path), FORMAT)
         try:
             profile = document["sensitivity_profile"]
             return cls(
-                Morphology.from_dict(document["morphology"]),
-                tuple(TwinChannel(**channel) for channel in document["channels"]),
-                PlanTransform(**document["frame"]),
-                profile["distance_mm"],
-                profile["weight"],
-                tuple(document["as_built_mm"]),
-                document["noise"],
-                document["sensed_mm"],
-                document["presses"],
-                profile.get("angular_weight"),
-                None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
-                document.get("provenance", {}),
-                TwinReadings(**document["readings"]) if document.get("readings") else None,
-                TwinScatter(**document["scatter"]),
+                morphology=Morphology.from_dict(document["morphology"]),
+                channels=tuple(TwinChannel(**channel) for channel in document["channels"]),
+                frame=PlanTransform(**document["frame"]),
+                **{"angular_weight": None, **profile},
+                as_built_mm=tuple(document["as_built_mm"]),
+                noise=document["noise"],
+                sensed_mm=document["sensed_mm"],
+                presses=document["presses"],
+                sensitivity=None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
+                provenance=document.get("provenance", {}),
+                readings=TwinReadings(**document["readings"]) if document.get("readings") else None,
+                scatter=TwinScatter(**document["scatter"]),
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: no valid twin ({error!r})") from error
@@ -277,17 +312,16 @@ class Twin:
             raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | Path) -> None:
-        """Write a `twin.json`, atomically."""
-        pad = self.morphology
+        """Write a `twin.json` atomically."""
+        profile = {name: getattr(self, name) for name in ("distance_mm", "weight", "angular_weight")}
         document = {
             "format": FORMAT,
-            "morphology": pad.to_dict(),
+            "morphology": self.morphology.to_dict(),
             "channels": [asdict(channel) for channel in self.channels],
             "frame": asdict(self.frame),
-            "sensitivity_profile": {"distance_mm": self.distance_mm.tolist(), "weight": self.weight.tolist()}
-            | ({} if self.angular_weight is None else {"angular_weight": self.angular_weight.tolist()}),
-            "as_built_mm": _rounded(self.as_built_mm),
-            "sensitivity": None if self.sensitivity is None else _rounded(self.sensitivity),
+            "sensitivity_profile": {name: row.tolist() for name, row in profile.items() if row is not None},
+            "as_built_mm": _round_rows(self.as_built_mm),
+            "sensitivity": None if self.sensitivity is None else _round_rows(self.sensitivity),
             "noise": self.noise,
             "scatter": asdict(self.scatter),
             "sensed_mm": list(self.sensed_mm),
@@ -297,45 +331,21 @@ class Twin:
         write_json(as_path("path", path), document)
 
 
-def _refuse_wiring(read: list[int], fibres: int) -> None:
-    if read and max(read) >= fibres:
-        raise InputError(f"a channel reads fibre {max(read)}, allowed are 0 to {fibres - 1}")
-    if len(set(read)) < len(read):
-        raise InputError("two channels read the same fibre")
-
-
-def _rounded(rows: Sequence[Array | None]) -> list[list[Any] | None]:
+def _round_rows(rows: Sequence[Array | None]) -> list[list[Any] | None]:
     return [None if row is None else np.round(row, 4).tolist() for row in rows]
 
 
-def _elements(line: Array, counts: Array | None) -> tuple[Array, Array, Array]:
-    """Middles (n, 2), lengths times what they count (n,) and unit tangents (n, 2) of elements up to LONGEST.
+def _cut(path: Array, sensitivity: Array | None) -> tuple[Array, Array, Array]:
+    """Cut a polyline (P, 2) into elements up to MAX_ELEMENT_LENGTH.
 
-    Args:
-        line: (P, 2) a polyline. counts: (P - 1,) of each piece; None where all count alike.
+    Returns:
+        Middles (n, 2), lengths times sensitivity (n,) and unit tangents (n, 2).
     """
-    along = np.diff(line, axis=0)
-    size = np.hypot(*along.T)
+    step = np.diff(path, axis=0)
+    size = np.hypot(*step.T)
     parts = np.maximum(np.ceil(size / MAX_ELEMENT_LENGTH), 1).astype(int)
-    which = np.repeat(np.arange(len(parts)), parts)
-    share = (np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[which]
-    tangents = along / np.maximum(size, 1e-12)[:, None]
-    return (
-        line[which] + share[:, None] * along[which],
-        ((size if counts is None else counts * size) / parts)[which],
-        tangents[which],
-    )
-
-
-def _answer(
-    middles: Array, lengths: Array, tangents: Array, place: Array, profiles: Sequence[Array], end: float
-) -> float:
-    """What elements signal for a press at `place` (2,), by the profiles of the weight and of its angle's part."""
-    off = middles - place
-    far = np.hypot(*off.T)
-    near = far < end
-    weights = profile_weights(profiles[0], end, far[near])
-    for angled in profiles[1:]:
-        along = (off[near] * tangents[near]).sum(axis=1)
-        weights = weights + profile_weights(angled, end, far[near]) * (2 * along**2 / (far[near] ** 2 + 1e-6) - 1)
-    return float(weights @ lengths[near])
+    piece = np.repeat(np.arange(len(parts)), parts)
+    share = (np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[piece]
+    tangents = step / np.maximum(size, 1e-12)[:, None]
+    weighted = size if sensitivity is None else sensitivity * size
+    return path[piece] + share[:, None] * step[piece], (weighted / parts)[piece], tangents[piece]

@@ -1,7 +1,7 @@
-"""The exact signals differentiated with respect to knots and slopes.
+"""Gradient of the exact signals with respect to knots and slopes.
 
-The signal of a stretch [a, b] of a span, S = integral of w(|p|^2) l ds with p the place from the press centre and l the
-length per s, changes with a variable x of the span by
+The signal of a stretch [a, b] of a span, S = integral of w(|p|^2) l ds with p the position from the press centre and l
+the length per s, has the derivative (Leibniz integral rule) by a variable x of the span
 
     dS/dx = [w l ds/dx]_a^b + integral of (2 w' (p . dp/dx) l + w dl/dx) ds,   ds/dx = -(n . dp/dx) / (n . dp/ds)
 
@@ -15,40 +15,49 @@ import numpy as np
 from numba import njit
 
 from padforge.design.kernels.exact_signals import (
-    HALVINGS,
-    across,
-    kronrod,
-    local_cubic,
+    MAX_HALVINGS,
+    centre_cubic,
+    evaluate_cubic,
+    find_stretches_inside,
+    integrate_kronrod,
+    is_precise,
     make_scratch,
-    precise,
-    stretches_inside,
 )
-from padforge.design.kernels.geometry import EPS, INVERSE, MANHATTAN, UNIFORM, in_frame, touched_range, weigh
+from padforge.design.kernels.geometry import EPS, INVERSE, MANHATTAN, UNIFORM, find_touched_range, select_frame, weigh
 from padforge.design.kernels.pchip import piece_of
 
-GRAZING = 0.02
-"""Least sine of the angle of a fibre to the boundary: flatter ones change their length there without bound."""
+MIN_SINE = 0.02
+"""Smallest sine of the angle between fibre and boundary: below, the derivative would grow without bound."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 @njit(cache=True, error_model="numpy")
-def variations(s: float, h: float, d0: float, d1: float, place: Any, rate: Any) -> None:
-    """dp/dx and its derivative by s, both (6, 2), for x = t0, t1, v0, v1, d0, d1, at s in [0, 1] of the span."""
-    place[:] = 0.0
-    rate[:] = 0.0
+def differentiate_cubic(s: float, h: float, d0: float, d1: float, d_point: Any, d_tangent: Any) -> None:
+    """Compute dp/dx and its derivative by s for x = t0, t1, v0, v1, d0, d1.
+
+    Args:
+        s: parameter on the span, 0..1.
+        h: length of the span along its axis.
+        d0: slope at its first knot.
+        d1: slope at its last knot.
+        d_point: dp/dx; shape (6, 2), overwritten.
+        d_tangent: derivative of dp/dx by s; shape (6, 2), overwritten.
+    """
+    d_point[:] = 0.0
+    d_tangent[:] = 0.0
     r = 1 - s
     lift, lift_rate = d0 * s * r * r - d1 * s * s * r, d0 * r * (1 - 3 * s) - d1 * s * (2 - 3 * s)
-    place[0, 0], place[0, 1], rate[0, 0], rate[0, 1] = r, -lift, -1.0, -lift_rate
-    place[1, 0], place[1, 1], rate[1, 0], rate[1, 1] = s, lift, 1.0, lift_rate
-    place[2, 1], rate[2, 1] = (1 + 2 * s) * r * r, -6 * s * r
-    place[3, 1], rate[3, 1] = s * s * (3 - 2 * s), 6 * s * r
-    place[4, 1], rate[4, 1] = h * s * r * r, h * r * (1 - 3 * s)
-    place[5, 1], rate[5, 1] = -h * s * s * r, -h * s * (2 - 3 * s)
+    d_point[0, 0], d_point[0, 1], d_tangent[0, 0], d_tangent[0, 1] = r, -lift, -1.0, -lift_rate
+    d_point[1, 0], d_point[1, 1], d_tangent[1, 0], d_tangent[1, 1] = s, lift, 1.0, lift_rate
+    d_point[2, 1], d_tangent[2, 1] = (1 + 2 * s) * r * r, -6 * s * r
+    d_point[3, 1], d_tangent[3, 1] = s * s * (3 - 2 * s), 6 * s * r
+    d_point[4, 1], d_tangent[4, 1] = h * s * r * r, h * r * (1 - 3 * s)
+    d_point[5, 1], d_tangent[5, 1] = -h * s * s * r, -h * s * (2 - 3 * s)
 
 
 @njit(cache=True, error_model="numpy")
-def _normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, float]:
-    """Normal, of any length, of the boundary at (t, v) from the centre."""
+def _boundary_normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, float]:
+    """Return a normal, of any length, of the boundary at (t, v) from the centre."""
     breaks, upper, lower = chains
     last = len(breaks) - 1
     if last < 0:
@@ -65,8 +74,8 @@ def _normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, floa
 
 
 @njit(cache=True, error_model="numpy")
-def _weight_rate(square: float, law: Any) -> float:
-    """Derivative of `weigh` by the squared distance, but of a profile."""
+def _differentiate_weight(square: float, law: Any) -> float:
+    """Return the derivative of `weigh` by the squared distance, for every weight but a profile."""
     radius, weight = law.radius, law.weight
     if weight == UNIFORM:
         return 0.0
@@ -76,41 +85,43 @@ def _weight_rate(square: float, law: Any) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _end(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, work: Any, out: Any) -> None:
-    """Add to out (6,) what the end at s of a stretch contributes; sign is 1 for its last end and -1 for its first."""
-    (chains, _, law), (span, place, rate) = shape, work
-    t, v = span[0] + span[1] * s, across(span, s)
-    along_t, along_v = span[1], span[3] + s * (2 * span[4] + 3 * s * span[5])
-    nt, nv = _normal(t, v, chains, law.radius)
-    through = nt * along_t + nv * along_v
-    least = GRAZING * math.hypot(nt, nv) * math.hypot(along_t, along_v)
-    if abs(through) < least:
-        through = least if through > 0 else -least
-    run = along_t + abs(along_v) if law.length == MANHATTAN else math.hypot(along_t, along_v)
-    value = sign * weigh(t * t + v * v, law) * run
-    variations(s + s0, span[1], d0, d1, place, rate)
+def _add_boundary_term(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, work: Any, out: Any) -> None:
+    """Add the boundary term at s of a stretch to out (6,); sign is 1 for its last end and -1 for its first."""
+    (chains, _, law), (span, d_point, d_tangent) = shape, work
+    t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
+    dt_ds, dv_ds = span[1], span[3] + s * (2 * span[4] + 3 * s * span[5])
+    nt, nv = _boundary_normal(t, v, chains, law.radius)
+    normal_rate = nt * dt_ds + nv * dv_ds
+    least = MIN_SINE * math.hypot(nt, nv) * math.hypot(dt_ds, dv_ds)
+    if abs(normal_rate) < least:
+        normal_rate = least if normal_rate > 0 else -least
+    speed = dt_ds + abs(dv_ds) if law.length == MANHATTAN else math.hypot(dt_ds, dv_ds)
+    value = sign * weigh(t * t + v * v, law) * speed
+    differentiate_cubic(s + s0, span[1], d0, d1, d_point, d_tangent)
     for x in range(6):
-        out[x] -= value * (nt * place[x, 0] + nv * place[x, 1]) / through
+        out[x] -= value * (nt * d_point[x, 0] + nv * d_point[x, 1]) / normal_rate
 
 
 @njit(cache=True, error_model="numpy")
-def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any) -> None:
-    """Add to out (6,) the integral over [a, b]: a closed form, or quadrature on the pieces that suit the signal."""
-    law, (span, place, rate) = shape[2], work
+def _add_inner_term(
+    a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any
+) -> None:
+    """Add the integral over [a, b] to out (6,): a closed form, or quadrature on the pieces that suit the signal."""
+    law, (span, d_point, d_tangent) = shape[2], work
     is_manhattan = law.length == MANHATTAN
     if law.weight == UNIFORM and is_manhattan:
-        rising = 1.0 if across(span, b) >= across(span, a) else -1.0
+        rising = 1.0 if evaluate_cubic(span, b) >= evaluate_cubic(span, a) else -1.0
         for sign, s in ((1.0, b), (-1.0, a)):
-            variations(s + s0, span[1], d0, d1, place, rate)
+            differentiate_cubic(s + s0, span[1], d0, d1, d_point, d_tangent)
             for x in range(6):
-                out[x] += sign * (place[x, 0] + rising * place[x, 1])
+                out[x] += sign * (d_point[x, 0] + rising * d_point[x, 1])
         return
     stack[0, 0], stack[0, 1] = a, b
     top, pieces = 0, 0
     while top >= 0:
         low, high = stack[top]
         pieces += 1
-        if top < HALVINGS and not precise(kronrod(span, low, high, law)[1], pieces, law):
+        if top < MAX_HALVINGS and not is_precise(integrate_kronrod(span, low, high, law)[1], pieces, law):
             stack[top, 1] = 0.5 * (low + high)
             top += 1
             stack[top, 0], stack[top, 1] = 0.5 * (low + high), high
@@ -119,59 +130,81 @@ def _inner(a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work
         for i in range(len(_NODES)):
             s = 0.5 * (low + high) + 0.5 * (high - low) * _NODES[i]
             share = 0.5 * (high - low) * _WEIGHTS[i]
-            t, v = span[0] + span[1] * s, across(span, s)
-            along = span[3] + s * (2 * span[4] + 3 * s * span[5])
+            t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
+            dv_ds = span[3] + s * (2 * span[4] + 3 * s * span[5])
             square = t * t + v * v
-            run = span[1] + abs(along) if is_manhattan else math.hypot(span[1], along)
-            w, w_rate = weigh(square, law), _weight_rate(square, law)
-            run_t = 1.0 if is_manhattan else span[1] / run
-            run_v = math.copysign(1.0, along) if is_manhattan else along / run
-            variations(s + s0, span[1], d0, d1, place, rate)
+            speed = span[1] + abs(dv_ds) if is_manhattan else math.hypot(span[1], dv_ds)
+            w, dw_dsquare = weigh(square, law), _differentiate_weight(square, law)
+            speed_t = 1.0 if is_manhattan else span[1] / speed
+            speed_v = math.copysign(1.0, dv_ds) if is_manhattan else dv_ds / speed
+            differentiate_cubic(s + s0, span[1], d0, d1, d_point, d_tangent)
             for x in range(6):
-                moved = t * place[x, 0] + v * place[x, 1]
-                out[x] += share * (2 * w_rate * moved * run + w * (run_t * rate[x, 0] + run_v * rate[x, 1]))
+                radial = t * d_point[x, 0] + v * d_point[x, 1]
+                out[x] += share * (
+                    2 * dw_dsquare * radial * speed + w * (speed_t * d_tangent[x, 0] + speed_v * d_tangent[x, 1])
+                )
 
 
 @njit(cache=True, error_model="numpy")
-def _span(
+def _differentiate_span(
     t: Any, v: Any, d: Any, j: int, ct: float, cv: float, shape: Any, scratch: Any, work: Any, change: Any
 ) -> None:
-    """Set change (6,) to the derivatives of what span j of a fibre signals for a press at (ct, cv).
+    """Set change (6,) to the derivatives of the signal of span j for a press at (ct, cv).
 
     Args:
-        shape: of `in_frame`. work: (6,) the span, and (6, 2) place and rate of `variations`, all overwritten.
+        t: knots along the axis; shape (n,).
+        v: knots across it; shape (n,).
+        d: slopes; shape (n,).
+        j: index of the span.
+        ct: press coordinate along the axis.
+        cv: press coordinate across it.
+        shape: from `select_frame`.
+        scratch: from `make_scratch`.
+        work: the span (6,), d_point and d_tangent (6, 2), overwritten.
+        change: derivatives; shape (6,).
     """
     span, tolerance = work[0], 4 * EPS * (abs(cv) + shape[2].radius)
-    s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
+    s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
-    for i in range(stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
+    for i in range(find_stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
         a, b = scratch[4][i]
-        _inner(a, b, s0, d[j], d[j + 1], shape, work, scratch[3], change)
+        _add_inner_term(a, b, s0, d[j], d[j + 1], shape, work, scratch[3], change)
         for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
             if not is_knot:
-                _end(s, s0, sign, d[j], d[j + 1], shape, work, change)
+                _add_boundary_term(s, s0, sign, d[j], d[j + 1], shape, work, change)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def signals_gradient(
-    travel: Any,
-    cross: Any,
+    along: Any,
+    across: Any,
     slope: Any,
-    strays: Any,
+    max_offsets: Any,
     ends: Any,
     presses: Any,
     upstream: Any,
     chains: tuple[Any, Any],
-    reach: Any,
+    extents: Any,
     law: Any,
 ) -> Any:
-    """Gradient (3, F, n) of sum(upstream * signals) by knots' travel and cross coordinates and slopes, one pad.
+    """Compute the gradient of sum(upstream * signals) with respect to knots and slopes of one pad.
 
     Args:
-        travel, cross, slope: (F, n), held independent. strays: (2,). ends: `Ends`. presses: (Q, 2). upstream: (Q, F).
-        law: of any weight but PROFILE, whose gradient `measured_signals` has.
+        along: knots along the axis; shape (F, n).
+        across: knots across it; shape (F, n).
+        slope: slopes at the knots, held independent; shape (F, n).
+        max_offsets: from the function of that name, for this pad; shape (2,).
+        ends: `Ends`.
+        presses: x and y; shape (Q, 2).
+        upstream: gradient with respect to the signals; shape (Q, F).
+        chains: shape in the frame of each family, two of (3, B).
+        extents: extents in the frame of each family; shape (2, 5).
+        law: `WeightLaw` of any weight but PROFILE, which `measured_signals` differentiates.
+
+    Returns:
+        Gradient with respect to along, across and slope; shape (3, F, n).
     """
-    fibres, n = travel.shape
+    fibres, n = along.shape
     out = np.zeros((3, fibres, n))
     change = np.empty(6)
     work = np.empty(6), np.empty((6, 2)), np.empty((6, 2))
@@ -179,16 +212,16 @@ def signals_gradient(
     for q in range(len(presses)):
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = in_frame((chains, reach, law), family)
+            shape = select_frame((chains, extents, law), family)
             tolerance = 4 * EPS * (abs(cv) + law.radius)
-            low, high = cv + reach[family, 2] - tolerance, cv + reach[family, 3] + tolerance
-            first, last = touched_range(cv, reach[family], strays[family], ends, family)
+            low, high = cv + extents[family, 2] - tolerance, cv + extents[family, 3] + tolerance
+            first, last = find_touched_range(cv, extents[family], max_offsets[family], ends, family)
             for f in range(first, last):
-                t, v, d = travel[f], cross[f], slope[f]
-                j = piece_of(ct + reach[family, 0], t, n)
-                while j < n - 1 and t[j] < ct + reach[family, 1]:
+                t, v, d = along[f], across[f], slope[f]
+                j = piece_of(ct + extents[family, 0], t, n)
+                while j < n - 1 and t[j] < ct + extents[family, 1]:
                     if min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:
-                        _span(t, v, d, j, ct, cv, shape, scratch, work, change)
+                        _differentiate_span(t, v, d, j, ct, cv, shape, scratch, work, change)
                         for x in range(6):
                             out[x // 2, f, j + x % 2] += upstream[q, f] * change[x]
                     j += 1

@@ -1,12 +1,12 @@
-"""The exact contact rule: integrals along PCHIP spans inside the press, no sampling.
+"""Exact signals: line integrals along PCHIP spans inside the press, without sampling.
 
-Frame: a fibre travels along t and moves across along v; both are taken from the press centre. A span is the cubic
+Frame: a fibre runs along t and deviates across it, v; both are measured from the press centre. A span is the cubic
 t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 in a parameter s whose zero is the point of the span abreast of the
 centre, so that small presses keep their relative accuracy.
 
-A polygon is two chains over t, upper and lower, linear between shared breakpoints; a circle is its own chain. PCHIP
-spans are monotone, so most pieces are taken or left whole by comparing ends; only where the fibre and a chain may
-meet are roots sought.
+A polygon is two chains over t, upper and lower, linear between shared breakpoints; a circle has none. PCHIP spans are
+monotone, so most pieces are accepted or rejected by comparing ends; roots are computed only where the fibre and a chain
+may intersect.
 """
 
 import math
@@ -22,38 +22,28 @@ from padforge.design.kernels.geometry import (
     PROFILE,
     SCRATCH,
     UNIFORM,
-    in_frame,
-    roots_in_unit,
-    sort,
-    touched_range,
+    find_touched_range,
+    find_unit_roots,
+    select_frame,
+    shell_sort,
     weigh,
 )
 from padforge.design.kernels.pchip import piece_of
 
-# G7-K15 nodes and weights on [-1, 1], positive half, the centre last; Gauss weights for every second node
-NODES = np.array(
-    [
-        0.991455371120812639206854697526329,
-        0.949107912342758524526189684047851,
-        0.864864423359769072789712788640926,
-        0.741531185599394439863864773280788,
-        0.586087235467691130294144691693013,
-        0.405845151377397166906606412076961,
-        0.207784955007898467600689403773245,
-        0.0,
-    ]
-)
-KRONROD = np.array(
-    [
-        0.022935322010529224963732008058970,
-        0.063092092629978553290700663189204,
-        0.104790010322250183839876322541518,
-        0.140653259715525918745189590510238,
-        0.169004726639267902826583426598550,
-        0.190350578064785409913256402421014,
-        0.204432940075298892414161999234649,
-        0.209482141084727828012999174891714,
-    ]
+# G7-K15 rule on [-1, 1]: nodes and Kronrod weights of the positive half, the centre last; Gauss weights of every second
+NODES, KRONROD = np.ascontiguousarray(
+    np.array(
+        [
+            (0.991455371120812639206854697526329, 0.022935322010529224963732008058970),
+            (0.949107912342758524526189684047851, 0.063092092629978553290700663189204),
+            (0.864864423359769072789712788640926, 0.104790010322250183839876322541518),
+            (0.741531185599394439863864773280788, 0.140653259715525918745189590510238),
+            (0.586087235467691130294144691693013, 0.169004726639267902826583426598550),
+            (0.405845151377397166906606412076961, 0.190350578064785409913256402421014),
+            (0.207784955007898467600689403773245, 0.204432940075298892414161999234649),
+            (0.0, 0.209482141084727828012999174891714),
+        ]
+    ).T
 )
 GAUSS = np.array(
     [
@@ -63,37 +53,46 @@ GAUSS = np.array(
         0.417959183673469387755102040816327,
     ]
 )
-HALVINGS = 48
+MAX_HALVINGS = 48
 PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
-"""To which a piece is integrated where it is no closed form, as a share; of a profile, as a share at weight 1."""
+"""Relative error of a piece without a closed form; of a profile, relative to weight 1."""
 PIECES, PATIENCE = 500, 100
-"""Beyond PIECES, what counts as precise doubles with every PATIENCE more: where rounding is all that is left, halving
-would never end."""
+"""Beyond PIECES the tolerance doubles with every PATIENCE more pieces: halving pure rounding errors would not end."""
 
 
 @njit(cache=True, error_model="numpy")
-def across(span: Any, s: float) -> float:
-    """v at s."""
+def evaluate_cubic(span: Any, s: float) -> float:
+    """Return v at s."""
     return span[2] + s * (span[3] + s * (span[4] + s * span[5]))
 
 
 @njit(cache=True, error_model="numpy")
 def _density(span: Any, s: float, law: Any) -> float:
-    """Weighted length per unit of s."""
+    """Return the weighted length per unit of s."""
     rise = span[3] + s * (2 * span[4] + 3 * s * span[5])
     run = span[1] + abs(rise) if law.length == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
     if law.weight == UNIFORM:
         return run
-    t, v = span[0] + span[1] * s, across(span, s)
+    t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
     return run * weigh(t * t + v * v, law)
 
 
 @njit(cache=True, error_model="numpy")
-def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
-    """15-point Kronrod integral over [a, b] and its error estimate (difference to 7-point Gauss, sharpened).
+def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
+    """Integrate over [a, b] by the 15-point Kronrod rule and estimate the error by the 7-point Gauss rule.
 
-    The estimate is a share of the integral, but for a profile, whose weights may cancel, of what it would be at weight
-    1; there it is the plain difference, as sharpening holds for smooth functions only, and splines bend at their knots.
+    The estimate is relative to the integral. For a profile, whose weights may cancel, it is relative to the integral at
+    weight 1, and the plain difference: QUADPACK's sharpening (200 d)^1.5 holds for smooth functions only, and splines
+    bend at their knots.
+
+    Args:
+        span: r, h, e0..e3; shape (6,).
+        a: start of the interval.
+        b: end of the interval.
+        law: a `WeightLaw`.
+
+    Returns:
+        Integral and error estimate.
     """
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
     centre = _density(span, middle, law)
@@ -105,22 +104,30 @@ def kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
         if i % 2 == 1:
             coarse += GAUSS[i // 2] * pair
     if law.weight == PROFILE:
-        run = span[1] + abs(across(span, b) - across(span, a)) / (b - a)  # spans are monotone
+        run = span[1] + abs(evaluate_cubic(span, b) - evaluate_cubic(span, a)) / (b - a)  # spans are monotone
         return fine * half, abs(fine - coarse) / run
     gap = abs(fine - coarse) / fine if fine > 0 else 0.0
     return fine * half, min(1.0, (200 * gap) ** 1.5)
 
 
 @njit(cache=True, error_model="numpy")
-def precise(error: float, pieces: int, law: Any) -> bool:
-    """Whether a piece need not be halved, the `pieces`-th that is looked at."""
+def is_precise(error: float, pieces: int, law: Any) -> bool:
+    """Whether the error of a piece, the `pieces`-th that was integrated, is acceptable."""
     least = PROFILE_PRECISION if law.weight == PROFILE else PRECISION
     return error <= least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
 
 
 @njit(cache=True, error_model="numpy")
-def length_element(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
-    """Integral of the density over a stretch [a, b] that lies wholly inside the press."""
+def integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
+    """Integrate the density over a stretch [a, b]: in closed form, or by adaptive Gauss-Kronrod.
+
+    Args:
+        span: r, h, e0..e3; shape (6,).
+        a: start of the stretch.
+        b: end of the stretch.
+        law: a `WeightLaw`.
+        stack: intervals to do; shape (MAX_HALVINGS + 2, 2), overwritten.
+    """
     if law.weight == UNIFORM and law.length == MANHATTAN:
         mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
         return (b - a) * (span[1] + abs(mean_rise))
@@ -129,9 +136,9 @@ def length_element(span: Any, a: float, b: float, law: Any, stack: Any) -> float
     top = 0
     while top >= 0:
         low, high = stack[top]
-        part, error = kronrod(span, low, high, law)
+        part, error = integrate_kronrod(span, low, high, law)
         pieces += 1
-        if precise(error, pieces, law) or top >= HALVINGS:
+        if is_precise(error, pieces, law) or top >= MAX_HALVINGS:
             total += part
             top -= 1
         else:
@@ -143,15 +150,15 @@ def length_element(span: Any, a: float, b: float, law: Any, stack: Any) -> float
 
 
 _PROBES = (0.5, 0.22, 0.78)
-_CLEAR = 1e6  # tolerances a value must be away from zero to be believed without a second look
+_CLEAR = 1e6  # a value this many tolerances from zero has a certain sign
 
 
 @njit(cache=True, error_model="numpy")
-def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
-    """Append to out[count:] where the span crosses the circle of `radius` in (a, b), as parameters s."""
+def find_circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
+    """Append to out[count:] the s in (a, b) at which the span crosses the circle of `radius`; return the count."""
     w = b - a
     t0, t1 = span[0] + span[1] * a, span[1] * w
-    v0, v3 = across(span, a), span[5] * w**3
+    v0, v3 = evaluate_cubic(span, a), span[5] * w**3
     v1, v2 = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w, (span[4] + 3 * a * span[5]) * w * w
     p[0] = (t0 - radius) * (t0 + radius) + v0 * v0
     p[1] = 2 * (t0 * t1 + v0 * v1)
@@ -160,31 +167,31 @@ def circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: 
     p[4] = v2 * v2 + 2 * v1 * v3
     p[5] = 2 * v2 * v3
     p[6] = v3 * v3
-    end = roots_in_unit(p, np.int64(6), 16 * EPS * radius * radius, out, count, work)
+    end = find_unit_roots(p, np.int64(6), 16 * EPS * radius * radius, out, count, work)
     for i in range(count, end):
         out[i] = a + w * out[i]
     return end
 
 
 @njit(cache=True, error_model="numpy")
-def _line_roots(
+def _find_line_roots(
     span: Any, a: float, b: float, at_a: float, at_b: float, tolerance: float, out: Any, count: Any, work: Any, p: Any
 ) -> int:
-    """Append to out[count:] where the span crosses a line that runs from `at_a` at s = a to `at_b` at s = b."""
+    """Append to out[count:] the s at which the span crosses the line from `at_a` at s = a to `at_b` at s = b."""
     w = b - a
-    p[0] = across(span, a) - at_a
+    p[0] = evaluate_cubic(span, a) - at_a
     p[1] = (span[3] + a * (2 * span[4] + 3 * a * span[5])) * w - (at_b - at_a)
     p[2] = (span[4] + 3 * a * span[5]) * w * w
     p[3] = span[5] * w**3
-    end = roots_in_unit(p, np.int64(3), tolerance, out, count, work)
+    end = find_unit_roots(p, np.int64(3), tolerance, out, count, work)
     for i in range(count, end):
         out[i] = a + w * out[i]
     return end
 
 
 @njit(cache=True, error_model="numpy")
-def _keep(stretches: Any, count: Any, begin: float, end: float) -> int:
-    """Append [begin, end] to stretches[:count], joined to the last one where they meet; returns the new count."""
+def _append_stretch(stretches: Any, count: Any, begin: float, end: float) -> int:
+    """Append [begin, end] to stretches[:count], merged with the last one if they touch; return the new count."""
     if count > 0 and stretches[count - 1, 1] == begin:
         stretches[count - 1, 1] = end
         return count
@@ -193,80 +200,82 @@ def _keep(stretches: Any, count: Any, begin: float, end: float) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> Any:
-    """`stretches_inside` of a circle."""
+def _find_inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> Any:
+    """Find the stretches inside a circle, as `find_stretches_inside`."""
     roots, work, p, _, stretches = scratch
-    count = circle_roots(span, a, b, radius, roots, np.int64(0), work, p)
-    found, begin = np.int64(0), a
+    count = find_circle_roots(span, a, b, radius, roots, np.int64(0), work, p)
+    count_inside, begin = np.int64(0), a
     for i in range(count + 1):
         end = b if i == count else roots[i]
         # no sign changes between roots, but a touch may lie there: the largest of three values has the sign
         largest = 0.0
         for share in _PROBES:
             s = begin + share * (end - begin)
-            t, v = span[0] + span[1] * s, across(span, s)
+            t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
             depth = radius * radius - t * t - v * v
             if abs(depth) > abs(largest):
                 largest = depth
             if abs(largest) > _CLEAR * radius * tolerance:
                 break
         if largest >= -2 * radius * tolerance:
-            found = _keep(stretches, found, begin, end)
+            count_inside = _append_stretch(stretches, count_inside, begin, end)
         begin = end
-    return found
+    return count_inside
 
 
 @njit(cache=True, error_model="numpy")
-def _between_lines(
-    span: Any, here: float, after: float, lines: Any, near: Any, tolerance: float, found: Any, scratch: Any
+def _find_between_lines(
+    span: Any, start: float, after: float, lines: Any, near: Any, tolerance: float, count_inside: Any, scratch: Any
 ) -> Any:
-    """Append to the `found` stretches where the span is between two lines, upper and lower, that are near."""
+    """Append the stretches on which the span is between two lines of which `near` ones may cross it."""
     roots, work, p, _, stretches = scratch
     (u0, u1, l0, l1), count = lines, np.int64(0)
     if near[0]:
-        count = _line_roots(span, here, after, u0, u1, tolerance, roots, count, work, p)
+        count = _find_line_roots(span, start, after, u0, u1, tolerance, roots, count, work, p)
     if near[1]:
-        count = _line_roots(span, here, after, l0, l1, tolerance, roots, count, work, p)
-    sort(roots, count)
-    begin = here
+        count = _find_line_roots(span, start, after, l0, l1, tolerance, roots, count, work, p)
+    shell_sort(roots, count)
+    begin = start
     for i in range(count + 1):
         end = after if i == count else roots[i]
         above, below = 0.0, 0.0
         for share in _PROBES:
             s = begin + share * (end - begin)
-            x, at = (s - here) / (after - here), across(span, s)
+            x, at = (s - start) / (after - start), evaluate_cubic(span, s)
             to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
             above = to_upper if abs(to_upper) > abs(above) else above
             below = to_lower if abs(to_lower) > abs(below) else below
             if min(abs(above), abs(below)) > _CLEAR * tolerance:
                 break
         if above >= -tolerance and below >= -tolerance:
-            found = _keep(stretches, found, begin, end)
+            count_inside = _append_stretch(stretches, count_inside, begin, end)
         begin = end
-    return found
+    return count_inside
 
 
 @njit(cache=True, error_model="numpy")
-def stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float, scratch: Any) -> Any:
-    """Stretches of [a, b] on which the span lies inside the press, ascending, into the last of `scratch`.
+def find_stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float, scratch: Any) -> Any:
+    """Find the stretches of [a, b] on which the span lies inside the press into the last array of `scratch`.
 
     Args:
-        span: (6,) r, h, e0..e3.
-        shape: of `in_frame`; its chains are (3, B) breakpoints t, upper v, lower v of a polygon, B = 0 for a circle.
-        tolerance: how far outside still counts as on the boundary.
-        scratch: of `make_scratch`.
+        span: r, h, e0..e3; shape (6,).
+        a: start of the interval.
+        b: end of the interval.
+        shape: from `select_frame`; chains are (3, B) breakpoints t, upper v, lower v of a polygon, B = 0 for a circle.
+        tolerance: distance outside that still counts as on the boundary.
+        scratch: from `make_scratch`.
 
     Returns:
-        How many stretches there are.
+        Number of stretches.
     """
     stretches = scratch[4]
-    (chains, reach, law), r, h = shape, span[0], span[1]
-    radius, inner = law.radius, reach[4]
+    (chains, extents, law), r, h = shape, span[0], span[1]
+    radius, inner = law.radius, extents[4]
     # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
-    t0, t1, v, v1 = r + h * a, r + h * b, across(span, a), across(span, b)
+    t0, t1, v, v1 = r + h * a, r + h * b, evaluate_cubic(span, a), evaluate_cubic(span, b)
     far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v1))
     if far_t * far_t + far_v * far_v < inner * inner:
-        return _keep(stretches, np.int64(0), a, b)
+        return _append_stretch(stretches, np.int64(0), a, b)
     near_t, near_v = max(t0, -t1, 0.0), max(min(v, v1), -max(v, v1), 0.0)
     if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
         return 0
@@ -277,17 +286,17 @@ def stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float
     if b <= a:
         return 0
     if last < 0:
-        return _inside_circle(span, a, b, radius, tolerance, scratch)
-    found, here, v, k = np.int64(0), a, across(span, a), piece_of(r + h * a, breaks, last)
-    while here < b:
+        return _find_inside_circle(span, a, b, radius, tolerance, scratch)
+    count_inside, start, v, k = np.int64(0), a, evaluate_cubic(span, a), piece_of(r + h * a, breaks, last)
+    while start < b:
         after = b if k == last - 1 else min(b, (breaks[k + 1] - r) / h)
-        if after <= here:
+        if after <= start:
             k += 1
             continue
-        v_after, t0, t1 = across(span, after), r + h * here, r + h * after
+        v_after, t0, t1 = evaluate_cubic(span, after), r + h * start, r + h * after
         far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v_after))
         if far_t * far_t + far_v * far_v < inner * inner:  # as for the whole span: no chain is near
-            found, here, v, k = _keep(stretches, found, here, after), after, v_after, k + 1
+            count_inside, start, v, k = _append_stretch(stretches, count_inside, start, after), after, v_after, k + 1
             continue
         width = breaks[k + 1] - breaks[k]
         x0, x1 = (t0 - breaks[k]) / width, (t1 - breaks[k]) / width
@@ -295,36 +304,50 @@ def stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float
         l0, l1 = lower[k] + (lower[k + 1] - lower[k]) * x0, lower[k] + (lower[k + 1] - lower[k]) * x1
         least, most = min(v, v_after), max(v, v_after)
         if most <= min(u0, u1) and least >= max(l0, l1):
-            found = _keep(stretches, found, here, after)
+            count_inside = _append_stretch(stretches, count_inside, start, after)
         elif least <= max(u0, u1) + tolerance and most >= min(l0, l1) - tolerance:
             near = most >= min(u0, u1), least <= max(l0, l1)
-            found = _between_lines(span, here, after, (u0, u1, l0, l1), near, tolerance, found, scratch)
-        here, v = after, v_after
+            count_inside = _find_between_lines(
+                span, start, after, (u0, u1, l0, l1), near, tolerance, count_inside, scratch
+            )
+        start, v = after, v_after
         k += 1
-    return found
+    return count_inside
 
 
 @njit(cache=True, error_model="numpy")
-def _stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
-    """Signal of a stretch inside the press; the 1/d weight has a kink where it is cut off, which is split at."""
+def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
+    """Return the signal of a stretch inside the press, split at the kink of the 1/d weight."""
     roots, work, p, stack, _ = scratch
     if law.weight != INVERSE:
-        return length_element(span, a, b, law, stack)
-    count = circle_roots(span, a, b, law.radius / 100, roots, np.int64(0), work, p)
+        return integrate_stretch(span, a, b, law, stack)
+    count = find_circle_roots(span, a, b, law.radius / 100, roots, np.int64(0), work, p)
     total, begin = 0.0, a
     for i in range(count):
-        total += length_element(span, begin, roots[i], law, stack)
+        total += integrate_stretch(span, begin, roots[i], law, stack)
         begin = roots[i]
-    return total + length_element(span, begin, b, law, stack)
+    return total + integrate_stretch(span, begin, b, law, stack)
 
 
 @njit(cache=True, error_model="numpy")
-def local_cubic(
+def centre_cubic(
     t0: float, t1: float, v0: float, v1: float, d0: float, d1: float, ct: float, cv: float, out: Any
 ) -> float:
-    """The span from knot (t0, v0) to (t1, v1) with end slopes d0, d1 about its point abreast of the centre (ct, cv).
+    """Expand the span between two knots about its point abreast of the press centre.
 
-    Writes r, h, e0..e3 to out (6,) and returns the share s0 of the span before that point: s runs from -s0 to 1 - s0.
+    Args:
+        t0: first knot along the axis.
+        t1: last knot along the axis.
+        v0: first knot across it.
+        v1: last knot across it.
+        d0: slope at the first knot.
+        d1: slope at the last knot.
+        ct: press coordinate along the axis.
+        cv: press coordinate across it.
+        out: r, h, e0..e3; shape (6,), overwritten.
+
+    Returns:
+        Share s0 of the span before that point; s runs from -s0 to 1 - s0.
     """
     h, rise = t1 - t0, v1 - v0
     s0 = min(max((ct - t0) / h, 0.0), 1.0)
@@ -339,26 +362,35 @@ def local_cubic(
 
 
 @njit(cache=True, error_model="numpy")
-def fibre_signal(
+def compute_fibre_signal(
     t: Any, v: Any, d: Any, ct: float, cv: float, shape: Any, span: Any, scratch: Any
 ) -> tuple[float, int]:
-    """Signal of one fibre for the press at (ct, cv), and how many spans were looked at.
+    """Compute the signal of one fibre for the press at (ct, cv).
 
     Args:
-        t, v, d: (n,) knots and slopes. shape: of `in_frame`; its extents (5,) are least and greatest t, least and
-            greatest v, radius of the circle inside.
+        t: knots along the axis; shape (n,).
+        v: knots across it; shape (n,).
+        d: slopes; shape (n,).
+        ct: press coordinate along the axis.
+        cv: press coordinate across it.
+        shape: from `select_frame`; its extents (5,) are min and max t, min and max v, radius of the inscribed circle.
+        span: work array; shape (6,).
+        scratch: from `make_scratch`.
+
+    Returns:
+        Signal, and number of spans visited.
     """
-    _, reach, law = shape
-    n, begin, end = len(t), ct + reach[0], ct + reach[1]
+    _, extents, law = shape
+    n, begin, end = len(t), ct + extents[0], ct + extents[1]
     if end <= t[0] or begin >= t[n - 1]:
         return 0.0, 0
     tolerance = 4 * EPS * (abs(cv) + law.radius)
     total, visited, j = 0.0, 0, piece_of(begin, t, n)
     while j < n - 1 and t[j] < end:
-        if min(v[j], v[j + 1]) <= cv + reach[3] + tolerance and max(v[j], v[j + 1]) >= cv + reach[2] - tolerance:
-            s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
-            for i in range(stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
-                total += _stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], law, scratch)
+        if min(v[j], v[j + 1]) <= cv + extents[3] + tolerance and max(v[j], v[j + 1]) >= cv + extents[2] - tolerance:
+            s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
+            for i in range(find_stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
+                total += _compute_stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], law, scratch)
             visited += 1
         j += 1
     return total, visited
@@ -366,23 +398,23 @@ def fibre_signal(
 
 @njit(cache=True, error_model="numpy")
 def make_scratch(breaks: int) -> Any:
-    """Work arrays of one thread: roots, root finder's stack, polynomial, quadrature's stack, stretches inside.
+    """Allocate one thread's work arrays: roots, root finder's stack, polynomial, quadrature's stack, stretches inside.
 
-    Each of the pieces between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it in 7 parts.
+    Each piece between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it into 7 parts.
     """
-    return np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((HALVINGS + 2, 2)), np.empty((4 * breaks + 8, 2))
+    return np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((MAX_HALVINGS + 2, 2)), np.empty((4 * breaks + 8, 2))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def exact_signals(
-    travel: Any,
-    cross: Any,
+    along: Any,
+    across: Any,
     slope: Any,
-    strays: Any,
+    max_offsets: Any,
     ends: Any,
     presses: Any,
     chains: tuple[Any, Any],
-    reach: Any,
+    extents: Any,
     law: Any,
     begin: int,
     end: int,
@@ -390,16 +422,28 @@ def exact_signals(
     fibre: Any,
     signal: Any,
 ) -> int:
-    """Signals of pads for presses, only of fibres a press can touch; returns how many spans were looked at.
+    """Compute signals of pads, only for fibres that a press can touch.
 
     Args:
-        travel, cross, slope: (P, F, n) knots and slopes. strays: (P, 2) of `family_strays`. ends: `Ends`.
-        presses: (Q, 2) x and y. begin, end: range of presses to do, counted through the population, 0..P Q.
-        chains: two (3, B), reach: (2, 5): the shape in the frame of each family. law: a `Law`.
-        starts: (Q + 1,) of `count_touched` for one pad, its fibres' indices and signals to be written to `fibre` and
-            `signal`; or empty for dense signals (P Q F,), zeros before.
+        along: knots along the axis; shape (P, F, n).
+        across: knots across it; shape (P, F, n).
+        slope: slopes at the knots; shape (P, F, n).
+        max_offsets: from the function of that name; shape (P, 2).
+        ends: `Ends`.
+        presses: x and y; shape (Q, 2).
+        chains: shape in the frame of each family, two of (3, B).
+        extents: extents in the frame of each family; shape (2, 5).
+        law: a `WeightLaw`.
+        begin: first press to do, counted through the population, 0..P Q.
+        end: press to stop before.
+        starts: from `count_touched` for one pad, shape (Q + 1,), for sparse signals; empty for dense ones.
+        fibre: fibre indices of sparse signals.
+        signal: sparse signals, or dense ones (P Q F,), zeros before.
+
+    Returns:
+        Number of spans visited.
     """
-    fibres = travel.shape[1]
+    fibres = along.shape[1]
     span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     visited = 0
     for index in range(begin, end):
@@ -407,11 +451,11 @@ def exact_signals(
         slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = in_frame((chains, reach, law), family)
-            first, last = touched_range(cv, reach[family], strays[p, family], ends, family)
+            shape = select_frame((chains, extents, law), family)
+            first, last = find_touched_range(cv, extents[family], max_offsets[p, family], ends, family)
             for f in range(first, last):
-                t, v, d = travel[p, f], cross[p, f], slope[p, f]
-                value, spans = fibre_signal(t, v, d, ct, cv, shape, span, scratch)
+                t, v, d = along[p, f], across[p, f], slope[p, f]
+                value, spans = compute_fibre_signal(t, v, d, ct, cv, shape, span, scratch)
                 visited += spans
                 if len(starts):
                     fibre[slot], signal[slot] = f, value

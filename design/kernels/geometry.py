@@ -1,4 +1,4 @@
-"""How near places of fibres come to a fibre of the other family, with the gradient by the samples of both."""
+"""Geometry shared by the kernels: press shapes and weights, reachable fibres, near polylines, polynomial roots."""
 
 import math
 from functools import lru_cache
@@ -20,25 +20,30 @@ NO_PROFILE = np.empty((0, 5))
 
 
 class Ends(NamedTuple):
-    """Where fibres end: horizontal i (from 0) at the height (i + 1) apart_y, vertical i at (i + 1) apart_x.
+    """Positions of fibre ends: horizontal i (from 0) at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x.
 
     Attributes:
-        horizontals, verticals: how many there are of each family. apart_y, apart_x: grid units.
+        horizontals: number of horizontals.
+        verticals: number of verticals.
+        spacing_y: distance of horizontals, grid units.
+        spacing_x: distance of verticals, grid units.
     """
 
     horizontals: int
     verticals: int
-    apart_y: float
-    apart_x: float
+    spacing_y: float
+    spacing_x: float
 
 
 class WeightLaw(NamedTuple):
-    """What a fibre element in a press counts.
+    """Weight of a fibre element in a press.
 
     Attributes:
-        radius: of the shape, or where a profile ends. weight, length: UNIFORM, ...; MANHATTAN, ...
-        profile: (B, 5), each row a squared distance and the powers of a cubic in what lies beyond it, up to the next
-            row's; NO_PROFILE for a weight with a formula.
+        radius: circumradius of the shape, or the distance at which a profile ends.
+        weight: UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE.
+        length: MANHATTAN or EUCLIDEAN.
+        profile: rows of a squared distance and the coefficients of a cubic in the excess over it, up to the next row's;
+            shape (B, 5); NO_PROFILE for a weight with a formula.
     """
 
     radius: float
@@ -49,7 +54,7 @@ class WeightLaw(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def weigh(square: float, law: Any) -> float:
-    """Weight of a fibre element at squared distance `square` from the press centre, by a `WeightLaw`."""
+    """Return the weight of a fibre element at a squared distance from the press centre, by a `WeightLaw`."""
     radius, weight, profile = law.radius, law.weight, law.profile
     if weight == UNIFORM:
         return 1.0
@@ -63,14 +68,22 @@ def weigh(square: float, law: Any) -> float:
 
 
 @lru_cache(maxsize=64)
-def profile_coefficients(reach: tuple[tuple[float, float], ...]) -> Array:
-    """The profile (B, 5) of `weigh` through points (distance, weight), the last of weight 0: their `profile_spline`."""
-    spline = profile_spline(reach)
-    return np.ascontiguousarray(np.column_stack([spline.x[:-1], spline.c[::-1].T]))  # one order: compiled once
+def profile_coefficients(points: tuple[tuple[float, float], ...]) -> Array:
+    """Return the `WeightLaw.profile` (B, 5) through points (distance, weight), by their `profile_spline`."""
+    spline = profile_spline(points)
+    return np.ascontiguousarray(
+        np.column_stack([spline.x[:-1], spline.c[::-1].T])
+    )  # one memory order, so that kernels are compiled once
 
 
 def profile_weights(profile: Array, end: float, distance: Array) -> Array:
-    """What a profile, as `profile_coefficients` gives it, weighs at distances of any shape; 0 from `end` on."""
+    """Evaluate a profile.
+
+    Args:
+        profile: from `profile_coefficients`.
+        end: distance from which it is 0.
+        distance: distances of any shape.
+    """
     square = distance**2
     piece = np.searchsorted(profile[:, 0], square, side="right") - 1
     x, c0, c1, c2, c3 = profile[piece].T
@@ -79,11 +92,19 @@ def profile_weights(profile: Array, end: float, distance: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
-def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
-    """The press's shape in the frame of each family: chains (3, B) of breakpoints t, upper v, lower v; extents (2, 5).
+def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
+    """Return the shape of a press in the frame of each family.
 
-    A circle has no breakpoints. At t a polygon reaches up to the lowest of its upper edges' lines and down to the
+    A circle has no breakpoints. At t a polygon extends up to the lowest of its upper edges' lines and down to the
     highest of its lower ones.
+
+    Args:
+        radius: circumradius.
+        sides: number of sides; None for a circle.
+
+    Returns:
+        Chains, two of (3, B) breakpoints t, upper v and lower v; and extents (2, 5): min and max t, min and max v,
+        radius of the inscribed circle.
     """
     if sides is None:
         empty = np.empty((3, 0))
@@ -91,7 +112,7 @@ def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array
     corner = 2 * np.pi * np.arange(sides) / sides
     normal = corner + np.pi / sides
     apothem = np.cos(np.pi / sides)
-    chains, reach = [], []
+    chains, extents = [], []
     for to_frame in ((np.cos, np.sin), (np.sin, np.cos)):
         t = np.sort(to_frame[0](corner))
         t = t[np.append(True, np.diff(t) > 1e-12)]
@@ -100,72 +121,100 @@ def frames(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array
         upper = np.where(across > 1e-12, edge, np.inf).min(axis=1)
         lower = np.where(across < -1e-12, edge, -np.inf).max(axis=1)
         chains.append(radius * np.stack([t, upper, lower]))
-        reach.append([t[0], t[-1], lower.min(), upper.max(), apothem])
-    return (chains[0], chains[1]), radius * np.array(reach)
+        extents.append([t[0], t[-1], lower.min(), upper.max(), apothem])
+    return (chains[0], chains[1]), radius * np.array(extents)
 
 
 @njit(cache=True, error_model="numpy")
-def in_frame(shape: Any, family: int) -> Any:
-    """A shape (chains and extents in both frames, law) in the frame of one family."""
-    chains, reach, law = shape
-    return (chains[0] if family == 0 else chains[1]), reach[family], law
+def select_frame(shape: Any, family: int) -> Any:
+    """Return a shape (chains and extents in both frames, law) in the frame of one family."""
+    chains, extents, law = shape
+    return (chains[0] if family == 0 else chains[1]), extents[family], law
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def max_offsets(cross: Any, ends: Any) -> Any:
-    """(P, 2) how far the fibres of each family stray from their own level, from knots' cross (P, F, n)."""
-    population, fibres, _ = cross.shape
+def max_offsets(across: Any, ends: Any) -> Any:
+    """Compute the largest offset of the fibres of each family from their own level.
+
+    Args:
+        across: knots across the axis; shape (P, F, n).
+        ends: `Ends`.
+
+    Returns:
+        Offsets; shape (P, 2).
+    """
+    population, fibres, _ = across.shape
     out = np.zeros((population, 2))
     for p in range(population):
         for f in range(fibres):
-            family, first, _, apart = family_of(f, ends)
-            level = (f - first + 1) * apart
-            for at in cross[p, f]:
+            family, first, _, spacing = family_of(f, ends)
+            level = (f - first + 1) * spacing
+            for at in across[p, f]:
                 out[p, family] = max(out[p, family], abs(at - level))
     return out
 
 
 @njit(cache=True, error_model="numpy")
 def family_of(fibre: int, ends: Any) -> tuple[int, int, int, float]:
-    """Family of a fibre, 0 or 1, its first fibre and the one behind its last, and how far apart their ends are."""
+    """Return a fibre's family, 0 or 1, its first fibre and the one after its last, and the spacing of their ends."""
     if fibre < ends.horizontals:
-        return 0, 0, ends.horizontals, ends.apart_y
-    return 1, ends.horizontals, ends.horizontals + ends.verticals, ends.apart_x
+        return 0, 0, ends.horizontals, ends.spacing_y
+    return 1, ends.horizontals, ends.horizontals + ends.verticals, ends.spacing_x
 
 
 @njit(cache=True, error_model="numpy")
-def touched_range(cv: float, reach: Any, stray: float, ends: Any, family: int) -> tuple[int, int]:
-    """Fibres [first, end) of a family that a press at cross coordinate cv can touch, by index among all fibres.
+def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, family: int) -> tuple[int, int]:
+    """Find the fibres of a family that a press can touch: those whose level plus offset is within its extents.
 
-    Fibre i of the family (from 0) keeps to level (i + 1) apart within the family's stray.
+    Args:
+        cv: press coordinate across the family's axis.
+        extents: extents of the press in the family's frame; shape (5,).
+        max_offset: from `max_offsets`, of the family.
+        ends: `Ends`.
+        family: 0 or 1.
+
+    Returns:
+        First fibre and the one to stop before, as indices among all fibres.
     """
     before = 0 if family == 0 else ends.horizontals
-    count, apart = (ends.horizontals, ends.apart_y) if family == 0 else (ends.verticals, ends.apart_x)
-    slack = 8 * EPS * (abs(cv) + reach[3])  # a fibre on the boundary is touched, whichever way rounding goes
-    first = min(max(math.ceil((cv + reach[2] - stray - slack) / apart) - 1, 0.0), float(count))
-    end = min(max(math.floor((cv + reach[3] + stray + slack) / apart), 0.0), float(count))
+    count, spacing = (ends.horizontals, ends.spacing_y) if family == 0 else (ends.verticals, ends.spacing_x)
+    slack = 8 * EPS * (abs(cv) + extents[3])  # a fibre on the boundary is touched, whichever way rounding goes
+    first = min(max(math.ceil((cv + extents[2] - max_offset - slack) / spacing) - 1, 0.0), float(count))
+    end = min(max(math.floor((cv + extents[3] + max_offset + slack) / spacing), 0.0), float(count))
     return before + int(first), before + int(end)
 
 
 @njit(cache=True, error_model="numpy")
-def count_touched(strays: Any, presses: Any, reach: Any, ends: Any) -> Any:
-    """(Q + 1,) running number of fibres that presses (Q, 2) can touch on one pad with strays (2,)."""
+def count_touched(max_offsets: Any, presses: Any, extents: Any, ends: Any) -> Any:
+    """Count the fibres that presses can touch on one pad.
+
+    Args:
+        max_offsets: from the function of that name, for the pad; shape (2,).
+        presses: x and y; shape (Q, 2).
+        extents: extents in the frame of each family; shape (2, 5).
+        ends: `Ends`.
+
+    Returns:
+        Cumulative counts, starting with 0; shape (Q + 1,).
+    """
     starts = np.zeros(len(presses) + 1, np.int64)
     for q in range(len(presses)):
         starts[q + 1] = starts[q]
         for family in range(2):
-            first, end = touched_range(presses[q, 1 - family], reach[family], strays[family], ends, family)
+            first, end = find_touched_range(presses[q, 1 - family], extents[family], max_offsets[family], ends, family)
             starts[q + 1] += max(end - first, 0)
     return starts
 
 
-_BOXED = 8
-"""Segments that are put into one box, which is looked at before they are."""
+_BOX_SEGMENTS = 8
+"""Segments per bounding box, which is tested before they are."""
 
 
 @njit(cache=True, error_model="numpy")
-def _clip(value: float, slope: float, least: float, most: float, low: float, high: float) -> tuple[float, float]:
-    """What of low..high has value + t slope within least..most, ends that run past each other where nothing has."""
+def _clip_to_slab(
+    value: float, slope: float, least: float, most: float, low: float, high: float
+) -> tuple[float, float]:
+    """Clip low..high to where value + t slope is within least..most; low > high where nowhere."""
     if slope == 0:
         return (low, high) if least <= value <= most else (1.0, 0.0)
     first, last = (least - value) / slope, (most - value) / slope
@@ -173,8 +222,8 @@ def _clip(value: float, slope: float, least: float, most: float, low: float, hig
 
 
 @njit(cache=True, error_model="numpy")
-def _in_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[float, float]:
-    """What of 0..1 has (x, y) + t (dx, dy) within `radius` of 0, ends that run past each other where nothing has."""
+def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[float, float]:
+    """Clip 0..1 to where (x, y) + t (dx, dy) is within `radius` of 0; low > high where nowhere."""
     square, middle = dx * dx + dy * dy, x * dx + y * dy
     root = middle * middle - square * (x * x + y * y - radius * radius)
     if root < 0:
@@ -184,36 +233,38 @@ def _in_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[f
 
 
 @njit(cache=True, error_model="numpy")
-def _near_part(x: float, y: float, dx: float, dy: float, ex: float, ey: float, width: float) -> tuple[float, float]:
-    """What of 0..1 has (x, y) + t (dx, dy) within `width` of the segment from 0 to (ex, ey).
+def _clip_to_capsule(
+    x: float, y: float, dx: float, dy: float, ex: float, ey: float, width: float
+) -> tuple[float, float]:
+    """Clip 0..1 to where (x, y) + t (dx, dy) is within `width` of the segment from 0 to (ex, ey).
 
-    What is near a segment is a rectangle with a disc at either end. It is convex: a line is in it from the first place
-    at which it is in one of the three to the last.
+    The set near a segment is a rectangle with a disc at either end. It is convex, so a line is inside from the first to
+    the last position at which it is in one of the three.
     """
     low, high = 1.0, 0.0
-    reach = math.hypot(ex, ey)
-    if reach > 0:
-        ux, uy = ex / reach, ey / reach
-        low, high = _clip(x * ux + y * uy, dx * ux + dy * uy, 0.0, reach, 0.0, 1.0)
-        low, high = _clip(y * ux - x * uy, dy * ux - dx * uy, -width, width, low, high)
+    length = math.hypot(ex, ey)
+    if length > 0:
+        ux, uy = ex / length, ey / length
+        low, high = _clip_to_slab(x * ux + y * uy, dx * ux + dy * uy, 0.0, length, 0.0, 1.0)
+        low, high = _clip_to_slab(y * ux - x * uy, dy * ux - dx * uy, -width, width, low, high)
     for at in (0.0, 1.0):
-        begin, end = _in_disc(x - at * ex, y - at * ey, dx, dy, width)
+        begin, end = _clip_to_disc(x - at * ex, y - at * ey, dx, dy, width)
         if begin < end:
             low, high = (min(low, begin), max(high, end)) if low < high else (begin, end)
     return low, high
 
 
 @njit(cache=True, error_model="numpy")
-def _boxes(points: Any, first: Any, margin: float) -> tuple[Any, Any, Any]:
-    """Boxes around every few segments of lines, and a margin: sides (n, 4), segments (n, 2) from and to, lines (n,)."""
+def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, Any]:
+    """Bound every few segments of polylines: boxes (n, 4), first and last segment (n, 2), polyline (n,)."""
     count = 0
     for line in range(len(first) - 1):
-        count += (first[line + 1] - first[line] + _BOXED - 2) // _BOXED
+        count += (first[line + 1] - first[line] + _BOX_SEGMENTS - 2) // _BOX_SEGMENTS
     sides, segments, lines = np.empty((count, 4)), np.empty((count, 2), np.int64), np.empty(count, np.int64)
     box = 0
     for line in range(len(first) - 1):
-        for start in range(first[line], first[line + 1] - 1, _BOXED):
-            end = min(start + _BOXED, first[line + 1] - 1)
+        for start in range(first[line], first[line + 1] - 1, _BOX_SEGMENTS):
+            end = min(start + _BOX_SEGMENTS, first[line + 1] - 1)
             sides[box, :2], sides[box, 2:] = np.inf, -np.inf
             for k in range(start, end + 1):
                 for axis in range(2):
@@ -225,8 +276,8 @@ def _boxes(points: Any, first: Any, margin: float) -> tuple[Any, Any, Any]:
 
 
 @njit(cache=True, error_model="numpy")
-def _arcs(points: Any, first: Any) -> Any:
-    """(n,) length of the line of each vertex up to it."""
+def _cumulate_lengths(points: Any, first: Any) -> Any:
+    """Return the arc length (n,) of each vertex along its polyline."""
     arcs = np.zeros(len(points))
     for line in range(len(first) - 1):
         for k in range(first[line] + 1, first[line + 1]):
@@ -235,20 +286,23 @@ def _arcs(points: Any, first: Any) -> Any:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def near_intervals(points: Any, first: Any, others: Any, other_first: Any, width: float) -> Any:
-    """(k, 4) line, other line, and the arcs of the line from and to which a segment of it is near one of the other.
+def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, width: float) -> Any:
+    """Find the intervals of polylines that are near segments of other polylines.
 
     Args:
-        points: (n, 2) vertices of all lines, one after the other.
-        first: (L + 1,) where each line's begin, and n.
-        others: (m, 2) as `points`, of the lines they are compared with.
-        other_first: (M + 1,) as `first`.
+        points: vertices of all polylines, one after the other; shape (n, 2).
+        first: index of each polyline's first vertex, and n; shape (L + 1,).
+        others: vertices of the polylines to compare with; shape (m, 2).
+        other_first: as `first`, for these; shape (M + 1,).
         width: distance below which they are near.
+
+    Returns:
+        Polyline, other polyline, and arc length of start and end of the interval; shape (k, 4).
     """
-    sides, segments, lines = _boxes(points, first, width)
-    other_sides, other_segments, other_lines = _boxes(others, other_first, 0.0)
-    arcs = _arcs(points, first)
-    found, count = np.empty((64, 4)), 0
+    sides, segments, lines = _bound_segments(points, first, width)
+    other_sides, other_segments, other_lines = _bound_segments(others, other_first, 0.0)
+    arcs = _cumulate_lengths(points, first)
+    intervals, count = np.empty((64, 4)), 0
     for box in range(len(sides)):
         left, low, right, high = sides[box]
         for beside in range(len(other_sides)):
@@ -268,26 +322,26 @@ def near_intervals(points: Any, first: Any, others: Any, other_first: Any, width
                         continue
                     if min(oy, oy + ey) > max(0.0, dy) + width or max(oy, oy + ey) < min(0.0, dy) - width:
                         continue
-                    since, until = _near_part(-ox, -oy, dx, dy, ex, ey, width)
+                    since, until = _clip_to_capsule(-ox, -oy, dx, dy, ex, ey, width)
                     if since >= until:
                         continue
-                    if count == len(found):
-                        found = np.concatenate((found, np.empty_like(found)))
-                    found[count, 0], found[count, 1] = lines[box], other_lines[beside]
-                    found[count, 2], found[count, 3] = arcs[i] + since * length, arcs[i] + until * length
+                    if count == len(intervals):
+                        intervals = np.concatenate((intervals, np.empty_like(intervals)))
+                    intervals[count, 0], intervals[count, 1] = lines[box], other_lines[beside]
+                    intervals[count, 2], intervals[count, 3] = arcs[i] + since * length, arcs[i] + until * length
                     count += 1
-    return found[:count]
+    return intervals[:count]
 
 
 DEPTH = 60
 MAX_DEGREE = 6
 SCRATCH = (DEPTH + 2, MAX_DEGREE + 3)
-"""Shape of the work array of `roots_in_unit`."""
+"""Shape of the work array of `find_unit_roots`."""
 
 
 @njit(cache=True, error_model="numpy")
-def sort(values: Any, count: Any) -> None:
-    """Sort values[:count] in place, by Shell's method: numpy's sort takes a second to compile."""
+def shell_sort(values: Any, count: Any) -> None:
+    """Sort values[:count] in place (Shell 1959): NumPy's sort takes a second to compile."""
     gap = count
     while gap > 1:
         gap = max(gap * 5 // 11, 1)
@@ -300,8 +354,8 @@ def sort(values: Any, count: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _bracketed(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
-    """The one sign change of p in (low, high): Newton's method, bisected where it would leave the bracket."""
+def _refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
+    """Find the one sign change of p in (low, high) by Newton's method, safeguarded by bisection."""
     u = 0.5 * (low + high)
     for _ in range(100):
         value, slope = p[degree], 0.0
@@ -324,15 +378,23 @@ def _bracketed(p: Any, degree: int, low: float, high: float, rising: bool) -> fl
 
 
 @njit(cache=True, error_model="numpy")
-def roots_in_unit(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
-    """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
+def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
+    """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:] by Bernstein subdivision.
 
-    Bernstein coefficients with no change of sign exclude a root, with one change hold exactly one; else the interval
-    is halved. Where all coefficients are within `tolerance` of 0 the polynomial only touches zero: no sign change.
+    Coefficients in Bernstein form without a change of sign exclude a root, with one change they isolate one (Descartes'
+    rule); else the interval is halved by de Casteljau's algorithm. A polynomial whose coefficients are all within
+    `tolerance` of 0 only touches zero: no sign change.
 
     Args:
-        p: (degree + 1,) power coefficients, degree <= MAX_DEGREE; no literal, for each of which it would be compiled.
-        work: (SCRATCH) floats, overwritten: a stack of [coefficients ..., low, high].
+        p: power coefficients; shape (degree + 1,).
+        degree: at most MAX_DEGREE; an int64, no literal, for each of which the kernel would be compiled.
+        tolerance: coefficient that counts as 0.
+        out: roots.
+        count: number of roots in `out`.
+        work: stack of [coefficients ..., low, high]; shape SCRATCH, overwritten.
+
+    Returns:
+        New number of roots.
     """
     lo, hi = MAX_DEGREE + 1, MAX_DEGREE + 2
     for j in range(degree + 1):  # power to Bernstein form: b_j = sum_i C(j, i) / C(n, i) p_i
@@ -354,7 +416,7 @@ def roots_in_unit(p: Any, degree: Any, tolerance: float, out: Any, count: Any, w
         if changes == 0 or largest <= tolerance:
             top -= 1
         elif changes == 1:
-            out[count] = _bracketed(p, degree, b[lo], b[hi], b[0] < 0)
+            out[count] = _refine_root(p, degree, b[lo], b[hi], b[0] < 0)
             count += 1
             top -= 1
         elif top >= DEPTH:
@@ -375,57 +437,68 @@ def roots_in_unit(p: Any, degree: Any, tolerance: float, out: Any, count: Any, w
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sum_overlaps(
-    place: Any, slope: Any, arc: Any, fibres: Any, beside: Any, middles: Any, half: float, width: float, gradient: Any
+    samples: Any,
+    slope: Any,
+    arc: Any,
+    fibres: Any,
+    neighbours: Any,
+    middles: Any,
+    half: float,
+    width: float,
+    gradient: Any,
 ) -> float:
-    """Return by how much places `half` before and behind middles are nearer than `width`, summed, as shares of it.
+    """Sum how much nearer than `width` points of fibres are to the tangent of a fibre of the other family.
 
     Args:
-        place: (F, P, 2) samples of fibres along their travel and cross axes.
-        slope: (F, P) slopes there.
-        arc: (F, P) lengths of the fibres up to there.
-        fibres: (K,) index of the fibre that each middle is on.
-        beside: (K,) index of the fibre, of the other family, that it lies by.
-        middles: (K,) arcs of the middles.
-        half: arc from a middle to either place.
-        width: distance from which a place costs nothing.
-        gradient: (F, P, 2) that of the sum by `place` is added to it, for places that keep their arcs.
+        samples: samples of the fibres, along and across their axis; shape (F, P, 2).
+        slope: slopes at the samples; shape (F, P).
+        arc: arc lengths at the samples; shape (F, P).
+        fibres: fibre of each middle; shape (K,).
+        neighbours: fibre of the other family that each middle is near; shape (K,).
+        middles: arc length of each middle; shape (K,).
+        half: arc length from a middle to the two points before and after it.
+        width: distance at which a point has no overlap.
+        gradient: derivative of the sum by `samples` is added to it, for points at fixed arc lengths; shape (F, P, 2).
+
+    Returns:
+        Sum of overlaps, relative to `width`.
     """
-    total, samples = 0.0, place.shape[1]
+    total, n_samples = 0.0, samples.shape[1]
     for k in range(len(fibres)):
-        f, g = fibres[k], beside[k]
+        f, g = fibres[k], neighbours[k]
         for side in (-half, half):
-            # 1. the place, between two samples of its fibre, in the axes of the other fibre
-            after = min(max(np.searchsorted(arc[f], middles[k] + side), 1), samples - 1)
+            # 1. position of the point, between two samples of its fibre, in the axes of the other fibre
+            after = min(max(np.searchsorted(arc[f], middles[k] + side), 1), n_samples - 1)
             share = (middles[k] + side - arc[f, after - 1]) / (arc[f, after] - arc[f, after - 1])
-            dx, dy = place[f, after, 1] - place[f, after - 1, 1], place[f, after, 0] - place[f, after - 1, 0]
-            x, y = place[f, after - 1, 1] + share * dx, place[f, after - 1, 0] + share * dy
-            # 2. its distance to the tangent in the sample that is next to it
+            dx, dy = samples[f, after, 1] - samples[f, after - 1, 1], samples[f, after, 0] - samples[f, after - 1, 0]
+            x, y = samples[f, after - 1, 1] + share * dx, samples[f, after - 1, 0] + share * dy
+            # 2. its distance to the tangent at the nearest sample of the other fibre
             nearest, least = 0, np.inf
-            for i in range(samples):
-                square = (place[g, i, 0] - x) ** 2 + (place[g, i, 1] - y) ** 2
+            for i in range(n_samples):
+                square = (samples[g, i, 0] - x) ** 2 + (samples[g, i, 1] - y) ** 2
                 if square < least:
                     nearest, least = i, square
-            run = math.hypot(1.0, slope[g, nearest])
-            nx, ny = -slope[g, nearest] / run, 1.0 / run
-            away = (x - place[g, nearest, 0]) * nx + (y - place[g, nearest, 1]) * ny
-            close = 1.0 - abs(away) / width
-            if close <= 0:
+            norm_slope = math.hypot(1.0, slope[g, nearest])
+            nx, ny = -slope[g, nearest] / norm_slope, 1.0 / norm_slope
+            distance = (x - samples[g, nearest, 0]) * nx + (y - samples[g, nearest, 1]) * ny
+            overlap = 1.0 - abs(distance) / width
+            if overlap <= 0:
                 continue
-            total += close
-            push = -math.copysign(1.0, away) / width
-            # the fibre beside it turns there with the sample on the other side of its foot
-            beyond = (x - place[g, nearest, 0]) * ny - (y - place[g, nearest, 1]) * nx
-            behind = min(max(nearest + (1 if beyond > 0 else -1), 0), samples - 1)
+            total += overlap
+            push = -math.copysign(1.0, distance) / width
+            # the tangent turns with the sample on the other side of the foot point
+            beyond = (x - samples[g, nearest, 0]) * ny - (y - samples[g, nearest, 1]) * nx
+            behind = min(max(nearest + (1 if beyond > 0 else -1), 0), n_samples - 1)
             step = abs(arc[g, behind] - arc[g, nearest])
             foot = min(abs(beyond) / step, 1.0) if step > 0 else 0.0
-            for i, part in ((nearest, 1.0 - foot), (behind, foot)):
-                gradient[g, i, 0] -= part * push * nx
-                gradient[g, i, 1] -= part * push * ny
-            # 3. a place keeps its arc: what moves it along its own fibre does not count
-            length = math.hypot(dx, dy)
-            along = (nx * dx + ny * dy) / length
-            px, py = push * (nx - along * dx / length), push * (ny - along * dy / length)
-            for i, part in ((after - 1, 1.0 - share), (after, share)):
-                gradient[f, i, 1] += part * px
-                gradient[f, i, 0] += part * py
+            for i, weight in ((nearest, 1.0 - foot), (behind, foot)):
+                gradient[g, i, 0] -= weight * push * nx
+                gradient[g, i, 1] -= weight * push * ny
+            # 3. gradient for the point's own fibre, projected: points keep their arc length
+            norm = math.hypot(dx, dy)
+            along = (nx * dx + ny * dy) / norm
+            px, py = push * (nx - along * dx / norm), push * (ny - along * dy / norm)
+            for i, weight in ((after - 1, 1.0 - share), (after, share)):
+                gradient[f, i, 1] += weight * px
+                gradient[f, i, 0] += weight * py
     return total

@@ -1,9 +1,9 @@
-"""How much a rigid indenter lengthens the fibres: integrals along PCHIP spans of the surface it deflects.
+"""Elongation of fibres by a rigid indenter: integrals along PCHIP spans on the deflected surface.
 
 A span is the cubic of `exact_signals`, t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 from the press centre. The slope of
-the surface has a root or a pole in r - a at the edge of the contact; spans are cut there, and the pieces outside run in
-u with s - s_edge ~ u^2, in which both are smooth. Spans are monotone, so their ends box them: pieces are halved until
-none is long for its distance, and then by the error that Gauss-Kronrod estimates.
+the surface has a root or a pole in r - a at the edge of the contact. Spans are cut there, and the pieces outside are
+integrated in u with s - s_edge ~ u^2, in which both are smooth. Spans are monotone, so their ends bound them: pieces
+are halved until none is long for its distance, and then by the Gauss-Kronrod error estimate.
 """
 
 import math
@@ -14,65 +14,70 @@ from numba import njit
 
 from padforge.design.kernels.exact_signals import (
     GAUSS,
-    HALVINGS,
     KRONROD,
+    MAX_HALVINGS,
     NODES,
-    across,
-    circle_roots,
-    local_cubic,
+    centre_cubic,
+    evaluate_cubic,
+    find_circle_roots,
     make_scratch,
 )
 
 SPHERE, CONE, FLAT = 0, 1, 2
 PRECISION = 1e-6
-"""Estimated relative error at which a piece is taken."""
+"""Estimated relative error at which a piece is is_accepted."""
 MAX_PIECE_LENGTH = 4.0
-"""Length of a piece, of its distance from the centre plus the contact radius, above which it is halved unseen."""
+"""Length of a piece above which it is halved at once, relative to its distance plus the contact radius."""
 NOTCH_WIDTH = 2e-5
-"""Width of the notch in the density, of the contact radius, that may be stepped over."""
+"""Width of the notch in the density that may be skipped, relative to the contact radius."""
 
 
 @njit(cache=True, error_model="numpy")
-def _descent(square: float, a: float, steepness: float, shape: int) -> float:
-    """-dw/dr / r of the deflected surface at squared distance `square`; steepness as in `lengthenings`."""
+def _surface_slope(square: float, a: float, steepness: float, shape: int) -> float:
+    """Return -dw/dr / r of the deflected surface at a squared distance; `steepness` as in `integrate_elongations`."""
     r = math.sqrt(square)
     if r <= a:
         if shape == CONE:
             return steepness / r if r > 0 else 0.0
         return steepness / a if shape == SPHERE else 0.0
     x = a / r
-    rest = math.sqrt((r - a) * (r + a)) / r
+    cosine = math.sqrt((r - a) * (r + a)) / r
     if shape == CONE:
-        return steepness * x * x / (1 + rest) / r
+        return steepness * x * x / (1 + cosine) / r
     if shape == FLAT:
-        return steepness * x * x / rest / r
+        return steepness * x * x / cosine / r
     # asin(x) / x - sqrt(1 - x^2), by its series where the difference would lose digits
-    fall = math.asin(x) / x - rest if x > 0.02 else x * x * (2 / 3 + x * x * (0.2 + 0.107 * x * x))
-    return 2 / math.pi * steepness * fall / r
+    slope_part = math.asin(x) / x - cosine if x > 0.02 else x * x * (2 / 3 + x * x * (0.2 + 0.107 * x * x))
+    return 2 / math.pi * steepness * slope_part / r
 
 
 @njit(cache=True, error_model="numpy")
 def _density(span: Any, s: float, a: float, steepness: float, shape: int) -> float:
-    """Lengthening per unit of s: sqrt(1 + (dw / dl)^2) - 1 times dl / ds, l the fibre's own arc length."""
-    t, v = span[0] + span[1] * s, across(span, s)
+    """Return elongation per unit of s: sqrt(1 + (dw / dl)^2) - 1 times dl / ds; l is arc length."""
+    t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
     rise = span[3] + s * (2 * span[4] + 3 * s * span[5])
-    own = span[1] ** 2 + rise**2
-    fall = (_descent(t * t + v * v, a, steepness, shape) * (t * span[1] + v * rise)) ** 2
-    return fall / (math.sqrt(own + fall) + math.sqrt(own)) if own > 0 else 0.0
+    speed_square = span[1] ** 2 + rise**2
+    slope_part = (_surface_slope(t * t + v * v, a, steepness, shape) * (t * span[1] + v * rise)) ** 2
+    return slope_part / (math.sqrt(speed_square + slope_part) + math.sqrt(speed_square)) if speed_square > 0 else 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def _is_long(span: Any, s0: float, s1: float, from_edge: bool, a: float, shape: int) -> bool:
-    """Whether a piece is long for where it lies, by the box of its ends.
+    """Whether a piece is long for its distance, by the box of its ends.
 
-    A fibre that passes the tip of a cone, or the edge of a flat punch, at a small distance does not rise or fall for
-    as short a length: a notch in the density that quadrature would step over.
+    If a fibre passes the tip of a cone or the edge of a flat punch at a small distance, it does not rise or fall over
+    just as short a length: a notch in the density that quadrature would miss.
 
     Args:
+        span: r, h, e0..e3; shape (6,).
+        s0: start of the piece.
+        s1: end of the piece.
         from_edge: whether the piece starts at the edge of the contact.
+        a: contact radius.
+        shape: SPHERE, CONE or FLAT.
     """
     t0, t1 = span[0] + span[1] * s0, span[0] + span[1] * s1
-    v0, v1 = across(span, s0), across(span, s1)
+    v0, v1 = evaluate_cubic(span, s0), evaluate_cubic(span, s1)
     dt, dv = max(min(t0, t1), -max(t0, t1), 0.0), max(min(v0, v1), -max(v0, v1), 0.0)
     gap = math.sqrt(dt * dt + dv * dv)
     if shape == CONE and gap < a:
@@ -85,14 +90,29 @@ def _is_long(span: Any, s0: float, s1: float, from_edge: bool, a: float, shape: 
 
 
 @njit(cache=True, error_model="numpy")
-def _integral(
-    span: Any, start: float, end: float, bent: bool, a: float, steepness: float, floor: float, shape: int, stack: Any
+def _integrate_piece(
+    span: Any,
+    start: float,
+    end: float,
+    is_quadratic: bool,
+    a: float,
+    steepness: float,
+    max_error: float,
+    shape: int,
+    stack: Any,
 ) -> float:
-    """Lengthening between s = start and s = end, in either order.
+    """Integrate the elongation between s = start and s = end, in either order, by adaptive Gauss-Kronrod.
 
     Args:
-        bent: whether s - start ~ u^2, for a start at the edge of the contact; else s - start ~ u.
-        floor: an error that does not matter.
+        span: r, h, e0..e3; shape (6,).
+        start: first end.
+        end: second end.
+        is_quadratic: whether s - start ~ u^2, for a start at the edge of the contact; else s - start ~ u.
+        a: contact radius.
+        steepness: as in `integrate_elongations`.
+        max_error: absolute error that is negligible.
+        shape: SPHERE, CONE or FLAT.
+        stack: intervals to do, overwritten.
     """
     width = end - start
     total = 0.0
@@ -103,27 +123,27 @@ def _integral(
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         s0, s1 = (
             (start + width * low * low, start + width * high * high)
-            if bent
+            if is_quadratic
             else (start + width * low, start + width * high)
         )
-        taken = top >= HALVINGS or not _is_long(span, s0, s1, bent and low == 0, a, shape)
-        if taken:
+        is_accepted = top >= MAX_HALVINGS or not _is_long(span, s0, s1, is_quadratic and low == 0, a, shape)
+        if is_accepted:
             fine, coarse = 0.0, 0.0
             for i in range(15):
                 k = i if i < 8 else 14 - i
                 u = middle + half * (NODES[k] if i >= 8 else -NODES[k])
-                value = _density(span, start + width * (u * u if bent else u), a, steepness, shape)
-                value *= 2 * u if bent else 1.0
+                value = _density(span, start + width * (u * u if is_quadratic else u), a, steepness, shape)
+                value *= 2 * u if is_quadratic else 1.0
                 fine += KRONROD[k] * value
                 if k % 2 == 1:
                     coarse += GAUSS[k // 2] * value
             error = (200 * abs(fine - coarse) / fine) ** 1.5 if fine > 0 else 0.0
             fine *= half * abs(width)
-            taken = top >= HALVINGS or error <= PRECISION or min(error, 1.0) * fine <= floor
-            if taken:
+            is_accepted = top >= MAX_HALVINGS or error <= PRECISION or min(error, 1.0) * fine <= max_error
+            if is_accepted:
                 total += fine
                 top -= 1
-        if not taken:
+        if not is_accepted:
             stack[top, 1] = middle
             top += 1
             stack[top, 0], stack[top, 1] = middle, high
@@ -131,62 +151,70 @@ def _integral(
 
 
 @njit(cache=True, error_model="numpy")
-def _span_lengthening(
-    span: Any, low: float, high: float, a: float, steepness: float, floor: float, shape: int, scratch: Any
+def _integrate_span(
+    span: Any, low: float, high: float, a: float, steepness: float, max_error: float, shape: int, scratch: Any
 ) -> float:
-    """Lengthening of a span from s = low to s = high."""
+    """Integrate the elongation of a span from s = low to s = high."""
     roots, work, p, stack, _ = scratch
     t0, t1 = span[0] + span[1] * low, span[0] + span[1] * high
-    v0, v1 = across(span, low), across(span, high)
+    v0, v1 = evaluate_cubic(span, low), evaluate_cubic(span, high)
     near_t, near_v = max(t0, -t1, 0.0), max(min(v0, v1), -max(v0, v1), 0.0)
     far_t, far_v = max(abs(t0), abs(t1)), max(abs(v0), abs(v1))
     count = 0
     if near_t**2 + near_v**2 < a * a < far_t**2 + far_v**2:
-        count = circle_roots(span, low, high, a, roots, np.int64(0), work, p)
+        count = find_circle_roots(span, low, high, a, roots, np.int64(0), work, p)
     total, begin = 0.0, low
     for i in range(count + 1):
         end = high if i == count else roots[i]
         middle = 0.5 * (begin + end)
-        t, v = span[0] + span[1] * middle, across(span, middle)
+        t, v = span[0] + span[1] * middle, evaluate_cubic(span, middle)
         if t * t + v * v <= a * a:
             if shape != FLAT:
-                total += _integral(span, begin, end, False, a, steepness, floor, shape, stack)
+                total += _integrate_piece(span, begin, end, False, a, steepness, max_error, shape, stack)
         elif 0 < i < count:
-            total += _integral(span, begin, middle, True, a, steepness, floor, shape, stack)
-            total += _integral(span, end, middle, True, a, steepness, floor, shape, stack)
+            total += _integrate_piece(span, begin, middle, True, a, steepness, max_error, shape, stack)
+            total += _integrate_piece(span, end, middle, True, a, steepness, max_error, shape, stack)
         elif i < count:
-            total += _integral(span, end, begin, True, a, steepness, floor, shape, stack)
+            total += _integrate_piece(span, end, begin, True, a, steepness, max_error, shape, stack)
         else:
-            total += _integral(span, begin, end, i > 0, a, steepness, floor, shape, stack)
+            total += _integrate_piece(span, begin, end, i > 0, a, steepness, max_error, shape, stack)
         begin = end
     return total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def lengthenings(
-    travel: Any,
-    cross: Any,
+def integrate_elongations(
+    along: Any,
+    across: Any,
     slope: Any,
     horizontals: int,
     presses: Any,
     contact_radius: Any,
     steepness: Any,
-    floor: Any,
+    max_error: Any,
     shape: int,
     begin: int,
     end: int,
     out: Any,
 ) -> None:
-    """Lengthening of every fibre of one pad for presses begin..end, into out (Q, F), zeros before.
+    """Compute the elongation of every fibre of one pad for presses begin..end.
 
     Args:
-        travel, cross, slope: (F, n) knots and slopes. horizontals: how many of them. presses: (Q, 2) x and y.
-        contact_radius: (Q,) a; 0 for no press.
-        steepness: (Q,) what scales dw/dr: of a sphere the slope at the edge a / R, of a cone that of its flank, of a
-            flat punch 2 d / (pi a).
-        floor: (Q,) an error in a piece's lengthening that does not matter.
+        along: knots along the axis; shape (F, n).
+        across: knots across it; shape (F, n).
+        slope: slopes at the knots; shape (F, n).
+        horizontals: number of fibres, the first ones, that run along x.
+        presses: x and y; shape (Q, 2).
+        contact_radius: a, 0 for no press; shape (Q,).
+        steepness: scale of dw/dr: slope at the edge a / R of a sphere, slope of the flank of a cone, 2 d / (pi a) of a
+            flat punch; shape (Q,).
+        max_error: negligible error of a piece; shape (Q,).
+        shape: SPHERE, CONE or FLAT.
+        begin: first press.
+        end: press to stop before.
+        out: elongations, zeros before; shape (Q, F).
     """
-    fibres, knots = travel.shape
+    fibres, knots = along.shape
     span, scratch = np.empty(6), make_scratch(0)
     for q in range(begin, end):
         a = contact_radius[q]
@@ -195,7 +223,7 @@ def lengthenings(
         for f in range(fibres):
             family = 0 if f < horizontals else 1
             ct, cv = presses[q, family], presses[q, 1 - family]
-            t, v, d = travel[f], cross[f], slope[f]
+            t, v, d = along[f], across[f], slope[f]
             for j in range(knots - 1):
-                s0 = local_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
-                out[q, f] += _span_lengthening(span, -s0, 1 - s0, a, steepness[q], floor[q], shape, scratch)
+                s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
+                out[q, f] += _integrate_span(span, -s0, 1 - s0, a, steepness[q], max_error[q], shape, scratch)

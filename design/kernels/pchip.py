@@ -1,4 +1,4 @@
-"""PCHIP curves: slopes and samples. Arrays in grid units."""
+"""PCHIP curves: slopes and samples, in grid units."""
 
 import math
 from typing import Any
@@ -9,7 +9,13 @@ from numba import njit
 
 @njit(cache=True, error_model="numpy")
 def piece_of(at: float, edges: Any, pieces: int) -> int:
-    """Which of so many pieces, that begin at ascending edges (pieces or more,), holds at `at`; the first if none."""
+    """Return the index of the piece that contains `at` by bisection; the first one if none does.
+
+    Args:
+        at: coordinate.
+        edges: ascending starts of the pieces; `pieces` or more.
+        pieces: number of pieces.
+    """
     low, high = 0, pieces
     while high - low > 1:
         middle = (low + high) // 2
@@ -22,7 +28,7 @@ def piece_of(at: float, edges: Any, pieces: int) -> int:
 
 @njit(cache=True, error_model="numpy")
 def extremes(values: Any) -> tuple[float, float]:
-    """The least and the largest of (n,) values."""
+    """Return the smallest and the largest of (n,) values."""
     least = largest = values[0]
     for value in values:
         least, largest = min(least, value), max(largest, value)
@@ -31,7 +37,7 @@ def extremes(values: Any) -> tuple[float, float]:
 
 @njit(cache=True, error_model="numpy")
 def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
-    """Slope at an end knot from the two spans next to it: three-point rule, kept shape-preserving."""
+    """Return the slope at an end knot: three-point rule, limited to preserve the shape."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
     if d * m0 <= 0:
         return 0.0
@@ -42,7 +48,13 @@ def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def pchip_slopes(t: Any, v: Any, d: Any) -> None:
-    """Fritsch-Butland slopes of the PCHIP through (t, v), both (n,) with t ascending, into d (n,)."""
+    """Compute the slopes of the PCHIP interpolant (Fritsch and Butland 1984).
+
+    Args:
+        t: ascending coordinates; shape (n,).
+        v: values; shape (n,).
+        d: slopes; shape (n,), overwritten.
+    """
     n = len(t)
     if n == 2:
         d[0] = d[1] = (v[1] - v[0]) / (t[1] - t[0])
@@ -63,7 +75,14 @@ def pchip_slopes(t: Any, v: Any, d: Any) -> None:
 
 @njit(cache=True, error_model="numpy")
 def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
-    """Values of the PCHIP through (t, v) at 0, step, 2 step, ... into out; the last sample is the last knot."""
+    """Sample the PCHIP interpolant of (t, v) at 0, step, 2 step, ...; the last sample is the last knot.
+
+    Args:
+        t: ascending coordinates; shape (n,).
+        v: values; shape (n,).
+        step: distance of samples.
+        out: samples; shape (samples,), overwritten.
+    """
     d = np.empty(len(t))
     pchip_slopes(t, v, d)
     i = 0
@@ -81,22 +100,39 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sample_curves(knots: Any, horizontals: int, samples: int) -> Any:
-    """Cross coordinates (P, F, samples) of the fibres `knots` (P, F, N+2, 2), uniform along the travel axis."""
+    """Sample fibres uniformly along their axis.
+
+    Args:
+        knots: shape (P, F, N + 2, 2).
+        horizontals: number of fibres, the first ones, that run along x.
+        samples: samples per fibre.
+
+    Returns:
+        Coordinates across the axis; shape (P, F, samples).
+    """
     population, fibres = knots.shape[:2]
     out = np.empty((population, fibres, samples))
     for index in range(population * fibres):
         p, f = index // fibres, index % fibres
-        travel = 0 if f < horizontals else 1
-        t = knots[p, f, :, travel].copy()
-        pchip_sample(t, knots[p, f, :, 1 - travel].copy(), t[-1] / (samples - 1), out[p, f])
+        along = 0 if f < horizontals else 1
+        t = knots[p, f, :, along].copy()
+        pchip_sample(t, knots[p, f, :, 1 - along].copy(), t[-1] / (samples - 1), out[p, f])
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def population_slopes(travel: Any, cross: Any) -> Any:
-    """Slopes (P, F, n) of the PCHIP curves through knots `travel`, `cross`, both (P, F, n)."""
-    out = np.empty_like(cross)
-    for p in range(len(travel)):
-        for f in range(travel.shape[1]):
-            pchip_slopes(travel[p, f], cross[p, f], out[p, f])
+def population_slopes(along: Any, across: Any) -> Any:
+    """Compute the slopes of the PCHIP curves of a population.
+
+    Args:
+        along: knots along the axis; shape (P, F, n).
+        across: knots across it; shape (P, F, n).
+
+    Returns:
+        Slopes; shape (P, F, n).
+    """
+    out = np.empty_like(across)
+    for p in range(len(along)):
+        for f in range(along.shape[1]):
+            pchip_slopes(along[p, f], across[p, f], out[p, f])
     return out

@@ -124,13 +124,13 @@ def check_bends(pad: Morphology, limit: float, bent_radius_mm: float | None = No
     spans, slopes = beziers(pad), slope_beziers(pad)
     turned = np.abs(np.diff(extreme_headings(slopes), prepend=0, append=0)).sum(axis=1)  # leads have heading 0
     max_rolled = 0.0 if bent_radius_mm is None else window / bent_radius_mm
-    found = []
+    violations = []
     for fibre in map(int, np.flatnonzero(turned + max_rolled > angle)):
         path = spans[fibre].tobytes(), slopes[fibre].tobytes()
         radius, place = _min_bend(*path, pad.layout.family(fibre), pad.unit_mm, window, limit, bent_radius_mm)
         if radius < limit:
-            found.append(Violation("min_bend_radius_mm", (fibre + 1,), radius, limit, _to_pair(pad.to_mm(place))))
-    return found
+            violations.append(Violation("min_bend_radius_mm", (fibre + 1,), radius, limit, _to_pair(pad.to_mm(place))))
+    return violations
 
 
 @lru_cache(maxsize=CACHE_SIZE)
@@ -155,7 +155,7 @@ def _min_bend(
 def _check_gaps(lines: list[Array], layout: Layout, limit: float) -> list[Violation]:
     shapes = np.array([shapely.LineString(line) for line in lines])
     shapely.prepare(shapes)  # a tenth of the time where fibres are tangled
-    found = []
+    violations = []
     for rows in layout.families:
         family = shapes[rows]
         near = shapely.STRtree(family).query(family, predicate="dwithin", distance=limit).T
@@ -164,8 +164,8 @@ def _check_gaps(lines: list[Array], layout: Layout, limit: float) -> list[Violat
             if between.length < limit:
                 fibres = rows.start + first + 1, rows.start + second + 1
                 middle = _to_pair(np.mean(between.coords, axis=0))
-                found.append(Violation("min_gap_mm", fibres, float(between.length), limit, middle))
-    return found
+                violations.append(Violation("min_gap_mm", fibres, float(between.length), limit, middle))
+    return violations
 
 
 def _check_folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
@@ -173,12 +173,12 @@ def _check_folds(pad: Morphology, lines: list[Array], limit: float) -> list[Viol
         return []
     if FOLD_TOLERANCE * limit > TOLERANCE_MM:
         lines = [pad.to_mm(points) for points in flatten(pad, FOLD_TOLERANCE * limit / pad.unit_mm)]
-    found = []
+    violations = []
     for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
         fold = _min_fold(lines[fibre].tobytes(), limit)
         if fold is not None:
-            found.append(Violation("min_gap_mm", (int(fibre) + 1,), fold[0], limit, _to_pair(fold[1])))
-    return found
+            violations.append(Violation("min_gap_mm", (int(fibre) + 1,), fold[0], limit, _to_pair(fold[1])))
+    return violations
 
 
 @lru_cache(maxsize=CACHE_SIZE)
@@ -188,15 +188,16 @@ def _min_fold(line: bytes, limit: float) -> tuple[float, Array] | None:
 
 def _check_crossings(pad: Morphology, rules: RulesSettings) -> list[Violation]:
     limit, min_angle = rules.max_crossings, rules.min_crossing_angle_deg
-    found = crossings(pad, CROSSING_TOLERANCE, across=limit is not None or min_angle > 0)
+    points = crossings(pad, CROSSING_TOLERANCE, across=limit is not None or min_angle > 0)
     horizontals = pad.layout.horizontals
-    across = [c for c in found if c.first < horizontals <= c.second]
-    same = [c for c in found if (c.first < horizontals) == (c.second < horizontals)]
+    across = [c for c in points if c.first < horizontals <= c.second]
+    same = [c for c in points if (c.first < horizontals) == (c.second < horizontals)]
     violations = []
     if len(same) > rules.same_family_crossings:
         amount = len(same), rules.same_family_crossings
         violations += [
-            Violation("same_family_crossings", _fibre_numbers(c), *amount, _to_pair(pad.to_mm(c.place))) for c in same
+            Violation("same_family_crossings", _fibre_numbers(c), *amount, _to_pair(pad.to_mm(c.position)))
+            for c in same
         ]
     if limit is not None and len(across) > limit:
         violations.append(Violation("max_crossings", (), len(across), limit))
@@ -207,7 +208,7 @@ def _check_angles(pad: Morphology, across: list[Crossing], limit: float) -> list
     angles = crossing_angles(pad, across)
     worst: dict[tuple[int, int], Violation] = {}
     for i in np.argsort(angles, kind="stable")[: np.count_nonzero(angles < limit)]:  # a pair's least angle comes first
-        pair, place = _fibre_numbers(across[i]), _to_pair(pad.to_mm(across[i].place))
+        pair, place = _fibre_numbers(across[i]), _to_pair(pad.to_mm(across[i].position))
         worst.setdefault(pair, Violation("min_crossing_angle_deg", pair, float(angles[i]), limit, place))
     return [worst[pair] for pair in sorted(worst)]
 
@@ -230,19 +231,21 @@ def _check_common_tracks(lines: list[Array], layout: Layout, limit: float | None
 
 
 def _check_borders(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
-    found = []
+    violations = []
     for fibre, line in enumerate(lines):
         across = 1 - pad.layout.family(fibre)
         distance = pad.layout.size_mm[across] / 2 - np.abs(line[:, across])
         worst = int(np.argmin(distance))
         if distance[worst] < limit:
-            found.append(Violation("border_mm", (fibre + 1,), float(distance[worst]), limit, _to_pair(line[worst])))
-    return found
+            violations.append(
+                Violation("border_mm", (fibre + 1,), float(distance[worst]), limit, _to_pair(line[worst]))
+            )
+    return violations
 
 
 def _check_keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, limit: float) -> list[Violation]:
     """Return the point of every fibre nearest to each polygon, or the middle of the longest stretch through it."""
-    found = []
+    violations = []
     for polygon in shapely.transform(keep_outs(size), pad.to_mm):
         for fibre, line in enumerate(lines):
             curve = shapely.LineString(line)
@@ -251,11 +254,11 @@ def _check_keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, lim
             if not inside.is_empty:
                 longest = max(shapely.get_parts(inside), key=lambda part: part.length)
                 middle = longest.interpolate(0.5, normalized=True)
-                found.append(Violation("keep_out_mm", (fibre + 1,), 0.0, limit, (middle.x, middle.y)))
+                violations.append(Violation("keep_out_mm", (fibre + 1,), 0.0, limit, (middle.x, middle.y)))
             elif between.length < limit:
                 place = _to_pair(np.array(between.coords[0]))
-                found.append(Violation("keep_out_mm", (fibre + 1,), between.length, limit, place))
-    return found
+                violations.append(Violation("keep_out_mm", (fibre + 1,), between.length, limit, place))
+    return violations
 
 
 def _check_lengths(pad: Morphology, limit: float) -> list[Violation]:

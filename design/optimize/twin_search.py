@@ -31,7 +31,7 @@ TOLERANCE = 1.03
 is no more certain."""
 SUBSETS = 8
 """Sets of failed fibres of a size by which pads are compared."""
-BUDGET_SHARES = {"usual": 0.35, "twin": 0.4, "from usual": 0.2}
+BUDGET_SHARES = {"default": 0.35, "twin": 0.4, "from default": 0.2}
 """Of a time budget, by search."""
 
 
@@ -86,7 +86,7 @@ def search_for_twin(
     contact: Contact,
     settings: SearchSettings,
     rules: RulesSettings,
-    usual: SearchSettings,
+    default_settings: SearchSettings,
     *,
     origin: Morphology | None = None,
     run: SearchOptions | None = None,
@@ -101,44 +101,46 @@ def search_for_twin(
         contact: as measured.
         settings: of the search, with the scatter as measured.
         rules: the limits.
-        usual: settings of the search for the default pad, which is for the default contact.
+        default_settings: settings of the search for the default pad, which is for the default contact.
         origin: the morphology to start from; random if None.
         run: callbacks, checkpoints, time budget and executor.
 
     Returns:
-        Its `candidate` is "twin", "from usual", "usual" or "straight fibres". A search that is stopped ends with the
-        best so far.
+        Its `candidate` is "twin", "from default", "default" or "straight fibres". A search that is stopped ends with
+        the best so far.
     """
     run = run or SearchOptions()
-    plain = search(pad, None, usual, rules, run=_options(run, "usual"))
+    plain = search(pad, None, default_settings, rules, run=_options(run, "default"))
     if plain.stopped == "interrupted":
         return plain
     afresh = search(pad, contact, settings, rules, origin=origin, run=_options(run, "twin"))
-    one = settings.model_copy(update={"starts": 1, "knots": max(settings.knots, usual.knots)})
-    further = search(pad, contact, one, rules, origin=plain.morphology, run=_options(run, "from usual"))
+    from_plain = settings.model_copy(update={"starts": 1, "knots": max(settings.knots, default_settings.knots)})
+    further = search(pad, contact, from_plain, rules, origin=plain.morphology, run=_options(run, "from default"))
     problem = build_problem(pad, contact, settings, rules)
     pads = {
-        "usual": plain.morphology,
+        "default": plain.morphology,
         "straight fibres": Morphology.straight(pad.layout),
         "twin": afresh.morphology,
-        "from usual": further.morphology,
+        "from default": further.morphology,
     }
     # a pad that cannot be built is no use, unless none can
-    pads = {name: each for name, each in pads.items() if not problem.violations(each)} or {"twin": afresh.morphology}
+    pads = {key: morphology for key, morphology in pads.items() if not problem.violations(morphology)} or {
+        "twin": afresh.morphology
+    }
     with stage("judge"):
         rows = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
     name = choose({row.pad: np.array(row.errors_mm) for row in rows})
-    parts = {"usual": plain, "twin": afresh, "from usual": further}
-    history = [entry | {"run": f"{part}, {entry['run']}"} for part, each in parts.items() for entry in each.history]
+    parts = {"default": plain, "twin": afresh, "from default": further}
+    history = [entry | {"run": f"{part}, {entry['run']}"} for part, result in parts.items() for entry in result.history]
     return replace(
         score_result(pads[name], name, problem),
         history=history,
-        seconds=sum(each.seconds for each in parts.values()),
-        stopped=next((each.stopped for each in parts.values() if each.stopped), ""),
+        seconds=sum(result.seconds for result in parts.values()),
+        stopped=next((result.stopped for result in parts.values() if result.stopped), ""),
     )
 
 
-def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("usual", "straight fibres")) -> str:
+def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("default", "straight fibres")) -> str:
     """Return the pad of least mean error, among those that are worse than the plain ones with no number of failures.
 
     Args:
@@ -146,7 +148,7 @@ def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("usual", "straig
         plain: pads that the others are compared to; missing ones are ignored.
     """
     best = np.min([errors[name] for name in plain if name in errors] or list(errors.values()), axis=0)
-    ratios = {name: each / best for name, each in errors.items()}
+    ratios = {name: error / best for name, error in errors.items()}
     least = min(float(ratio.max()) for ratio in ratios.values())
     fair = [name for name, ratio in ratios.items() if ratio.max() <= max(least, TOLERANCE)]
     return min(fair, key=lambda name: float(np.log(ratios[name]).mean()))

@@ -1,7 +1,7 @@
-"""How a fibre bends and how near its folds come to each other: pure functions on the points of one curve.
+"""Bend radius of a fibre and the gap between its folds: functions of the points of one curve.
 
-A fibre is a graph over its travel axis, so its heading (the angle of its tangent to that axis) stays within a right
-angle either side of 0 and it never meets itself.
+A fibre is a graph over its axis, so its heading (the angle of its tangent to the axis) stays within a right angle of 0,
+and it never crosses itself.
 """
 
 import numpy as np
@@ -11,32 +11,38 @@ from padforge.design.morphology import Array
 from padforge.design.paths.curves import cubic, quadratic
 
 FOLD = np.pi / 2
-"""Points of a fibre that lie `FOLD` gaps apart along it, half a turn of a circle one gap wide, are to keep that gap."""
+"""Points of a fibre keep the gap if they are `FOLD` gaps apart along it, half a turn of a circle one gap wide."""
 UNFOLDED = 2 * np.arccos(1 / FOLD)
-"""Headings within this range cannot fold: a curve within an angle a of a line has chords of cos a times its length."""
+"""Range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc."""
 _TINY = 1e-30
-"""Divides in place of the length of a segment whose ends coincide."""
+"""Divides in position of the length of a segment whose ends coincide."""
 
 
 def extreme_headings(slopes: Array) -> Array:
-    """(..., 2n+1) headings at the ends of n spans and where each is steepest or flattest inside, from start to end.
-
-    Between two of them the heading is monotone.
+    """Return the headings at the ends of spans and at the extremes of the slope inside; monotone between two of them.
 
     Args:
-        slopes: (..., n, 3) Bezier coefficients of each span's slope.
+        slopes: Bezier coefficients of each span's slope; shape (..., n, 3).
+
+    Returns:
+        Headings from start to end; shape (..., 2 n + 1), rad.
     """
     pairs = np.stack([slopes[..., 0], quadratic(slopes, _stationary(slopes))], axis=-1)
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
 
 def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
-    """Points (n, 2) of one fibre and its exact headings (n,) there; from one to the next it turns by at most `step`.
+    """Sample one fibre so that it turns by at most `step` from point to point.
 
     Such points also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.
 
     Args:
-        spans: (N+1, 4, 2) Bezier control points. slopes: (N+1, 3) Bezier coefficients of the slope.
+        spans: Bezier control points; shape (N + 1, 4, 2).
+        slopes: Bezier coefficients of the slope; shape (N + 1, 3).
+        step: largest change of heading between points, rad.
+
+    Returns:
+        Points (n, 2), and the exact headings there (n,), rad.
     """
     starts = np.arange(len(spans))
     at = np.append(np.column_stack([starts, starts + _stationary(slopes)]), len(spans))  # span + parameter in it
@@ -54,65 +60,80 @@ def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]
     return cubic(spans[span], at - span), heading
 
 
-def rolled_turns(points: Array, from_axis: Array, radius: float) -> Array:
-    """(n - 1,) radians by which a curve turns away from its plane, from point to point, once that is rolled up.
+def rolled_turns(points: Array, angles: Array, radius: float) -> Array:
+    """Compute the turn out of the plane, from point to point, of a curve in a plane rolled up on a cylinder about y.
 
-    A plane that is rolled up on a cylinder about y stays as long everywhere. A line on it at the angle a to x is then
-    curved out of the plane by cos(a)^2 / `radius` (Euler's formula: 1 / radius about the cylinder, 0 along it), beside
-    its curvature 1 / r in the plane; the two stand at right angles, so that it is curved by their root sum of squares.
-
-    Args:
-        points: (n, 2) so near that their headings hardly differ. from_axis: (n,) angle to the x axis there.
-    """
-    curved = np.cos(from_axis) ** 2 / radius
-    return (curved[1:] + curved[:-1]) / 2 * np.hypot(*np.diff(points, axis=0).T)
-
-
-def bend_radius(points: Array, headings: Array, window: float, rolled: Array | float = 0.0) -> tuple[float, Array]:
-    """Least bend radius of a curve, and the place (2,) in the middle of that bend.
-
-    The radius is `window` divided by the greatest angle the curve turns, left and right added up, in a stretch of that
-    length (or by what all of it turns, where it is shorter than that: then its length stands for the window). A PCHIP
-    curve is only C1, so its pointwise curvature says nothing about how a fibre of finite stiffness lies.
-
-    Between two points the curve is taken to turn evenly; what a window turns is then piecewise linear in where the
-    window lies, and greatest for one that starts or ends at a point.
+    Rolling preserves lengths. A line at the angle a to x is then curved out of the plane by cos(a)^2 / `radius`
+    (Euler's theorem), in addition to its curvature in the plane; the two are orthogonal and add as root sum of squares.
 
     Args:
-        points: (n, 2) on the curve, so near that chords measure its length; a corner is a point given twice.
-        headings: (n,) of the tangents there, unwrapped.
-        rolled: (n - 1,) what it turns out of the plane from point to point: `rolled_turns`.
+        points: points whose headings hardly differ from one to the next; shape (n, 2).
+        angles: angles to the x axis there; shape (n,), rad.
+        radius: radius of the cylinder, in the unit of the points.
+
+    Returns:
+        Turns; shape (n - 1,), rad.
     """
-    arc = _arc(points)
+    curvature = np.cos(angles) ** 2 / radius
+    return (curvature[1:] + curvature[:-1]) / 2 * np.hypot(*np.diff(points, axis=0).T)
+
+
+def bend_radius(
+    points: Array, headings: Array, window: float, out_of_plane: Array | float = 0.0
+) -> tuple[float, Array]:
+    """Compute the smallest bend radius of a curve: `window` over the largest total turn in a stretch of that length.
+
+    For a shorter curve its length is the window. A PCHIP curve is only C1, so its pointwise curvature does not describe
+    how a fibre of finite stiffness lies. The curve is assumed to turn evenly between two points; the turn in a window
+    is then piecewise linear in the window's position, with its maximum at a window that starts or ends at a point.
+
+    Args:
+        points: points on the curve, dense enough that chords measure its length; a corner is a point given twice;
+            shape (n, 2).
+        headings: headings of the tangents there, unwrapped; shape (n,), rad.
+        window: length over which turns are added up.
+        out_of_plane: turns out of the plane from point to point, from `rolled_turns`; shape (n - 1,), rad.
+
+    Returns:
+        Radius, and the position (2,) of the middle of that bend.
+    """
+    arc = _cumulative_length(points)
     window = min(window, arc[-1])
-    turned = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(headings), rolled))])
-    # A corner at either end of a window counts: a window starts before the turn at its first point (`turned` there,
+    turn = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(headings), out_of_plane))])
+    # A corner at either end of a window counts: a window starts before the turn at its first point (`turn` there,
     # or at the first of two equal points), and `interp` takes the last of equal arcs.
-    ahead = np.interp(arc + window, arc, turned) - turned
-    behind = turned - np.interp(arc - window, arc, turned)
+    ahead = np.interp(arc + window, arc, turn) - turn
+    behind = turn - np.interp(arc - window, arc, turn)
     i, j = int(np.argmax(ahead)), int(np.argmax(behind))
     if ahead[i] >= behind[j]:
-        angle, half = ahead[i], turned[i] + ahead[i] / 2
+        angle, half = ahead[i], turn[i] + ahead[i] / 2
     else:
-        angle, half = behind[j], turned[j] - behind[j] / 2
-    place = _at(points, arc, np.interp(half, turned, arc))
-    return (window / float(angle) if angle > 0 else np.inf), place
+        angle, half = behind[j], turn[j] - behind[j] / 2
+    position = _interpolate(points, arc, np.interp(half, turn, arc))
+    return (window / float(angle) if angle > 0 else np.inf), position
 
 
 def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:
-    """Least distance of two points of a polyline (n, 2) that lie at least `FOLD` gaps apart along it, and their middle.
+    """Compute the smallest distance of two points of a polyline that are at least `FOLD` gaps apart along it.
 
-    None where all of them keep `gap`. The polyline must not meet itself: then the least distance is found between a
-    vertex and a segment, or between two points exactly `FOLD` gaps apart.
+    The polyline must not cross itself: the smallest distance is then between a vertex and a segment, or between two
+    points exactly `FOLD` gaps apart.
+
+    Args:
+        line: vertices; shape (n, 2).
+        gap: distance to keep.
+
+    Returns:
+        Distance, and the middle (2,) of the two points; None if all keep the gap.
     """
-    apart = FOLD * gap
-    arc = _arc(line)
-    if arc[-1] < apart:
+    min_arc = FOLD * gap
+    arc = _cumulative_length(line)
+    if arc[-1] < min_arc:
         return None
-    start, offset = _exactly_apart(line, arc, apart)
-    within = np.hypot(*offset.T).min(initial=gap)
-    others, to_segment = _vertices_to_segments(line, arc, apart, within)
-    start, offset = np.concatenate([start, others]), np.concatenate([offset, to_segment])
+    start, offset = _pairs_at_arc(line, arc, min_arc)
+    radius = np.hypot(*offset.T).min(initial=gap)
+    vertices, to_segment = _pairs_vertex_segment(line, arc, min_arc, radius)
+    start, offset = np.concatenate([start, vertices]), np.concatenate([offset, to_segment])
     distance = np.hypot(*offset.T)
     if distance.min(initial=np.inf) >= gap:
         return None
@@ -120,50 +141,50 @@ def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:
     return float(distance[worst]), start[worst] + offset[worst] / 2
 
 
-def _vertices_to_segments(line: Array, arc: Array, apart: float, within: float) -> tuple[Array, Array]:
-    """Vertices near a segment and the way from each to the nearest point of it that lies `apart` along the line."""
+def _pairs_vertex_segment(line: Array, arc: Array, min_arc: float, radius: float) -> tuple[Array, Array]:
+    """Return vertices near a segment, and offsets to its nearest point at least `min_arc` away along the line."""
     segments = np.asarray(shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1)))
-    vertex, segment = shapely.STRtree(segments).query(shapely.points(line), predicate="dwithin", distance=within)
+    vertex, segment = shapely.STRtree(segments).query(shapely.points(line), predicate="dwithin", distance=radius)
     ahead = segment >= vertex
-    allowed = np.where(ahead, arc[segment + 1] - arc[vertex], arc[vertex] - arc[segment]) >= apart
+    allowed = np.where(ahead, arc[segment + 1] - arc[vertex], arc[vertex] - arc[segment]) >= min_arc
     vertex, segment, ahead = vertex[allowed], segment[allowed], ahead[allowed]
     length = np.maximum(arc[segment + 1] - arc[segment], _TINY)
-    low = np.where(ahead, (arc[vertex] + apart - arc[segment]) / length, 0)
-    high = np.where(ahead, 1, (arc[vertex] - apart - arc[segment]) / length)
+    low = np.where(ahead, (arc[vertex] + min_arc - arc[segment]) / length, 0)
+    high = np.where(ahead, 1, (arc[vertex] - min_arc - arc[segment]) / length)
     start, step = line[segment] - line[vertex], line[segment + 1] - line[segment]
-    fraction = _nearest_zero(start, step, np.clip(low, 0, 1), np.clip(high, 0, 1))
+    fraction = _closest_fraction(start, step, np.clip(low, 0, 1), np.clip(high, 0, 1))
     return line[vertex], start + fraction * step
 
 
-def _exactly_apart(line: Array, arc: Array, apart: float) -> tuple[Array, Array]:
-    """Points with another one exactly `apart` ahead, nearest in every stretch both run straight, and the way to it."""
-    at = np.concatenate([arc, arc - apart])
-    at = np.unique(at[(at >= 0) & (at <= arc[-1] - apart)])
-    here = _at(line, arc, at)
-    offset = _at(line, arc, at + apart) - here
-    along, step = np.diff(here, axis=0), np.diff(offset, axis=0)
-    fraction = _nearest_zero(offset[:-1], step, 0, 1)
-    return here[:-1] + fraction * along, offset[:-1] + fraction * step
+def _pairs_at_arc(line: Array, arc: Array, min_arc: float) -> tuple[Array, Array]:
+    """Return points, and offsets to those exactly `min_arc` ahead: the smallest while both are on straight segments."""
+    at = np.concatenate([arc, arc - min_arc])
+    at = np.unique(at[(at >= 0) & (at <= arc[-1] - min_arc)])
+    here = _interpolate(line, arc, at)
+    offset = _interpolate(line, arc, at + min_arc) - here
+    advance, step = np.diff(here, axis=0), np.diff(offset, axis=0)
+    fraction = _closest_fraction(offset[:-1], step, 0, 1)
+    return here[:-1] + fraction * advance, offset[:-1] + fraction * step
 
 
-def _nearest_zero(start: Array, step: Array, low: Array | float, high: Array | float) -> Array:
-    """(n, 1) fraction within low..high at which start + fraction * step, both (n, 2), is nearest to zero."""
+def _closest_fraction(start: Array, step: Array, low: Array | float, high: Array | float) -> Array:
+    """Return the fraction (n, 1) within low..high at which start + fraction * step, both (n, 2), is closest to zero."""
     square = np.maximum((step**2).sum(axis=1), _TINY)
     return np.clip(-(start * step).sum(axis=1) / square, low, high)[:, None]
 
 
 def _stationary(slopes: Array) -> Array:
-    """(...,) parameter within 0..1 where a quadratic Bezier (..., 3) has its extremum, any where it has none inside."""
+    """Return the parameter within 0..1 of the extremum of quadratic Beziers (..., 3); any if there is none inside."""
     first, second = slopes[..., 0] - slopes[..., 1], slopes[..., 2] - slopes[..., 1]
     bend = first + second
     return np.clip(np.divide(first, bend, out=np.zeros_like(bend), where=bend != 0), 0, 1)
 
 
-def _arc(points: Array) -> Array:
-    """(n,) length of a polyline from its start to every vertex."""
+def _cumulative_length(points: Array) -> Array:
+    """Return the arc length (n,) of a polyline at each vertex."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
-def _at(points: Array, arc: Array, where: Array | float) -> Array:
-    """(..., 2) points of a polyline at lengths `where` (...) from its start."""
+def _interpolate(points: Array, arc: Array, where: Array | float) -> Array:
+    """Return the points (..., 2) of a polyline at arc lengths `where` (...)."""
     return np.stack([np.interp(where, arc, points[:, 0]), np.interp(where, arc, points[:, 1])], axis=-1)

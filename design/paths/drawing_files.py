@@ -1,11 +1,12 @@
-"""Curves of DXF files: lines, arcs, polylines, splines and ellipses of the modelspace, by layer."""
+"""Curves of SVG and DXF drawings, as polylines."""
 
+# pyright: reportPrivateImportUsage=false  ezdxf does not mark as exported what its manual imports
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from lxml import etree
@@ -13,35 +14,37 @@ from lxml import etree
 from padforge.design.common.files import check_file, read_bytes
 from padforge.design.common.validation import InputError, short_repr
 from padforge.design.morphology import Array
-from padforge.design.paths.curves import cubic
 
-MOST_BYTES = 2**22
-"""Of a drawing: one of more is none of fibres."""
-MOST_POINTS = 200_000
-MOST_PARTS = 20_000
-"""Elements of a drawing that are looked at."""
-MOST_CURVES = 5000
-"""Before those that end in one point are put together."""
-FARTHEST = 1e6
-"""Greatest coordinate by amount, in units of the drawing."""
-STEPS = 48
-"""Straight pieces of a cubic: off by less than 5e-5 of its length."""
+if TYPE_CHECKING:
+    from ezdxf.path import Path as BezierPath
 
-_LONGEST_REASON = 120
+MAX_BYTES = 2**22
+"""Size of a drawing; drawings of fibres are far smaller."""
+MAX_POINTS = 200_000
+MAX_PARTS = 20_000
+"""Elements of a drawing, drawn or not."""
+MAX_CURVES = 5000
+"""Curves of a drawing before they are joined."""
+MAX_COORDINATE = 1e6
+"""Largest absolute coordinate, in units of the drawing."""
+FLATNESS = 1e-5
+"""Largest distance of curve and polyline, relative to the size of the curve."""
+
+_MAX_REASON = 120
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
 _PAD = "pad"
-_TOGETHER = 1e-6
-"""Share of a drawing's size within which ends are one point."""
+_JOIN_TOLERANCE = 1e-6
+"""Distance of ends that are one point, relative to the size of the drawing."""
 
 
 @dataclass(frozen=True)
 class DrawnCurve:
-    """One piece of a drawing.
+    """A curve of a drawing.
 
     Attributes:
-        name: as the file has it, or its kind and number.
-        points: (n, 2) in units of the drawing, y upwards.
-        groups: names of it and of all groups or layers it lies in.
+        name: name in the file, or kind and number.
+        points: vertices; shape (n, 2), in units of the drawing, y upwards.
+        groups: names of the curve and of all groups or layers that contain it.
         closed: whether it ends where it begins.
     """
 
@@ -53,171 +56,151 @@ class DrawnCurve:
 
 @dataclass
 class DrawnPlan:
-    """A drawing as it is read.
+    """Content of a drawing.
 
     Attributes:
-        unit_mm: a unit of it. note: what had to be taken for granted.
+        unit_mm: unit of the drawing, mm.
+        note: assumptions that were made.
+        curves: its curves.
     """
 
     unit_mm: float = 1.0
     note: str = ""
-    strokes: list[DrawnCurve] = field(default_factory=list)
-    parts: int = 0
-    points: int = 0
+    curves: list[DrawnCurve] = field(default_factory=list)
+    _parts: int = 0
+    _points: int = 0
 
-    def looked_at(self) -> None:
-        """One more element.
+    def count_part(self) -> None:
+        """Count an element.
 
         Raises:
-            InputError: there are too many.
+            InputError: there are more than MAX_PARTS.
         """
-        self.parts += 1
-        if self.parts > MOST_PARTS:
-            raise InputError(f"more than {MOST_PARTS} elements, which is more than a drawing of fibres has")
+        self._parts += 1
+        if self._parts > MAX_PARTS:
+            raise InputError(f"more than {MAX_PARTS} elements, which is more than a drawing of fibres has")
 
     def add(self, name: str, points: Array, groups: Sequence[str] = (), closed: bool = False) -> None:
-        """One more stroke, unless it is but a point.
+        """Add a curve, unless it is a single point.
+
+        Args:
+            name: name of the curve.
+            points: vertices; shape (n, 2), in units of the drawing.
+            groups: names of groups that contain it.
+            closed: whether it ends where it begins.
 
         Raises:
-            InputError: coordinates that are not finite or beyond FARTHEST, or too many points.
+            InputError: coordinates not finite or beyond MAX_COORDINATE, or too many points.
         """
-        self.points += len(points)
-        if self.points > MOST_POINTS:
-            raise InputError(f"more than {MOST_POINTS} points, which is more than a drawing of fibres has")
-        if not (np.abs(points) <= FARTHEST).all():
-            raise InputError(f"{name}: coordinates that are no numbers or beyond {FARTHEST:g}")
+        self._points += len(points)
+        if self._points > MAX_POINTS:
+            raise InputError(f"more than {MAX_POINTS} points, which is more than a drawing of fibres has")
+        if not (np.abs(points) <= MAX_COORDINATE).all():
+            raise InputError(f"{name}: coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
         points = points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
         if len(points) > 1:
             closed = closed or bool((points[0] == points[-1]).all())
-            self.strokes.append(DrawnCurve(name, points, tuple(filter(None, groups)), closed))
+            self.curves.append(DrawnCurve(name, points, tuple(filter(None, groups)), closed))
 
     @property
     def border(self) -> Array | None:
-        """(2, 2) low and high corner of what is named "pad", None where nothing is."""
-        found = [stroke.points for stroke in self.strokes if _PAD in (each.lower() for each in stroke.groups)]
-        return np.array([np.vstack(found).min(axis=0), np.vstack(found).max(axis=0)]) if found else None
+        """Low and high corner (2, 2) of what is named "pad"; None if nothing is."""
+        outlines = [curve.points for curve in self.curves if _is_pad(curve)]
+        points = np.vstack(outlines) if outlines else None
+        return None if points is None else np.array([points.min(axis=0), points.max(axis=0)])
 
     @property
     def fibres(self) -> list[DrawnCurve]:
-        """The curves that are fibres, pieces that end where another begins put together.
+        """Curves that are fibres, joined where one ends at another.
 
-        They are what is named so (fibre, horizontal, vertical), or where nothing is all that is open.
+        They are those named so (fibre, horizontal, vertical), or all open curves if none is.
         """
-        named = [stroke for stroke in self.strokes if any(map(_FIBRES.match, stroke.groups))]
-        for stroke in named:
-            if stroke.closed:
-                raise InputError(f"{stroke.name}: closed, expected a curve from one border of the pad to the other")
-        open_ones = [each for each in self.strokes if not each.closed and _PAD not in map(str.lower, each.groups)]
-        chosen = named or open_ones
-        if len(chosen) > MOST_CURVES:
+        named = [curve for curve in self.curves if any(map(_FIBRES.match, curve.groups))]
+        for curve in named:
+            if curve.closed:
+                raise InputError(f"{curve.name}: closed, expected a curve from one border of the pad to the other")
+        chosen = named or [curve for curve in self.curves if not curve.closed and not _is_pad(curve)]
+        if len(chosen) > MAX_CURVES:
             raise InputError(f"{len(chosen)} open curves, which is more than a drawing of fibres has")
-        return list(_joined(chosen))
+        return list(_join(chosen))
 
 
-def reason(error: Exception) -> str:
-    """What a library has against a file, in one line that is not as long as the file."""
-    return " ".join(str(error).split())[:_LONGEST_REASON] or type(error).__name__
+def _is_pad(curve: DrawnCurve) -> bool:
+    return _PAD in (group.lower() for group in curve.groups)
 
 
-class Pen:
-    """Takes what a curve is made of and gives polylines."""
-
-    def __init__(self) -> None:
-        self.lines: list[tuple[Array, bool]] = []
-        self._points: list[Array] = []
-
-    def begin(self, place: Sequence[float]) -> None:
-        """A new polyline begins."""
-        self.end()
-        self._points = [np.array([place], dtype=float)]
-
-    def line(self, place: Sequence[float]) -> None:
-        """Straight on to a place."""
-        self._points.append(np.array([place], dtype=float))
-
-    def curve(self, *control: Sequence[float]) -> None:
-        """A Bezier curve on by one, two or three control points, the last of them its end."""
-        points = np.array([self._points[-1][-1], *control], dtype=float)
-        if len(points) == 3:
-            a, b, c = points
-            points = np.array([a, a + (b - a) * 2 / 3, c + (b - c) * 2 / 3, c])
-        self._points.append(cubic(points, np.arange(1, STEPS + 1) / STEPS) if len(points) == 4 else points[1:])
-
-    def end(self, closed: bool = False) -> None:
-        """The polyline is done."""
-        if self._points:
-            points = np.vstack(self._points)
-            self.lines.append((np.vstack([points, points[:1]]) if closed else points, closed))
-        self._points = []
-
-
-def _joined(strokes: list[DrawnCurve]) -> Iterator[DrawnCurve]:
-    """Strokes, those put together whose ends are one point."""
-    if not strokes:
+def _join(curves: list[DrawnCurve]) -> Iterator[DrawnCurve]:
+    """Join curves whose ends coincide."""
+    if not curves:
         return
     from scipy.spatial import KDTree
 
-    ends = np.array([stroke.points[end] for stroke in strokes for end in (0, -1)])
-    near = _TOGETHER * max(float(np.ptp(ends, axis=0).max()), 1e-9)
-    found = KDTree(ends).query(ends, k=min(3, len(ends)), distance_upper_bound=near)
-    apart, others = (np.asarray(each).tolist() for each in found)
+    # 1. end 2 k is the start of curve k, end 2 k + 1 its end: which other end is each one joined to?
+    ends = np.array([curve.points[end] for curve in curves for end in (0, -1)])
+    tolerance = _JOIN_TOLERANCE * max(float(np.ptp(ends, axis=0).max()), 1e-9)
+    nearest = KDTree(ends).query(ends, k=min(3, len(ends)), distance_upper_bound=tolerance)
     partners: dict[int, int] = {}
-    for end, row in enumerate(zip(apart, others, strict=True)):
-        close = [other for distance, other in zip(*row, strict=True) if distance <= near and other != end]
+    for end, row in enumerate(zip(*(values.tolist() for values in nearest), strict=True)):
+        close = [other for distance, other in zip(*row, strict=True) if distance <= tolerance and other != end]
         if len(close) > 1:
             x, y = ends[end]
-            raise InputError(f"{strokes[end // 2].name}: more than two curves end at ({x:g}, {y:g})")
+            raise InputError(f"{curves[end // 2].name}: more than two curves end at ({x:g}, {y:g})")
         if close:
             partners[end] = close[0]
-    left = set(range(len(strokes)))
-    free = [end for end in range(len(ends)) if end not in partners]
-    for end in free:
-        if end // 2 not in left:
+    # 2. walk from every free end to the other end of its chain
+    remaining = set(range(len(curves)))
+    for start in range(len(ends)):
+        if start in partners or start // 2 not in remaining:
             continue
-        pieces: list[Array] = []
-        names: list[DrawnCurve] = []
-        at: int | None = end
-        while at is not None:
-            stroke = strokes[at // 2]
-            left.discard(at // 2)
-            names.append(stroke)
-            pieces.append(stroke.points if at % 2 == 0 else stroke.points[::-1])
-            at = partners.get(at ^ 1)
-        name = names[0].name if len(names) == 1 else f"{names[0].name} to {names[-1].name}"
-        yield DrawnCurve(name, np.vstack(pieces), names[0].groups)
-    if left:
-        raise InputError(
-            f"{strokes[min(left)].name}: part of a ring, or drawn twice, expected curves from border to border"
-        )
+        chain: list[int] = []
+        end: int | None = start
+        while end is not None:
+            chain.append(end)
+            remaining.discard(end // 2)
+            end = partners.get(end ^ 1)
+        first, last = curves[chain[0] // 2], curves[chain[-1] // 2]
+        points = np.vstack([curves[end // 2].points[:: 1 - 2 * (end % 2)] for end in chain])
+        yield DrawnCurve(first.name if len(chain) == 1 else f"{first.name} to {last.name}", points, first.groups)
+    if remaining:
+        name = curves[min(remaining)].name
+        raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
+
+
+def _shorten(error: Exception) -> str:
+    """Return a library's message in one line of limited length."""
+    return " ".join(str(error).split())[:_MAX_REASON] or type(error).__name__
+
+
+def _flatten(path: "BezierPath") -> Array:
+    """Flatten a path of Bezier curves to a polyline (n, 2)."""
+    control = np.array([vertex.xyz for vertex in path.control_vertices()])
+    if not (np.abs(control) <= 1e3 * MAX_COORDINATE).all():  # a matrix may still scale it down
+        raise InputError(f"coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
+    distance = FLATNESS * max(float(np.ptp(control, axis=0).max()), 1e-12)
+    return np.array([vertex.xyz[:2] for vertex in path.flattening(distance, segments=16)])
 
 
 _UNITS_MM = {
-    "": 25.4 / 96,
-    "px": 25.4 / 96,
-    "mm": 1.0,
-    "cm": 10.0,
-    "q": 0.25,
-    "in": 25.4,
-    "pt": 25.4 / 72,
-    "pc": 25.4 / 6,
+    **{"": 25.4 / 96, "px": 25.4 / 96, "mm": 1.0, "cm": 10.0, "q": 0.25, "in": 25.4},
+    **{"pt": 25.4 / 72, "pc": 25.4 / 6},
 }
+# possessive quantifiers (++) do not backtrack: a text of a million blanks is scanned once, not a million times
 _NUMBER = re.compile(r"[-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?")
 _LENGTH = re.compile(rf"\s*+({_NUMBER.pattern})\s*+([a-zA-Z]*+)\s*+")
 _TRANSFORM = re.compile(r"\s*+,?\s*+([a-zA-Z]++)\s*+\(([^()]*+)\)\s*+")
-"""A doubled + takes all it can and gives nothing back: a text of a million blanks is read once, not a million times."""
-_UNSEEN = {"defs", "symbol", "clipPath", "mask", "pattern", "marker", "metadata", "style", "title", "desc", "text"}
+_NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "pattern", "marker", "metadata", "style", "title", "desc", "text"}
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _LINK = "{http://www.w3.org/1999/xlink}href"
-_DEEPEST_USE = 8
+_MAX_USES = 8
 
 
 def read_svg(path: Path) -> DrawnPlan:
-    """The curves of an SVG, y upwards. A unit without a name is a pixel of 1/96 inch.
+    """Read the curves of an SVG. Lengths without a unit are pixels of 1/96 inch.
 
     Raises:
-        InputError: it cannot be read, or is of a kind that no drawing of fibres is.
+        InputError: the file cannot be read, or holds what no drawing of fibres does.
     """
-    content = read_bytes(path, MOST_BYTES)
+    content = read_bytes(path, MAX_BYTES)
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False, remove_comments=True, remove_pis=True
     )
@@ -226,124 +209,116 @@ def read_svg(path: Path) -> DrawnPlan:
     try:
         root = etree.fromstring(content, parser)
     except (etree.XMLSyntaxError, ValueError) as error:
-        raise InputError(f"{path}: not an SVG file that can be read ({reason(error)})") from error
-    etree.strip_tags(root, etree.Entity)  # what an external DTD may declare, which is not looked at
+        raise InputError(f"{path}: not an SVG file that can be read ({_shorten(error)})") from error
+    etree.strip_tags(root, etree.Entity)  # declared in an external DTD, which is not read
     if _kind(root) != "svg":
         raise InputError(f"{path}: the root is <{_kind(root)}>, expected <svg>")
     drawing = DrawnPlan()
-    flip = np.diag([1.0, -1.0, 1.0])
-    reader = _Reader(drawing, {each.get("id"): each for each in root.iter() if each.get("id")})
-    with np.errstate(all="ignore"):  # what becomes of too large numbers is refused where it is added
-        for element, matrix, groups in reader.shapes(root, flip @ _viewport(root)):
-            reader.draw(element, matrix, groups)
+    flip = np.diag([1.0, -1.0, 1.0])  # y of an SVG points down
+    ids = {element.get("id"): element for element in root.iter() if element.get("id")}
+    with np.errstate(all="ignore"):  # overflow is refused where curves are added
+        for element, matrix, groups in _iterate_shapes(drawing, ids, root, flip @ _viewport(root)):
+            _draw_shape(drawing, element, matrix, groups)
     return drawing
 
 
-class _Reader:
-    """What it takes to go through a file."""
-
-    def __init__(self, drawing: DrawnPlan, ids: Mapping[str, Any]) -> None:
-        self._drawing, self._ids = drawing, ids
-
-    def shapes(self, root: Any, matrix: Array) -> Iterator[tuple[Any, Array, tuple[str, ...]]]:
-        """What is drawn, in order, with its matrix and the names of all it lies in."""
-        waiting = [(child, matrix, (), 0) for child in reversed(root)]
-        while waiting:
-            element, matrix, groups, uses = waiting.pop()
-            self._drawing.looked_at()
-            kind = _kind(element)
-            if kind in _UNSEEN or _is_hidden(element):
-                continue
-            name = element.get("id") or kind
-            matrix = matrix @ _transform(element, name)
-            groups = (*groups, element.get("id", ""), element.get(_LABEL, ""))
-            if kind == "use":
-                target = self._ids.get((element.get("href") or element.get(_LINK) or "").removeprefix("#"))
-                if target is None:
-                    continue
-                if uses == _DEEPEST_USE:
-                    raise InputError(f"{name}: <use> of <use>, deeper than {_DEEPEST_USE}")
-                matrix = matrix @ _shift(*(_length(element, side, name) for side in ("x", "y")))
-                inside = list(target) if _kind(target) == "symbol" else [target]
-                waiting += [(child, matrix, groups, uses + 1) for child in reversed(inside)]
-            elif kind in ("g", "a", "svg", "switch"):
-                inner = matrix @ _viewport(element, nested=True) if kind == "svg" else matrix
-                waiting += [(child, inner, groups, uses) for child in reversed(element)]
-            else:
-                yield element, matrix, groups
-
-    def draw(self, element: Any, matrix: Array, groups: tuple[str, ...]) -> None:
-        """Add what an element draws; what is no curve draws nothing."""
+def _iterate_shapes(
+    drawing: DrawnPlan, ids: Mapping[str, Any], root: Any, matrix: Array
+) -> Iterator[tuple[Any, Array, tuple[str, ...]]]:
+    """Iterate over what is drawn, in order, with its matrix and the names of all that contains it."""
+    stack: list[tuple[Any, Array, tuple[str, ...], int]] = [(child, matrix, (), 0) for child in reversed(root)]
+    while stack:
+        element, matrix, groups, uses = stack.pop()
+        drawing.count_part()
         kind = _kind(element)
-        name = next((each for each in reversed(groups) if each), f"{kind} {len(self._drawing.strokes) + 1}")
-        pen = Pen()
-        if kind == "path":
-            _draw_path(element.get("d", ""), pen, name)
-        elif kind == "line":
-            x1, y1, x2, y2 = (_length(element, side, name) for side in ("x1", "y1", "x2", "y2"))
-            pen.begin((x1, y1))
-            pen.line((x2, y2))
-        elif kind in ("polyline", "polygon"):
-            numbers = [float(each) for each in _NUMBER.findall(element.get("points", ""))]
-            for k, place in enumerate(zip(numbers[::2], numbers[1::2], strict=False)):
-                (pen.line if k else pen.begin)(place)
-        elif kind == "rect":
-            x, y, width, height = (_length(element, side, name) for side in ("x", "y", "width", "height"))
-            pen.begin((x, y))
-            for place in ((x + width, y), (x + width, y + height), (x, y + height)):
-                pen.line(place)
-        pen.end(closed=kind in ("polygon", "rect"))
-        for points, closed in pen.lines:
-            self._drawing.add(name, points @ matrix[:2, :2].T + matrix[:2, 2], groups, closed)
+        style = element.get("style", "").replace(" ", "")
+        if kind in _NOT_DRAWN or element.get("display") == "none" or "display:none" in style:
+            continue
+        name = element.get("id") or kind
+        matrix = matrix @ _transform(element, name)
+        groups = (*groups, element.get("id", ""), element.get(_LABEL, ""))
+        if kind == "use":
+            target = ids.get((element.get("href") or element.get(_LINK) or "").removeprefix("#"))
+            if target is None:
+                continue
+            if uses == _MAX_USES:
+                raise InputError(f"{name}: <use> of <use>, deeper than {_MAX_USES}")
+            matrix = matrix @ _shift(*_lengths(element, name, "x", "y"))
+            children = list(target) if _kind(target) == "symbol" else [target]
+            stack += [(child, matrix, groups, uses + 1) for child in reversed(children)]
+        elif kind in ("g", "a", "svg", "switch"):
+            inner = matrix @ _viewport(element, nested=True) if kind == "svg" else matrix
+            stack += [(child, inner, groups, uses) for child in reversed(element)]
+        else:
+            yield element, matrix, groups
 
 
-def _draw_path(description: str, pen: Pen, name: str) -> None:
-    from fontTools.pens.basePen import AbstractPen
+def _draw_shape(drawing: DrawnPlan, element: Any, matrix: Array, groups: tuple[str, ...]) -> None:
+    """Add the curves of an element, none if it is no curve."""
+    kind = _kind(element)
+    name = next((group for group in reversed(groups) if group), f"{kind} {len(drawing.curves) + 1}")
+    lines: list[tuple[Array, bool]] = []
+    if kind == "path":
+        lines = _parse_path(element.get("d", ""), name)
+    elif kind == "line":
+        lines = [(np.reshape(_lengths(element, name, "x1", "y1", "x2", "y2"), (2, 2)), False)]
+    elif kind in ("polyline", "polygon"):
+        numbers = [float(number) for number in _NUMBER.findall(element.get("points", ""))]
+        lines = [(np.reshape(numbers[: len(numbers) // 2 * 2], (-1, 2)), kind == "polygon")]
+    elif kind == "rect":
+        x, y, width, height = _lengths(element, name, "x", "y", "width", "height")
+        lines = [(np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]]), True)]
+    for points, closed in lines:
+        if len(points):
+            points = np.vstack([points, points[:1]]) if closed else points
+            drawing.add(name, points @ matrix[:2, :2].T + matrix[:2, 2], groups, closed)
+
+
+def _parse_path(description: str, name: str) -> list[tuple[Array, bool]]:
+    """Return the polylines of an SVG path, and whether each is closed."""
+    from ezdxf.path import Path as BezierPath
+    from fontTools.pens.recordingPen import RecordingPen
     from fontTools.svgLib.path.parser import parse_path
 
-    class Taken(AbstractPen):
-        """What fontTools calls a pen."""
-
-        def moveTo(self, pt: Any) -> None:  # noqa: N802  names of fontTools
-            pen.begin(pt)
-
-        def lineTo(self, pt: Any) -> None:  # noqa: N802
-            pen.line(pt)
-
-        def curveTo(self, *points: Any) -> None:  # noqa: N802
-            pen.curve(*points)
-
-        def qCurveTo(self, *points: Any) -> None:  # noqa: N802
-            pen.curve(*points)
-
-        def closePath(self) -> None:  # noqa: N802
-            pen.end(closed=True)
-
-        def endPath(self) -> None:  # noqa: N802
-            pen.end()
-
+    pen = RecordingPen()
     try:
-        parse_path(description, Taken())
+        parse_path(description, pen)
+        if len(pen.value) > MAX_POINTS:
+            raise InputError(f"more than {MAX_POINTS} points, which is more than a drawing of fibres has")
+        path, lines = BezierPath(), []
+        for command, points in pen.value:
+            match command, points:
+                case "moveTo", [start]:
+                    path = BezierPath(start)
+                case "lineTo", [end]:
+                    path.line_to(end)
+                case "qCurveTo", [control, end]:
+                    path.curve3_to(end, control)
+                case "curveTo", [first, second, end]:
+                    path.curve4_to(end, first, second)
+                case "closePath" | "endPath", _:
+                    lines.append((_flatten(path) if len(path) else np.empty((0, 2)), command == "closePath"))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
     except (ValueError, ArithmeticError, LookupError, AssertionError) as error:
-        raise InputError(f"{name}: no path that can be read ({reason(error)})") from error
+        raise InputError(f"{name}: no path that can be read ({_shorten(error)})") from error
+    return lines
 
 
 def _kind(element: Any) -> str:
     return etree.QName(element).localname if isinstance(element.tag, str) else ""
 
 
-def _is_hidden(element: Any) -> bool:
-    style = element.get("style", "").replace(" ", "")
-    return element.get("display") == "none" or "display:none" in style
-
-
-def _length(element: Any, side: str, name: str) -> float:
-    """A length in user units, 0 where there is none; shares have no meaning here."""
-    text = element.get(side, "0")
-    found = _LENGTH.fullmatch(text)
-    if not found or found[2].lower() not in _UNITS_MM:
-        raise InputError(f"{name}: {side} is {short_repr(text)}, expected a length")
-    return float(found[1]) * (_UNITS_MM[found[2].lower()] / _UNITS_MM[""] if found[2] else 1)
+def _lengths(element: Any, name: str, *attributes: str) -> list[float]:
+    """Return lengths in user units, 0 where an attribute is missing; percentages have no meaning here."""
+    lengths = []
+    for attribute in attributes:
+        text = element.get(attribute, "0")
+        match = _LENGTH.fullmatch(text)
+        if not match or match[2].lower() not in _UNITS_MM:
+            raise InputError(f"{name}: {attribute} is {short_repr(text)}, expected a length")
+        lengths.append(float(match[1]) * (_UNITS_MM[match[2].lower()] / _UNITS_MM[""] if match[2] else 1))
+    return lengths
 
 
 def _shift(x: float, y: float) -> Array:
@@ -351,83 +326,78 @@ def _shift(x: float, y: float) -> Array:
 
 
 def _viewport(element: Any, nested: bool = False) -> Array:
-    """From what is inside an <svg> to mm, or, of one in another, to the units around it."""
+    """Return the matrix from inside an <svg> to mm, or to the surrounding units if it is nested in another."""
     name = element.get("id") or "svg"
-    origin = _shift(*(_length(element, side, name) for side in ("x", "y"))) if nested else np.eye(3)
+    origin = _shift(*_lengths(element, name, "x", "y")) if nested else np.eye(3)
     unit = np.eye(3) if nested else np.diag([_UNITS_MM[""], _UNITS_MM[""], 1.0])
-    box = [float(each) for each in _NUMBER.findall(element.get("viewBox", ""))]
+    box = [float(number) for number in _NUMBER.findall(element.get("viewBox", ""))]
     if len(box) != 4:
         return unit @ origin
     if not (box[2] > 0 and box[3] > 0):
         raise InputError(
             f"{name}: viewBox is {short_repr(element.get('viewBox'))}, expected x, y, width, height above 0"
         )
-    sides = [element.get(side, "100%") for side in ("width", "height")]
-    shown_as = [
-        inner if text.strip().endswith("%") else _length(element, side, name)
-        for text, side, inner in zip(sides, ("width", "height"), box[2:], strict=True)
+    sides = [
+        inner if element.get(side, "100%").strip().endswith("%") else _lengths(element, name, side)[0]
+        for side, inner in zip(("width", "height"), box[2:], strict=True)
     ]
-    scale = [outer / inner for outer, inner in zip(shown_as, box[2:], strict=True)]
+    scale = [outer / inner for outer, inner in zip(sides, box[2:], strict=True)]
     if element.get("preserveAspectRatio", "").strip() != "none":
         scale = [min(scale)] * 2
-    room = [outer - inner * each for outer, inner, each in zip(shown_as, box[2:], scale, strict=True)]
-    if not nested:  # its own origin is what whoever drew it counts from
+    if not nested:  # the drawing's own origin is the one that was drawn from
         return unit @ np.diag([*scale, 1.0])
-    return origin @ _shift(room[0] / 2, room[1] / 2) @ np.diag([*scale, 1.0]) @ _shift(-box[0], -box[1])
+    margins = [outer - inner * factor for outer, inner, factor in zip(sides, box[2:], scale, strict=True)]
+    return origin @ _shift(margins[0] / 2, margins[1] / 2) @ np.diag([*scale, 1.0]) @ _shift(-box[0], -box[1])
 
 
 def _transform(element: Any, name: str) -> Array:
-    """The matrix of the attribute `transform`."""
+    """Return the matrix of the attribute `transform`."""
     text, matrix, at = element.get("transform", "").rstrip(), np.eye(3), 0
     while at < len(text):
-        found = _TRANSFORM.match(text, at)
-        if not found:
+        match = _TRANSFORM.match(text, at)
+        if not match:
             raise InputError(f"{name}: transform is {short_repr(text)}, expected such as translate(1 2)")
-        values = [float(each) for each in _NUMBER.findall(found[2])]
+        values = [float(number) for number in _NUMBER.findall(match[2])]
         if not all(map(math.isfinite, values)):
             raise InputError(f"{name}: transform is {short_repr(text)}, expected finite numbers")
-        matrix, at = matrix @ _step(found[1], values, name), found.end()
+        matrix, at = matrix @ _elementary_transform(match[1], values, name), match.end()
     return matrix
 
 
-def _step(kind: str, values: list[float], name: str) -> Array:
+def _elementary_transform(kind: str, values: list[float], name: str) -> Array:
     match kind, values:
         case "matrix", [a, b, c, d, e, f]:
             return np.array([[a, c, e], [b, d, f], [0, 0, 1]])
-        case "translate", [x, *rest] if len(rest) < 2:
-            return _shift(x, *(rest or [0.0]))
-        case "scale", [x, *rest] if len(rest) < 2:
-            return np.diag([x, *(rest or [x]), 1.0])
-        case "rotate", [degrees, *middle] if len(middle) in (0, 2):
+        case "translate", [x, *y] if len(y) < 2:
+            return _shift(x, *(y or [0.0]))
+        case "scale", [x, *y] if len(y) < 2:
+            return np.diag([x, *(y or [x]), 1.0])
+        case "rotate", [degrees, *centre] if len(centre) in (0, 2):
             cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-            x, y = middle or (0.0, 0.0)
+            x, y = centre or (0.0, 0.0)
             return _shift(x, y) @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ _shift(-x, -y)
         case "skewX" | "skewY", [degrees]:
             skew = np.eye(3)
             skew[(0, 1) if kind == "skewX" else (1, 0)] = math.tan(math.radians(degrees))
             return skew
-    raise InputError(f"{name}: transform {short_repr(kind)} of {len(values)} numbers, which there is not")
-
-
-# pyright: reportPrivateImportUsage=false
-# ezdxf does not mark what its own manual imports as exported.
+    raise InputError(f"{name}: transform {short_repr(kind)} of {len(values)} numbers is not defined")
 
 
 _KINDS = ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE")
-_MOST_DEGREE = 9
+_MAX_DEGREE = 9
 
 
 def read_dxf(path: Path) -> DrawnPlan:
-    """The curves of a DXF; blocks, hatches and writing are left out. Its unit is that of $INSUNITS, mm without.
+    """Read the curves of a DXF's modelspace, in units of $INSUNITS, mm without; blocks, hatches and text are ignored.
 
     Raises:
-        InputError: it cannot be read, or is of a kind that no drawing of fibres is.
+        InputError: the file cannot be read, or holds what no drawing of fibres does.
     """
     import ezdxf
     from ezdxf import path as paths
     from ezdxf import units
 
-    path = check_file(path, MOST_BYTES)
+    path = check_file(path, MAX_BYTES)
     try:
         document = ezdxf.readfile(path)
         unit, millimetre = document.units, units.InsertUnits.Millimeters
@@ -435,54 +405,44 @@ def read_dxf(path: Path) -> DrawnPlan:
     except MemoryError:
         raise
     except Exception as error:  # ezdxf raises whatever a torn file leads it to
-        raise InputError(f"{path}: not a DXF file that can be read ({reason(error)})") from error
-    drawing = DrawnPlan(note="" if unit else "the file says no unit: mm")
-    drawing.unit_mm = unit_mm
+        raise InputError(f"{path}: not a DXF file that can be read ({_shorten(error)})") from error
+    drawing = DrawnPlan(unit_mm, note="" if unit else "the file says no unit: mm")
     for number, entity in enumerate(document.modelspace(), 1):
-        drawing.looked_at()
+        drawing.count_part()
         if entity.dxftype() not in _KINDS:
             continue
         name = f"{entity.dxftype()} {number} of layer {short_repr(entity.dxf.layer)}"
         try:
-            _require_bounded(entity)
-            pen = Pen()
-            for part in paths.make_path(entity).sub_paths():
-                _draw(part, pen)
+            _check_bounds(entity)
+            lines = [_flatten(part) for part in paths.make_path(entity).sub_paths()]
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
         except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError, ezdxf.DXFError) as error:
-            raise InputError(f"{name}: no curve ({reason(error)})") from error
-        for points, closed in pen.lines:
-            drawing.add(name, points, (str(entity.dxf.layer),), closed)
+            raise InputError(f"{name}: no curve ({_shorten(error)})") from error
+        for points in lines:
+            drawing.add(name, points, (str(entity.dxf.layer),))
     return drawing
 
 
-def _require_bounded(entity: Any) -> None:
-    """Refuse what would take long to draw before it is tried."""
-    kind = entity.dxftype()
-    places: Any = []
-    if kind == "LINE":
-        places = [entity.dxf.start, entity.dxf.end]
-    elif kind in ("ARC", "ELLIPSE"):
-        places = [entity.dxf.center, [entity.dxf.radius] if kind == "ARC" else entity.dxf.major_axis]
-    elif kind == "LWPOLYLINE":
-        places = list(entity.get_points("xyb"))
-    elif kind == "POLYLINE":
-        places = [vertex.dxf.location for vertex in entity.vertices]
-    else:
-        if entity.dxf.degree > _MOST_DEGREE:
-            raise InputError(f"of degree {entity.dxf.degree}, allowed are up to {_MOST_DEGREE}")
-        places = [*entity.control_points, *entity.fit_points]
-    if len(places) > MOST_POINTS // 10:
-        raise InputError(f"it has {len(places)} points, allowed are {MOST_POINTS // 10}")
-    for place in places:
-        if not (np.abs(np.array(list(place), dtype=float)) <= FARTHEST).all():
-            raise InputError(f"coordinates that are no numbers or beyond {FARTHEST:g}")
-
-
-def _draw(part: Any, pen: Pen) -> None:
-    pen.begin(part.start[:2] if isinstance(part.start, tuple) else (part.start.x, part.start.y))
-    for command in part.commands():
-        controls = [getattr(command, name) for name in ("ctrl", "ctrl1", "ctrl2") if hasattr(command, name)]
-        pen.curve(*((place.x, place.y) for place in (*controls, command.end)))
-    pen.end(False)
+def _check_bounds(entity: Any) -> None:
+    """Refuse an entity that would take long to flatten."""
+    points: Any = []
+    match entity.dxftype():
+        case "LINE":
+            points = [entity.dxf.start, entity.dxf.end]
+        case "ARC":
+            points = [entity.dxf.center, [entity.dxf.radius]]
+        case "ELLIPSE":
+            points = [entity.dxf.center, entity.dxf.major_axis]
+        case "LWPOLYLINE":
+            points = list(entity.get_points("xyb"))
+        case "POLYLINE":
+            points = [vertex.dxf.location for vertex in entity.vertices]
+        case "SPLINE":
+            if entity.dxf.degree > _MAX_DEGREE:
+                raise InputError(f"of degree {entity.dxf.degree}, allowed are up to {_MAX_DEGREE}")
+            points = [*entity.control_points, *entity.fit_points]
+    if len(points) > MAX_POINTS // 10:
+        raise InputError(f"it has {len(points)} points, allowed are {MAX_POINTS // 10}")
+    if not all((np.abs(np.array(list(point), dtype=float)) <= MAX_COORDINATE).all() for point in points):
+        raise InputError(f"coordinates that are no numbers or beyond {MAX_COORDINATE:g}")

@@ -1,7 +1,7 @@
-"""Fibres through curves that somebody has drawn: PCHIP knots, as few as keep within a tolerance.
+"""PCHIP curves through drawn polylines, with as few knots as keep within a tolerance.
 
-Knots are put where a curve turns and where it is missed most, then all of them are moved along and across by
-least squares (K. Levenberg 1944, D. Marquardt 1963), and left out one by one while the others can do without.
+Knots are inserted where the polyline turns and where the misfit is largest, then all are moved along and across by
+damped least squares (Levenberg 1944, Marquardt 1963), and removed one by one while the others suffice.
 """
 
 from collections.abc import Sequence
@@ -13,52 +13,64 @@ from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Ints
 from padforge.design.settings import Layout
 
-HAIR = 1e-4
-"""Length of all spare knots of a fibre together, grid units: far below what can be printed."""
-_SHARES = np.array([0.15, 0.3, 0.5, 0.7, 0.85])
-"""Where on a span a knot is tried."""
-_LEVEL = 1e-9
-"""Heights that differ by less are one: a file in pitches is right to rounding."""
+SPARE_LENGTH = 1e-4
+"""Length of all spare knots of a fibre, grid units: far below what can be printed."""
+_TRIAL_POSITIONS = np.array([0.15, 0.3, 0.5, 0.7, 0.85])
+"""Positions on a span at which a knot is tried."""
+_LEVEL_TOLERANCE = 1e-9
+"""Rises below this are none: positions in a file in pitches are right to rounding."""
 
 
-def add_spare_knots(courses: Sequence[Array], layout: Layout) -> Array:
-    """(F, n, 2) knots of all fibres, n of the one that has most; those of others are filled up with spare ones.
+def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
+    """Give all fibres the same number of knots by adding spare ones that do not change the curve.
 
     Args:
-        courses: of every fibre its knots (n, 2), as a morphology has them.
+        paths: knots of each fibre, as in a morphology; shape (n, 2), grid units.
+        layout: layout of the fibres.
+
+    Returns:
+        Knots; shape (F, n, 2), n that of the fibre with the most.
     """
-    most = max(map(len, courses))
-    return np.stack([_filled(course, layout.family(fibre), most - len(course)) for fibre, course in enumerate(courses)])
+    n_knots = max(map(len, paths))
+    return np.stack([_add_spares(path, layout.family(i), n_knots - len(path)) for i, path in enumerate(paths)])
 
 
 def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
-    """Of every fibre its knots (n, 2) but the spare ones, of knots (F, n, 2)."""
-    courses = []
+    """Return the knots of each fibre without spare ones.
+
+    Args:
+        knots: shape (F, n, 2), grid units.
+        layout: layout of the fibres.
+
+    Returns:
+        Knots of each fibre; shape (n, 2).
+    """
+    paths = []
     for fibre, line in enumerate(knots):
         step = np.abs(np.diff(line, axis=0))
         axis = layout.family(fibre)
-        spare = (step[:, axis] <= HAIR * (1 + _LEVEL)) & (step[:, 1 - axis] <= _LEVEL)
+        spare = (step[:, axis] <= SPARE_LENGTH * (1 + _LEVEL_TOLERANCE)) & (step[:, 1 - axis] <= _LEVEL_TOLERANCE)
         spare[-1] = False
-        courses.append(line[np.append(True, ~spare)])
-    return courses
+        paths.append(line[np.append(True, ~spare)])
+    return paths
 
 
-def _filled(course: Array, axis: int, count: int) -> Array:
-    """A fibre with so many more knots."""
+def _add_spares(path: Array, axis: int, count: int) -> Array:
+    """Return a fibre with `count` more knots."""
     if not count:
-        return course
-    at = _level_knot(course[:, axis], course[:, 1 - axis])
+        return path
+    at = _find_level_knot(path[:, axis], path[:, 1 - axis])
     if at is None:
-        return _filled(_with_knot_on_curve(course.tobytes(), axis), axis, count - 1)
-    step = min(HAIR, (course[at + 1, axis] - course[at, axis]) / 4) / count
-    spares = np.repeat(course[at : at + 1], count, axis=0)
+        return _add_spares(_insert_knot_on_curve(path.tobytes(), axis), axis, count - 1)
+    step = min(SPARE_LENGTH, (path[at + 1, axis] - path[at, axis]) / 4) / count
+    spares = np.repeat(path[at : at + 1], count, axis=0)
     spares[:, axis] += step * np.arange(1, count + 1)
-    return np.insert(course, at + 1, spares, axis=0)
+    return np.insert(path, at + 1, spares, axis=0)
 
 
-def _level_knot(travel: Array, cross: Array) -> int | None:
-    """The knot where a course is level, not next to an end, that has most room behind it; None where there is none."""
-    rise, room = np.diff(cross), np.diff(travel)
+def _find_level_knot(along: Array, across: Array) -> int | None:
+    """Find the level knot, not next to an end, with the most room behind it; None if there is none."""
+    rise, room = np.diff(across), np.diff(along)
     if not rise.any():
         return int(np.argmax(room))
     level = np.append(rise[0] == 0, rise[:-1] * rise[1:] <= 0)
@@ -66,69 +78,71 @@ def _level_knot(travel: Array, cross: Array) -> int | None:
     return int(np.argmax(np.where(level, room, -1))) if level.any() else None
 
 
-@lru_cache(maxsize=256)  # whoever edits a fibre leaves all others as they are
-def _with_knot_on_curve(course: bytes, axis: int) -> Array:
-    """A fibre, knots (n, 2) as bytes, with one more knot on its curve near an end, where that moves it least."""
+@lru_cache(maxsize=256)  # an editor changes one fibre and leaves the others
+def _insert_knot_on_curve(path: bytes, axis: int) -> Array:
+    """Insert a knot on the curve of a fibre, knots (n, 2) as bytes, near an end, where it changes the curve least."""
     from scipy.interpolate import PchipInterpolator
 
-    knots = np.frombuffer(course).reshape(-1, 2)
-    travel, cross = knots[:, axis], knots[:, 1 - axis]
-    curve = PchipInterpolator(travel, cross)
-    spans = sorted({0, 1, len(travel) - 3, len(travel) - 2} & set(range(len(travel) - 1)))
-    places = np.concatenate([travel[k] + (travel[k + 1] - travel[k]) * _SHARES for k in spans])
-    dense = np.concatenate([np.linspace(travel[k], travel[k + 1], 33) for k in spans])
-    best, least = travel, np.inf
-    for place in places:
-        more = np.sort(np.append(travel, place))
-        moved = float(np.abs(PchipInterpolator(more, curve(more))(dense) - curve(dense)).max())
-        if moved < least:
-            best, least = more, moved
-    found = np.empty((len(best), 2))
-    found[:, axis], found[:, 1 - axis] = best, curve(best)
-    found[[0, -1]] = knots[[0, -1]]
-    return found
+    knots = np.frombuffer(path).reshape(-1, 2)
+    along, across = knots[:, axis], knots[:, 1 - axis]
+    curve = PchipInterpolator(along, across)
+    spans = sorted({0, 1, len(along) - 3, len(along) - 2} & set(range(len(along) - 1)))
+    positions = np.concatenate([along[k] + (along[k + 1] - along[k]) * _TRIAL_POSITIONS for k in spans])
+    dense = np.concatenate([np.linspace(along[k], along[k + 1], 33) for k in spans])
+    best, least = along, np.inf
+    for position in positions:
+        more = np.sort(np.append(along, position))
+        largest_change = float(np.abs(PchipInterpolator(more, curve(more))(dense) - curve(dense)).max())
+        if largest_change < least:
+            best, least = more, largest_change
+    result = np.empty((len(best), 2))
+    result[:, axis], result[:, 1 - axis] = best, curve(best)
+    result[[0, -1]] = knots[[0, -1]]
+    return result
 
 
 SAMPLES = 700
-"""Points of a curve that are looked at."""
-_ROUNDS = 40
-"""Steps of least squares at most."""
-_SHARE = 0.4
-"""Of the way to its neighbour by which a knot moves at once at most."""
-_LEFT_OUT = 4
-"""Knots that are tried to be done without, those first that are missed least."""
-_TRIES = 15
-"""Steps of ever shorter length that are tried for one."""
-_REACH = 4
-"""Spans that move with a knot, from two before it."""
-_NEAREST = 2e-3
-"""Least distance of knots along the curve, of its length."""
+"""Samples of a polyline."""
+_MAX_ITERATIONS = 40
+"""Iterations of Levenberg-Marquardt."""
+_MAX_STEP = 0.4
+"""Largest step of a knot, as a share of the way to its neighbour."""
+_MAX_CANDIDATES = 4
+"""Knots whose removal is tried, those with the smallest misfit first."""
+_MAX_DAMPINGS = 15
+"""Increases of the damping in one iteration."""
+_SUPPORT = 4
+"""Spans that depend on a knot, from two before it."""
+_MIN_SPAN = 2e-3
+"""Smallest distance of knots along the axis, as a share of the curve's extent."""
 
 
-def fit_knots(points: Array, tolerance: float, most: int = 64) -> Array:
-    """(n, 2) knots of a PCHIP curve through `points` that keeps within `tolerance` of it, from its first to its last.
-
-    What is missed is measured along the normal of the curve.
+def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
+    """Fit a PCHIP curve to a polyline; misfits are measured along the normal.
 
     Args:
-        points: (m, 2) travel, strictly ascending, and cross coordinate of a polyline.
-        most: inner knots; with so many the tolerance may be missed.
+        points: coordinates along, strictly ascending, and across; shape (m, 2).
+        tolerance: largest misfit, in the unit of the points.
+        max_inner: largest number of inner knots; with that many the tolerance may be exceeded.
+
+    Returns:
+        Knots from the first to the last point; shape (n, 2).
     """
-    samples, weight = _sampled(points)
-    knots = samples[_turns(samples, tolerance)]
-    if len(knots) > most + 2:  # which no choice of knots can follow
-        return np.vstack([knots[: most + 1], knots[-1:]])
+    samples, weight = _sample(points)
+    knots = samples[_find_turns(samples, tolerance)]
+    if len(knots) > max_inner + 2:  # more turns than knots
+        return np.vstack([knots[: max_inner + 1], knots[-1:]])
     while True:
-        knots = _polished(samples, weight, knots)
-        missed = _missed(samples, weight, knots)
-        if missed.max() <= tolerance or len(knots) >= most + 2:
+        knots = _optimise(samples, weight, knots)
+        misfit = _misfit(samples, weight, knots)
+        if misfit.max() <= tolerance or len(knots) >= max_inner + 2:
             break
-        knots = _with_more(samples, knots, missed, tolerance, most + 2 - len(knots))
-    return _thinned(samples, weight, knots, tolerance)
+        knots = _insert_knots(samples, knots, misfit, tolerance, max_inner + 2 - len(knots))
+    return _remove_redundant(samples, weight, knots, tolerance)
 
 
-def _sampled(points: Array) -> tuple[Array, Array]:
-    """Samples (m, 2) evenly along a polyline, and by how much less than across each is missed along the normal."""
+def _sample(points: Array) -> tuple[Array, Array]:
+    """Sample a polyline evenly (m, 2), and return the ratio of misfit along the normal to that across."""
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     at = np.linspace(0, arc[-1], SAMPLES)
     samples = np.stack([np.interp(at, arc, points[:, axis]) for axis in (0, 1)], axis=1)
@@ -138,119 +152,123 @@ def _sampled(points: Array) -> tuple[Array, Array]:
     return samples, 1 / np.sqrt(1 + slope**2)
 
 
-def _turns(samples: Array, tolerance: float) -> Ints:
-    """Samples at which a curve turns back by more than a tolerance, and its ends: no PCHIP curve turns elsewhere."""
-    cross, turns, way = samples[:, 1], [0], 0
+def _find_turns(samples: Array, tolerance: float) -> Ints:
+    """Find the samples at which the polyline turns back by more than the tolerance, and its ends.
+
+    A PCHIP curve turns only at knots.
+    """
+    across, turns, direction = samples[:, 1], [0], 0
     extreme = 0
-    for k, value in enumerate(cross):
-        further = value - cross[extreme]
-        if way == 0 and abs(value - cross[0]) > tolerance:
-            way, extreme = (1 if value > cross[0] else -1), k
-        elif way and further * way >= 0:
+    for k, value in enumerate(across):
+        further = value - across[extreme]
+        if direction == 0 and abs(value - across[0]) > tolerance:
+            direction, extreme = (1 if value > across[0] else -1), k
+        elif direction and further * direction >= 0:
             extreme = k
-        elif way and -further * way > tolerance:
+        elif direction and -further * direction > tolerance:
             turns.append(extreme)
-            way, extreme = -way, k
+            direction, extreme = -direction, k
     return np.unique([*turns, len(samples) - 1])
 
 
-def _values(knots: Array, travel: Array) -> Array:
-    """The PCHIP curve through knots at `travel`, ascending."""
+def _evaluate(knots: Array, along: Array) -> Array:
+    """Evaluate the PCHIP curve through knots at ascending coordinates."""
     t, v = np.ascontiguousarray(knots[:, 0]), np.ascontiguousarray(knots[:, 1])
     d = np.empty(len(t))
     pchip_slopes(t, v, d)
-    span = np.clip(np.searchsorted(t, travel, side="right") - 1, 0, len(t) - 2)
+    span = np.clip(np.searchsorted(t, along, side="right") - 1, 0, len(t) - 2)
     h = t[span + 1] - t[span]
-    s, rise = (travel - t[span]) / h, v[span + 1] - v[span]
+    s, rise = (along - t[span]) / h, v[span + 1] - v[span]
     a, b = h * d[span], h * d[span + 1]
     return v[span] + s * (a + s * (3 * rise - 2 * a - b + s * (a + b - 2 * rise)))
 
 
-def _missed(samples: Array, weight: Array, knots: Array) -> Array:
-    return np.abs(_values(knots, samples[:, 0]) - samples[:, 1]) * weight
+def _misfit(samples: Array, weight: Array, knots: Array) -> Array:
+    """Return the misfit along the normal at each sample."""
+    return np.abs(_evaluate(knots, samples[:, 0]) - samples[:, 1]) * weight
 
 
-def _with_more(samples: Array, knots: Array, missed: Array, tolerance: float, most: int) -> Array:
-    """With a knot in every span that misses the tolerance, where it misses most; at most so many, the worst first."""
+def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float, limit: int) -> Array:
+    """Insert up to `limit` knots, the worst first, each where a span's misfit is largest and above the tolerance."""
     span = np.clip(np.searchsorted(knots[:, 0], samples[:, 0], side="right") - 1, 0, len(knots) - 2)
     worst = []
     for k in range(len(knots) - 1):
         inside = np.flatnonzero(span == k)[1:]
-        if len(inside) and missed[inside].max() > tolerance:
-            worst.append(int(inside[np.argmax(missed[inside])]))
-    worst.sort(key=lambda at: -missed[at])
-    new = samples[worst[:most]]
-    if not len(new):  # spans are shorter than samples are apart
+        if len(inside) and misfit[inside].max() > tolerance:
+            worst.append(int(inside[np.argmax(misfit[inside])]))
+    worst.sort(key=lambda at: -misfit[at])
+    new = samples[worst[:limit]]
+    if not len(new):  # spans shorter than the distance of samples
         longest = int(np.argmax(np.diff(knots[:, 0])))
         new = knots[longest : longest + 2].mean(axis=0, keepdims=True)
-    together = np.vstack([knots, new])
-    return together[np.argsort(together[:, 0], kind="stable")]
+    combined = np.vstack([knots, new])
+    return combined[np.argsort(combined[:, 0], kind="stable")]
 
 
-def _polished(samples: Array, weight: Array, knots: Array) -> Array:
-    """Inner knots moved along and across by least squares."""
+def _optimise(samples: Array, weight: Array, knots: Array) -> Array:
+    """Move the inner knots along and across by the Levenberg-Marquardt algorithm."""
     if len(knots) == 2:
         return knots
-    travel, cross = samples.T
-    apart = _NEAREST * (knots[-1, 0] - knots[0, 0])
+    along, across = samples.T
+    min_span = _MIN_SPAN * (knots[-1, 0] - knots[0, 0])
 
-    def residual(tried: Array) -> Array:
-        return (_values(tried, travel) - cross) * weight
+    def residual(trial: Array) -> Array:
+        return (_evaluate(trial, along) - across) * weight
 
-    damping, now = 1e-2, residual(knots)
-    for _ in range(_ROUNDS):
-        jacobian = _jacobian(travel, weight, knots, now + cross * weight)
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ now
-        room = _SHARE * np.maximum(np.diff(knots[:, 0]) - apart, 0)
+    damping, current = 1e-2, residual(knots)
+    for _ in range(_MAX_ITERATIONS):
+        jacobian = _jacobian(along, weight, knots, current + across * weight)
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
+        room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0)
         scale = np.diag(normal) + 1e-12 * max(np.trace(normal), 1e-300)
-        for _ in range(_TRIES):
+        for _ in range(_MAX_DAMPINGS):
             step = np.linalg.solve(normal + damping * np.diag(scale), -gradient).reshape(-1, 2)
             step[:, 0] = np.clip(step[:, 0], -room[:-1], room[1:])
-            tried = knots.copy()
-            tried[1:-1] += step
-            if ((found := residual(tried)) ** 2).sum() < (now**2).sum():
+            trial = knots.copy()
+            trial[1:-1] += step
+            if ((new := residual(trial)) ** 2).sum() < (current**2).sum():
                 break
             damping *= 5
         else:
             return knots
-        gained = 1 - (found**2).sum() / (now**2).sum()
-        knots, now, damping = tried, found, damping / 5
-        if gained < 1e-3:
+        gain = 1 - (new**2).sum() / (current**2).sum()
+        knots, current, damping = trial, new, damping / 5
+        if gain < 1e-3:
             break
     return knots
 
 
-def _jacobian(travel: Array, weight: Array, knots: Array, values: Array) -> Array:
-    """(m, 2 (n - 2)) change of weighted values with travel and cross of every inner knot, by differences.
+def _jacobian(along: Array, weight: Array, knots: Array, values: Array) -> Array:
+    """Compute the Jacobian (m, 2 (n - 2)) of weighted values by along and across of each inner knot, by differences.
 
-    Knots so far apart that no span moves with two of them are tried at once.
+    Knots so far apart that no span depends on two of them are perturbed at once.
     """
     count = len(knots)
-    out = np.zeros((len(travel), count - 2, 2))
-    span = np.clip(np.searchsorted(knots[:, 0], travel, side="right") - 1, 0, count - 2)
+    out = np.zeros((len(along), count - 2, 2))
+    span = np.clip(np.searchsorted(knots[:, 0], along, side="right") - 1, 0, count - 2)
     step = 1e-4 * np.diff(knots[:, 0]).min()
-    for first in range(1, min(_REACH + 1, count - 1)):
-        group = np.arange(first, count - 1, _REACH)
-        owner = (span + 2 - first) // _REACH  # of its spans, from two before to one behind
-        owned = (owner >= 0) & (owner < len(group))
-        rows = np.flatnonzero(owned)
+    for first in range(1, min(_SUPPORT + 1, count - 1)):
+        group = np.arange(first, count - 1, _SUPPORT)
+        owner = (span + 2 - first) // _SUPPORT  # a knot owns the spans from two before to one behind it
+        is_owned = (owner >= 0) & (owner < len(group))
+        rows = np.flatnonzero(is_owned)
         for axis in (0, 1):
-            tried = knots.copy()
-            tried[group, axis] += step
-            change = (_values(tried, travel) * weight - values) / step
+            trial = knots.copy()
+            trial[group, axis] += step
+            change = (_evaluate(trial, along) * weight - values) / step
             out[rows, group[owner[rows]] - 1, axis] = change[rows]
-    return out.reshape(len(travel), -1)
+    return out.reshape(len(along), -1)
 
 
-def _thinned(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:
-    """Without knots that the others can do without."""
+def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:
+    """Remove knots that the others do not need."""
     while len(knots) > 2:
         fewer = [np.delete(knots, k, axis=0) for k in range(1, len(knots) - 1)]
-        fewer.sort(key=lambda each: _missed(samples, weight, each).max())
-        for tried in fewer[:_LEFT_OUT]:
-            polished = _polished(samples, weight, tried)
-            if _missed(samples, weight, polished).max() <= tolerance:
-                knots = polished
+        fewer.sort(key=lambda trial: _misfit(samples, weight, trial).max())
+        for trial in fewer[:_MAX_CANDIDATES]:
+            optimised = _optimise(samples, weight, trial)
+            if _misfit(samples, weight, optimised).max() <= tolerance:
+                knots = optimised
                 break
         else:
             break

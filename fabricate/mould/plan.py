@@ -176,7 +176,7 @@ class Plan:
     @property
     def clash_places_mm(self) -> Array:
         """(n, 2) where the clashes are."""
-        return self.pad.to_mm(np.array([c.place for c in self.clashes]).reshape(-1, 2))
+        return self.pad.to_mm(np.array([c.position for c in self.clashes]).reshape(-1, 2))
 
     @cached_property
     def common_tracks(self) -> list[CommonTrack]:

@@ -219,7 +219,7 @@ class LaidPad:
     def _placed(self, places_mm: Array) -> tuple[Array, Array]:
         """Places (Q, 2) in grid units of the plan, and their derivatives (Q, 2, 4) by turn, shift and scale."""
         frame, unit_mm = self.frame, self.plan.unit_mm
-        turned = frame.turned(places_mm)
+        turned = frame.rotate(places_mm)
         by = np.zeros((len(places_mm), 2, 4))
         by[:, 0, 0], by[:, 1, 0] = -frame.scale * turned[:, 1], frame.scale * turned[:, 0]
         by[:, 0, 1] = by[:, 1, 2] = 1

@@ -128,7 +128,7 @@ def wirings(
 
 def _off_middle(middle: Array, lying: PlanTransform, plan: Plan) -> Array:
     """The middle of what was pressed, as a shift that is undone where it lies far off the pad's own middle."""
-    turned = lying.turned(middle[None])[0]
+    turned = lying.rotate(middle[None])[0]
     return turned if np.abs(turned).max() > plan.unit_mm else np.zeros(2)
 
 

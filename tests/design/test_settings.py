@@ -15,7 +15,7 @@ from tests.helpers.limits import require_ends
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 
 
-def test_the_written_defaults_read_back_as_the_defaults_and_overrides_win():
+def test_written_defaults_read_back_and_overrides_win():
     text = commented_toml(MODELS)
     spec = Spec(tomllib.loads(text))
     for model in MODELS.values():
@@ -81,7 +81,7 @@ def test_refusals_name_the_key_the_value_and_what_is_allowed(model, table, messa
 
 
 @pytest.mark.parametrize("other", [None, 3, "a", int, np.ones((2, 2)), [1], {1: 2}])
-def test_what_is_no_section_and_no_table_is_refused(other):
+def test_spec_refuses_other_models_and_tables(other):
     for ask in (Spec({}).section, Spec({}).stated):
         with pytest.raises(InputError, match=r"model is .*, expected a section"):
             ask(other)
@@ -104,7 +104,7 @@ def test_what_is_no_section_and_no_table_is_refused(other):
     ],
     ids=range(5),
 )
-def test_files_that_are_no_toml_are_refused(tmp_path, content, message):
+def test_load_refuses_files_that_are_no_toml(tmp_path, content, message):
     path = tmp_path / "pad.toml"
     if content is not None:
         path.write_bytes(content)
@@ -171,7 +171,7 @@ def test_a_rectangle_is_what_was_stated_and_its_middle_is_pressed():
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
 
 
-def test_a_contact_given_by_its_shape_is_of_the_published_kind_and_has_no_profile():
+def test_contact_stated_by_its_shape_has_no_profile():
     """As it was before contacts were measured, and where it is written out, whatever it is, it reads back so."""
     ways = (
         ({}, MEASURED_PROFILE, "euclidean"),
@@ -203,7 +203,7 @@ def test_a_contact_given_by_its_shape_is_of_the_published_kind_and_has_no_profil
         )
 
 
-def test_the_measured_profile_is_about_a_gaussian_and_one_with_a_skirt_below_0_is_a_contact():
+def test_measured_profile_is_a_gaussian_and_negative_skirts_are_valid():
     distance = [d for d, _ in Contact().profile_points(11.25)]
     assert distance == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.65]  # to the bit
     assert [d for d, _ in Contact().profile_points(5.0)] == [d / 5 for d, _ in MEASURED_PROFILE]
@@ -241,7 +241,7 @@ HOLE = [[0, 0], [4, 0], [0, 4]]
         (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
     ],
 )
-def test_numbers_of_numpy_are_numbers(model, given, plain):
+def test_settings_accept_numpy_numbers(model, given, plain):
     assert model(**given) == Spec({}).section(model, **given) == model(**plain)
     assert model(**given).model_dump_json() == model(**plain).model_dump_json()
 

@@ -51,7 +51,7 @@ def design_kernels() -> None:
         signals_sparse,
     )
     from padforge.design.objectives.ambiguity import ambiguity_map
-    from padforge.design.objectives.published import disorder, disorder_area
+    from padforge.design.objectives.published import disorder_area
     from padforge.design.settings import PUBLISHED_CONTACT
     from padforge.fabricate import build, check_mesh
 
@@ -65,7 +65,6 @@ def design_kernels() -> None:
         signals_sparse(pad, presses, contact)
     signals_quantized(pad, presses)
     published_objective(pad)
-    disorder(pad.knots)
     disorder_area(pad)
     ambiguity_map(pad, presses, Contact(), 1, 0.1)
     indented_signals(pad, presses, 0.1, Indenter())

@@ -38,6 +38,8 @@ def sound() -> dict[str, Any]:
         "presses": np.array([[1.0, 1.0], [1.5, 2.0]]),
         "places": np.array([[1.0, 2.0]]),
         "places_mm": np.array([[1.0, 2.0]]),
+        "positions": np.array([[1.0, 2.0]]),
+        "positions_mm": np.array([[1.0, 2.0]]),
         "parameters": np.ones((3, 8)),
         "contact": design.Contact(),
         "rules": design.RulesSettings(enforce=False),

@@ -90,7 +90,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
         pair = crossing.first, crossing.second
         depths = [plan.depths_mm[plan.levels[fibre]] for fibre in pair]
         gap = abs(depths[0] - depths[1]) - plan.settings.fibre.material.diameter_mm
-        place = [round(x, 3) for x in plan.pad.to_mm(crossing.place).tolist()]
+        place = [round(x, 3) for x in plan.pad.to_mm(crossing.position).tolist()]
         table.append([*(fibre_name(plan, fibre) for fibre in pair), *place, *depths, round(gap, 3)])
     return {
         "total": len(table),

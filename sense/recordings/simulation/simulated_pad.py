@@ -96,7 +96,7 @@ def measured(twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
 
 def _sides_mm(twin: Twin) -> Array:
     """(2,) sides of what the arm pressed along its own axes: such that it spans `sensed_mm` along those of the plan."""
-    spans = np.abs(twin.frame.turned(np.eye(2))).T
+    spans = np.abs(twin.frame.rotate(np.eye(2))).T
     sides, *_ = np.linalg.lstsq(spans, np.array(twin.sensed_mm) / twin.frame.scale, rcond=LEAST_APART)
     return np.maximum(sides, 0)
 

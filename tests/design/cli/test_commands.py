@@ -51,6 +51,7 @@ def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
     result = load_result(Path("out/pad"))
     assert result is not None
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
+    assert document["descriptions"].keys() == document["terms"].keys()
     assert document["candidate"] == result.candidate == "straight fibres"
     assert summary_lines(result, Path("out/pad"))[1:] == printed[1:]
     first, second = straight_mm[:2]
@@ -108,7 +109,7 @@ def test_design_for_twin_uses_its_contact(here, twin):
     _, document = designed("--twin", twin, spec=QUICK_SEARCH)
     used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
     assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
-    assert document["candidate"] in ("twin", "from usual", "usual", "straight fibres")
+    assert document["candidate"] in ("twin", "from default", "default", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
     assert document["terms"] == pytest.approx(evaluate(pad, contact, used["search"]["noise"]), rel=1e-9)

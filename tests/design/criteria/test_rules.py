@@ -244,7 +244,7 @@ def test_tracks_that_lie_along_each_other_without_crossing_are_found():
     (found,) = check_rules(pad, only(max_common_track_mm=2.0))
     assert found.measured > 5
     place = np.array(found.place_mm)
-    assert min(np.hypot(*(pad.to_mm(c.place) - place)) for c in crossings(pad)) > found.measured / 2
+    assert min(np.hypot(*(pad.to_mm(c.position) - place)) for c in crossings(pad)) > found.measured / 2
 
 
 def test_a_pair_of_tracks_is_named_once_by_the_longest_stretch_of_either():

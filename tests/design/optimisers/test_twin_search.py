@@ -10,7 +10,7 @@ from padforge.design.optimize.search import SearchOptions
 from padforge.design.optimize.twin_search import choose, search_for_twin
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
+PLAIN = {"default": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
 
 
 @pytest.mark.parametrize(
@@ -18,8 +18,8 @@ PLAIN = {"usual": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0
     [
         ([0.9, 0.9, 1.0, 1.5], "twin"),  # better everywhere
         ([0.92, 1.02, 1.0, 1.0], "twin"),  # within what networks tell
-        ([1.02, 0.5, 0.5, 0.5], "usual"),  # far better with fibres failed, but an eighth worse with all alive
-        ([2.0, 2.0, 2.0, 3.5], "usual"),
+        ([1.02, 0.5, 0.5, 0.5], "default"),  # far better with fibres failed, but an eighth worse with all alive
+        ([2.0, 2.0, 2.0, 3.5], "default"),
     ],
 )
 def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
@@ -27,7 +27,7 @@ def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
 
 
 def test_choose_takes_the_least_bad_where_each_is_worse_somewhere():
-    errors = {"usual": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
+    errors = {"default": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
     assert choose(errors) == "twin"
 
 
@@ -41,7 +41,7 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
     monkeypatch.setattr("padforge.design.optimize.gradient.REPAIR_STEPS", 20)
 
     def judged(pads, contacts, size, scatter, seed, subsets):
-        assert set(pads) == ({"usual", "straight fibres", "twin", "from usual"} if expected != "twin" else {"twin"})
+        assert set(pads) == ({"default", "straight fibres", "twin", "from default"} if expected != "twin" else {"twin"})
         for name in pads:
             errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)
             yield ContactErrors("", name, errors)
@@ -57,4 +57,4 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
     if expected == "straight fibres":
         assert found.morphology == Morphology.straight(pad.layout)
         assert found.terms["expected_error_mm_0"] == pytest.approx(found.straight["expected_error_mm_0"], rel=1e-6)
-    assert {name.split(",")[0] for name in steps} == {"usual", "twin", "from usual"}
+    assert {name.split(",")[0] for name in steps} == {"default", "twin", "from default"}

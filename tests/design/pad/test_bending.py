@@ -32,7 +32,7 @@ def dense(pad, fibre, per_span=2000):
     return np.column_stack([at, curve(at)]), np.arctan(curve.derivative()(at))
 
 
-def test_bends_of_arcs_corners_and_lines_have_closed_forms():
+def test_bend_radius_matches_closed_forms():
     for radius, window, arc in ((0.5, 0.25, 1.5), (10.0, 5.0, 1.5), (5.0, 100.0, 0.2)):  # the last is shorter than that
         angle = np.linspace(0, arc, 300)
         points = radius * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -50,7 +50,7 @@ def test_bends_of_arcs_corners_and_lines_have_closed_forms():
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 2)), min_size=1, max_size=20), st.integers(1, 12))
 @settings(max_examples=25)
-def test_windows_count_the_corners_at_both_their_ends(steps, quarters):
+def test_bend_radius_includes_corners_at_window_ends(steps, quarters):
     """On quarter steps, whose lengths add without rounding, corners lie exactly a window apart again and again."""
     lengths, ways = np.array(steps).T
     corners = np.vstack([np.zeros(2), np.cumsum(AXES[ways] * lengths[:, None] / 4, axis=0)])
@@ -65,7 +65,7 @@ def test_windows_count_the_corners_at_both_their_ends(steps, quarters):
 
 @given(SEEDS, st.integers(1, 20), st.sampled_from([0.05, 0.3, 2.0]))
 @settings(max_examples=12)
-def test_the_bend_radius_is_that_of_every_window_tried(seed, knots, window):
+def test_bend_radius_matches_exhaustive_windows(seed, knots, window):
     pad = Morphology.random(2, knots, seed)
     points, headings = dense(pad, fibre=1)
     arc = arc_of(points)
@@ -78,7 +78,7 @@ def test_the_bend_radius_is_that_of_every_window_tried(seed, knots, window):
 
 @given(SEEDS, st.integers(0, 20), st.sampled_from([0.5, 0.02]))
 @settings(max_examples=25)
-def test_traced_points_lie_on_the_curve_with_its_headings(seed, knots, step):
+def test_trace_curve_returns_points_and_headings_of_the_curve(seed, knots, step):
     pad = Morphology.random(1, knots, seed)
     for fibre, axis in ((0, 0), (1, 1)):
         assume(np.diff(pad.knots[fibre, :, axis]).min() > 1e-3)  # closer ones cost the oracle its own digits
@@ -92,7 +92,7 @@ def test_traced_points_lie_on_the_curve_with_its_headings(seed, knots, step):
 
 @given(wild_pads((1, 2), (0, 8)), st.sampled_from([1e-9, 0.05, 100.0]), st.sampled_from([1e-6, 0.1, 3.0]))
 @settings(max_examples=15)
-def test_bends_and_folds_of_wild_curves_are_numbers_and_steps_are_corners(pad, limit, gap):
+def test_bend_radius_and_fold_gap_are_finite_on_wild_curves(pad, limit, gap):
     for fibre in range(2 * pad.grid):
         points, headings = traced(pad, fibre, 0.01)
         assert np.abs(np.diff(headings)).max() <= 0.01
@@ -120,7 +120,7 @@ def folds_tried(line, gap, step):
 
 @given(SEEDS, st.integers(1, 12), st.sampled_from([0.1, 0.4]))
 @settings(max_examples=10)
-def test_the_fold_gap_is_that_of_all_points_tried(seed, knots, gap):
+def test_fold_gap_matches_exhaustive_pairs(seed, knots, gap):
     pad = Morphology.random(1, knots, seed)
     line = flatten(pad, 1e-3)[0]
     found, tried = fold_gap(line, gap), folds_tried(line, gap, gap / 20)
@@ -128,7 +128,7 @@ def test_the_fold_gap_is_that_of_all_points_tried(seed, knots, gap):
     assert least - 1e-9 <= tried <= most
 
 
-def test_u_turns_and_corners_are_as_narrow_as_their_openings():
+def test_fold_gap_of_u_turns_and_corners_is_their_opening():
     angle = np.linspace(np.pi, 0, 500)
     turn = 0.25 * np.column_stack([np.cos(angle), np.sin(angle)])
     line = np.vstack([[-0.25, -5], turn, [0.25, -5]])

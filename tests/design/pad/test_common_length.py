@@ -10,7 +10,7 @@ from padforge.design.paths.curves import common_stretches, flatten
 LEVEL = np.array([[-9.0, 0.0], [9.0, 0.0]])
 
 
-def test_each_pair_and_each_place_has_its_stretch_also_beside_a_line_and_past_its_end():
+def test_common_stretches_are_separate_by_pair_and_position():
     """A line that crosses two others twice each, with a vertex given twice and a segment too long for one box."""
     rungs = [np.array([[x, -9.0], [x, 9.0]]) for x in (-3.0, 3.0)]
     turning = np.array([[-6.0, -1.0], [6, -1], [6, -1], [6, 1], [-6, 1]])
@@ -27,7 +27,7 @@ def test_each_pair_and_each_place_has_its_stretch_also_beside_a_line_and_past_it
 
 
 @pytest.mark.parametrize(("knots", "seed"), [(3, 0), (9, 1), (21, 2)])
-def test_tangled_fibres_against_buffers(knots, seed):
+def test_common_stretches_of_tangled_fibres_match_buffers(knots, seed):
     pad = Morphology.random(3, knots, seed)
     lines = [pad.to_mm(line) for line in flatten(pad, 1e-4)]
     shared = common_stretches(lines[:3], lines[3:], 0.4)

@@ -23,7 +23,7 @@ def scipy_curve(pad, fibre):
 
 @given(pads)
 @settings(max_examples=15)
-def test_slopes_samples_and_bezier_spans_are_scipys(pad):
+def test_slopes_samples_and_beziers_match_scipy(pad):
     at = np.linspace(0, pad.grid + 1, 200)
     compiled = sample_curves(pad.knots[None], pad.layout.horizontals, 200)[0]
     axes = [0] * pad.grid + [1] * pad.grid
@@ -53,7 +53,7 @@ def test_torch_gradients_pass_the_finite_difference_test():
 
 @given(pads, st.sampled_from([1e-2, 1e-3, 1e-4]))
 @settings(max_examples=15)
-def test_flattened_fibres_stay_within_the_tolerance(pad, tolerance):
+def test_flatten_keeps_the_tolerance(pad, tolerance):
     """Each point of a finer line is as near as that to the chord it lies beside."""
     for fibre, (coarse, fine) in enumerate(zip(flatten(pad, tolerance), flatten(pad, tolerance / 100), strict=True)):
         axis = 0 if fibre < pad.grid else 1
@@ -65,7 +65,7 @@ def test_flattened_fibres_stay_within_the_tolerance(pad, tolerance):
 
 @given(wild_pads((1, 3), (0, 12)))
 @settings(max_examples=20)
-def test_wild_curves_keep_to_their_knots_and_every_horizontal_crosses_every_vertical(pad):
+def test_wild_curves_are_monotone_between_knots_and_families_cross(pad):
     assert np.isfinite(beziers(pad)).all()
     assert np.isfinite(slope_beziers(pad)).all()
     for fibre, (knots, d) in enumerate(zip(pad.knots, slopes(pad), strict=True)):
@@ -79,13 +79,13 @@ def test_wild_curves_keep_to_their_knots_and_every_horizontal_crosses_every_vert
     across = [c for c in found if c.first < pad.grid <= c.second]
     grid = range(pad.grid)
     assert {(c.first, c.second) for c in across} == {(h, pad.grid + v) for h in grid for v in grid}
-    places, angles = np.array([c.place for c in found]), crossing_angles(pad, across)
+    places, angles = np.array([c.position for c in found]), crossing_angles(pad, across)
     assert ((places >= -1e-9) & (places <= pad.grid + 1 + 1e-9)).all()
     assert ((angles >= 0) & (angles <= 90)).all()
     assert crossings(pad, across=False) == [c for c in found if c not in across]
 
 
-def test_lengths_and_crossings_of_straight_bent_and_touching_fibres():
+def test_lengths_and_crossings_match_closed_forms():
     """Each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2); and one beside it."""
     np.testing.assert_allclose(lengths(Morphology.straight(3)), 4)
     pad = Morphology.random(4, 5, seed=3)
@@ -93,27 +93,29 @@ def test_lengths_and_crossings_of_straight_bent_and_touching_fibres():
     np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
     found = crossings(Morphology.straight(3))
     assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
-    np.testing.assert_allclose([c.place for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12)
+    np.testing.assert_allclose(
+        [c.position for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12
+    )
     fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
     pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
     found = crossings(pad)
-    np.testing.assert_allclose([c.place for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
+    np.testing.assert_allclose([c.position for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
     np.testing.assert_allclose(crossing_angles(pad, found), [90, 0, 90])
     bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
     pad = Morphology(np.stack([fibre, bow]))
     found = crossings(pad)
-    touch = [np.allclose(c.place, 1) for c in found]
+    touch = [np.allclose(c.position, 1) for c in found]
     assert sum(touch) == 1
     assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
 
 
 @given(pads)
 @settings(max_examples=12)
-def test_angles_are_those_of_scipys_tangents(pad):
+def test_crossing_angles_match_scipy_tangents(pad):
     across = [c for c in crossings(pad) if c.first < pad.grid <= c.second]
     slope = [scipy_curve(pad, fibre).derivative() for fibre in range(2 * pad.grid)]
     for c, angle in zip(across, crossing_angles(pad, across), strict=True):
-        rise, run = slope[c.first](c.place[0]), slope[c.second](c.place[1])
+        rise, run = slope[c.first](c.position[0]), slope[c.second](c.position[1])
         between = np.degrees(np.arctan(rise) + np.arctan(run) - np.pi / 2) % 180
         assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
 

@@ -59,7 +59,7 @@ def apart(one: Morphology, other: Morphology) -> float:
     return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
 
 
-def test_curves_become_fibres_whose_ends_are_put_right_within_the_tolerance(tmp_path: Path) -> None:
+def test_import_moves_ends_within_the_tolerance(tmp_path: Path) -> None:
     plain = import_plan(svg(tmp_path, PATHS), LAYOUT, 0.05).pad
     assert plain.to_mm(flatten(plain, 1e-4)[1])[0] == pytest.approx([-20, 6])  # y of an SVG goes down
     t = np.linspace(0, 1, 200)[:, None]
@@ -69,7 +69,7 @@ def test_curves_become_fibres_whose_ends_are_put_right_within_the_tolerance(tmp_
     assert shapely.distance(shapely.points(drawn), upper).max() < 0.06
     ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
     found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
-    assert found.fibres[1].moved_mm == pytest.approx(0.03)
+    assert found.fibres[1].end_shift_mm == pytest.approx(0.03)
     with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
         import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
     assert "--tolerance-mm" in str(told.value)
@@ -95,18 +95,20 @@ def test_curves_become_fibres_whose_ends_are_put_right_within_the_tolerance(tmp_
         (f'{PATHS}<path style="display: none" d="M0 0L1 1"/>', HEAD),
     ],
 )
-def test_it_is_read_as_it_is_drawn(tmp_path: Path, plain: Morphology, drawn: str, head: str) -> None:
+def test_import_follows_units_transforms_and_visibility(
+    tmp_path: Path, plain: Morphology, drawn: str, head: str
+) -> None:
     assert apart(import_plan(svg(tmp_path, drawn, head=head), LAYOUT, 0.4).pad, plain) < 0.02
 
 
-def test_pieces_are_put_together_and_what_another_file_would_have_to_declare_draws_nothing(tmp_path: Path) -> None:
+def test_import_joins_pieces_and_ignores_external_entities(tmp_path: Path) -> None:
     parts = [
         '<polyline points="-20,-6 -5,-8"/><line x1="5" y1="-4" x2="-5" y2="-8"/><path d="M5-4 20-6"/>',
         '<line x1="-20" y1="6" x2="20" y2="6"/>',
         *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
     ]
     found = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
-    assert found.fibres[1].off_mm < 0.05
+    assert found.fibres[1].max_error_mm < 0.05
     assert "to" in found.fibres[1].name
     path = svg(tmp_path, f"&a;{PATHS[:-2]}/>&b;")
     path.write_text('<!DOCTYPE svg SYSTEM "svg11.dtd">' + path.read_text())
@@ -150,7 +152,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("drawn", "message"), REFUSED, ids=range(len(REFUSED)))
-def test_what_is_no_plan_is_refused_in_one_line_and_soon(tmp_path: Path, drawn: str, message: str) -> None:
+def test_import_refuses_other_drawings_in_one_line_and_quickly(tmp_path: Path, drawn: str, message: str) -> None:
     begin = time.process_time()
     with pytest.raises(InputError, match=message) as refused:
         import_plan(svg(tmp_path, drawn), LAYOUT, 0.05)
@@ -173,7 +175,7 @@ FETCH = """<?xml version="1.0"?><!DOCTYPE svg SYSTEM "http://127.0.0.1:1/x.dtd" 
     ],
     ids=lambda content: repr(content[:20]),
 )
-def test_hostile_files_are_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_import_refuses_hostile_files_in_one_line(tmp_path: Path, content: bytes) -> None:
     for name in ("plan.svg", "plan.dxf"):
         path = tmp_path / name
         path.write_bytes(content)
@@ -194,7 +196,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @given(st.sampled_from(["damaged.svg", "damaged.dxf"]), damages)
 @settings(max_examples=20)
-def test_a_damaged_drawing_is_read_or_refused_in_one_line(drawn, tmp_path_factory, name, damage) -> None:
+def test_import_reads_or_refuses_damaged_drawings(drawn, tmp_path_factory, name, damage) -> None:
     layout, path = Layout.create(1), tmp_path_factory.getbasetemp() / name
     found = read_damaged(path, drawn[name], damage, lambda path: import_plan(path, layout, 0.5))
     assert found is None or np.isfinite(found.pad.knots).all()
@@ -230,9 +232,9 @@ def several(space) -> None:
         (lambda space: space.add_spline([(-20, -6), (0, -9), (20, -6)]), -9.0),
     ],
 )
-def test_a_dxf_of_all_kinds_is_read(tmp_path: Path, draw, middle_mm: float) -> None:
+def test_import_reads_all_kinds_of_dxf_entities(tmp_path: Path, draw, middle_mm: float) -> None:
     found = import_plan(dxf(tmp_path, lambda space: (straight_ones(space), draw(space))), LAYOUT, 0.05)
-    assert all(fibre.off_mm < 0.06 for fibre in found.fibres)
+    assert all(fibre.max_error_mm < 0.06 for fibre in found.fibres)
     line = found.pad.to_mm(flatten(found.pad, 1e-4)[0])
     assert np.interp(0, *line.T) == pytest.approx(middle_mm, abs=0.1)
 
@@ -250,7 +252,7 @@ def test_a_dxf_of_all_kinds_is_read(tmp_path: Path, draw, middle_mm: float) -> N
         lambda space: space.doc.header.__setitem__("$INSUNITS", 99),
     ],
 )
-def test_hostile_dxf_is_told_in_one_line(tmp_path: Path, draw) -> None:
+def test_import_refuses_hostile_dxf_in_one_line(tmp_path: Path, draw) -> None:
     begin = time.process_time()
     with pytest.raises(InputError) as refused:
         import_plan(dxf(tmp_path, draw), LAYOUT, 0.05)
@@ -258,7 +260,7 @@ def test_hostile_dxf_is_told_in_one_line(tmp_path: Path, draw) -> None:
     assert time.process_time() - begin < 10
 
 
-def test_our_own_plan_comes_back(tmp_path: Path) -> None:
+def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     courses = Morphology.random(LAYOUT, 4, rng).knots.copy()
     for fibre, line in enumerate(courses):  # not as steep as random ones are
@@ -270,10 +272,10 @@ def test_our_own_plan_comes_back(tmp_path: Path) -> None:
     found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
     assert apart(found.pad, pad) < 0.08
     assert found.pad.knots.shape[1] <= 6 + 3
-    assert found.placed == "the border is that named pad"
+    assert found.placement == "the border is that named pad"
 
 
-def test_the_command_writes_a_morphology_and_tells_of_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     stated = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_bend_radius_mm = 0\n"
     Path("pad.toml").write_text(stated)

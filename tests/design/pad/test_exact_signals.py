@@ -85,7 +85,7 @@ def test_exact_signals_equal_the_oracle(weight, length, sides):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=4e-12 if plain else 1e-10)
 
 
-def test_exact_signals_of_published_pads_are_the_limit_of_the_sampled_ones(published):
+def test_exact_signals_are_the_limit_of_sampled_ones(published):
     presses = np.random.default_rng(0).uniform(0.5, 4.5, (4, 2))
     for name in ("1para", "20para"):
         pad = Morphology.load(published / f"{name}.mat")
@@ -96,7 +96,7 @@ def test_exact_signals_of_published_pads_are_the_limit_of_the_sampled_ones(publi
 
 @given(wild.wild_pads((1, 4), (0, 10)), wild.wild_contacts, wild.SEEDS)
 @settings(max_examples=30)
-def test_signals_on_wild_pads_lie_between_nothing_and_the_whole_fibre(pad, contact, seed):
+def test_signals_on_wild_pads_are_within_0_and_the_fibre_length(pad, contact, seed):
     found = signals(pad, wild.wild_presses(pad, seed), contact)
     weights = {"uniform": 1.0, "inverse_square": 1 / contact.radius, "inverse": 100 / contact.radius}
     assert (found >= 0).all()
@@ -114,7 +114,7 @@ def test_signals_on_wild_pads_lie_between_nothing_and_the_whole_fibre(pad, conta
     wild.SEEDS,
 )
 @settings(max_examples=25)
-def test_signals_follow_the_pad_and_the_press_into_the_mirror(pad, contact, seed):
+def test_signals_are_invariant_under_reflection(pad, contact, seed):
     assume(pad.knots.shape[1] == 2 or np.diff(fibre_axes(pad)[0]).min() > 1e-5)  # steps move by rounding in a mirror
     grid, presses = pad.grid, np.random.default_rng(seed).uniform(-0.5, pad.grid + 1.5, (6, 2))
     found = signals(pad, presses, contact)
@@ -130,7 +130,7 @@ def test_signals_follow_the_pad_and_the_press_into_the_mirror(pad, contact, seed
     st.sampled_from(wild.KINDS), st.integers(1, 3), st.integers(0, 6), st.integers(0, 2), wild.wild_contacts, wild.SEEDS
 )
 @settings(max_examples=25)
-def test_presses_pads_and_forms_are_each_as_they_are_alone(kind, grid, count, population, contact, seed):
+def test_signals_do_not_depend_on_batching_or_sparsity(kind, grid, count, population, contact, seed):
     """Presses at once add up; order, other pads beside it, the layout in memory and sparseness change no bit."""
     rng = np.random.default_rng(seed)
     pads = [Morphology(wild.wild_knots(kind, grid, count, rng)) for _ in range(population)]
@@ -149,7 +149,7 @@ def test_presses_pads_and_forms_are_each_as_they_are_alone(kind, grid, count, po
 
 @pytest.mark.parametrize("radius", [1e-9, 1e-6, 1e-3, 0.4])
 @pytest.mark.parametrize("sides", [None, 4, 30])
-def test_a_press_centred_on_a_straight_fibre_signals_its_diameter_at_every_size(radius, sides):
+def test_signal_of_a_centred_press_is_its_diameter_at_every_size(radius, sides):
     """A 30-gon has vertices left and right, but edges at top and bottom."""
     found = signals(Morphology.straight(3), [[2, 2]], Contact(radius=radius, sides=sides))
     upright = np.cos(np.pi / 30) if sides == 30 else 1
@@ -178,13 +178,13 @@ def test_inverse_weights_on_a_straight_fibre_have_closed_forms():
         (3, (1.3 + 1e-9, 1.0), 2, 0.0),
     ],
 )
-def test_a_straight_fibre_at_a_corner_or_along_an_edge(sides, press, fibre, expected):
+def test_signals_at_corners_and_along_edges(sides, press, fibre, expected):
     found = signals(Morphology.straight(2), [press], Contact(radius=0.6, sides=sides))[0, fibre]
     assert found == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5, 6, 8, 12, 30])
-def test_a_fibre_on_an_edge_counts_whole_whichever_way_rounding_goes(sides):
+def test_signal_along_an_edge_is_robust_to_rounding(sides):
     normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     for radius in np.random.default_rng(sides).uniform(0.1, 1, 50):
         apothem, edge = radius * np.cos(np.pi / sides), 2 * radius * np.sin(np.pi / sides)
@@ -197,7 +197,7 @@ def test_a_fibre_on_an_edge_counts_whole_whichever_way_rounding_goes(sides):
 
 @pytest.mark.parametrize("radius", [1e-9, 0.25, 0.4, 1.0])
 @pytest.mark.parametrize("weight", wild.WEIGHTS)
-def test_a_circle_that_only_touches_a_fibre_adds_nothing(radius, weight):
+def test_signal_of_a_tangent_circle_is_0(radius, weight):
     """From both sides, and exactly at the radius, where the crossing is a double root."""
     contact = Contact(radius=radius, sides=None, weight=weight)
     presses = [[1.5, 1 + radius + nudge] for nudge in (0.0, 1e-15, -1e-15)]
@@ -205,7 +205,7 @@ def test_a_circle_that_only_touches_a_fibre_adds_nothing(radius, weight):
 
 
 @pytest.mark.parametrize("gap", [1e-12, 1e-9, 1e-6])
-def test_knots_that_nearly_coincide_make_a_step_and_nothing_else(gap):
+def test_signals_of_nearly_coincident_knots_are_those_of_a_step(gap):
     """A rise of 1 within `gap`, slope up to 1e12: the Manhattan signal is run plus rise."""
     inner = np.array([[[1.0, 0.5], [1.0 + gap, 1.5]], [[1.0, 0.5], [1.0, 1.5]]])
     pad = Morphology(assemble_knots(inner))
@@ -219,7 +219,7 @@ def test_knots_that_nearly_coincide_make_a_step_and_nothing_else(gap):
                 assert found[:, 0] == pytest.approx(2 + 0.5 + 1 + 0.5, rel=1e-9)
 
 
-def test_a_weight_that_rounding_blurs_is_summed_in_time():
+def test_quadrature_ends_where_rounding_dominates():
     """On a span all but vertical a small press is known to some digits only; halving it would go on for ever."""
     steep = np.empty((6, 7, 2))
     steep[:] = Morphology.straight(3).knots[:, :1]
@@ -233,7 +233,7 @@ def test_a_weight_that_rounding_blurs_is_summed_in_time():
     assert ((found[:, 3] > 1) & (found[:, 3] < 100)).all()
 
 
-def test_fibres_are_followed_out_of_the_pad_and_many_presses_on_many_threads():
+def test_signals_beyond_the_pad_and_on_many_threads():
     out = np.insert(Morphology.straight(2).knots, 1, [[1.5, 50], [1.5, -50], [50, 1.5], [-50, 1.5]], axis=1)
     found = signals(out, [[1.0, 40], [1, 1], [-30, 0.6]], Contact(sides=None))
     assert found[0, 0] > 1
@@ -244,7 +244,7 @@ def test_fibres_are_followed_out_of_the_pad_and_many_presses_on_many_threads():
         np.testing.assert_array_equal(whole[part], signals(pad, presses[part], PUBLISHED_CONTACT))
 
 
-def test_work_follows_what_is_touched():
+def test_visited_spans_follow_what_is_touched():
     """Counters, not clocks: spans looked at per press do not grow with the pad, and shrink with the press."""
     rng = np.random.default_rng(0)
     counts = {}
@@ -261,7 +261,7 @@ def test_work_follows_what_is_touched():
     np.testing.assert_array_equal(found.toarray(), signals(pad, presses))
 
 
-def test_odd_but_fair_input_is_taken_as_it_is():
+def test_signals_accept_unusual_valid_input():
     pad = Morphology.random(2, 3, seed=0)
     presses = np.array([[1, 2], [2, 1]])
     expected = signals(pad, presses.astype(float))
@@ -275,7 +275,7 @@ def test_odd_but_fair_input_is_taken_as_it_is():
         assert (none.shape, none.any()) == ((5, 4), False)
 
 
-def test_presses_that_are_no_positions_and_knots_that_are_no_pad_are_refused():
+def test_signals_refuse_invalid_presses_and_knots():
     for presses in ([[np.nan, 1]], [[np.inf, 1]], [1, 2, 3], [[1, 2, 3]]):
         for function in (signals, signals_quantized, signals_sparse):
             with pytest.raises(InputError, match="presses"):

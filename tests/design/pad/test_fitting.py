@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
-from padforge.design.paths.fitting import HAIR, add_spare_knots, fit_knots, remove_spare_knots
+from padforge.design.paths.fitting import SPARE_LENGTH, add_spare_knots, fit_knots, remove_spare_knots
 
 
 def off(knots, points):
@@ -17,7 +17,7 @@ def off(knots, points):
     return (np.abs(curve(points[:, 0]) - points[:, 1]) / np.hypot(1, slope)).max()
 
 
-def test_straight_curves_waves_and_steps_need_few_knots():
+def test_fit_knots_needs_few_knots():
     points = np.stack([np.linspace(-20, 20, 50), np.full(50, 3.0)], axis=1)
     assert np.array_equal(fit_knots(points, 0.05), points[[0, -1]])
     assert len(fit_knots(points[[0, -1]], 0.05)) == 2
@@ -27,7 +27,7 @@ def test_straight_curves_waves_and_steps_need_few_knots():
     assert off(found, points) < 0.06
     assert len(found) < 40
     assert len(fit_knots(points, 0.5)) < len(found)
-    assert len(fit_knots(points, 1e-6, most=12)) == 14
+    assert len(fit_knots(points, 1e-6, max_inner=12)) == 14
     assert (np.diff(found[:, 0]) > 0).all()
     assert np.array_equal(found[[0, -1]], points[[0, -1]])
     found = fit_knots(np.array([[0.0, 0], [10, 0], [10.001, 5], [20, 5]]), 0.05)
@@ -37,7 +37,7 @@ def test_straight_curves_waves_and_steps_need_few_knots():
 
 @given(st.lists(st.floats(-8, 8), min_size=1, max_size=8))
 @settings(max_examples=4)
-def test_a_pchip_curve_is_found_with_hardly_more_knots_than_it_has(heights):
+def test_fit_knots_recovers_pchip_curves(heights):
     t = np.linspace(-28, 28, len(heights) + 2)
     knots = np.stack([t, [1.0, *heights, 1.0]], axis=1)
     x = np.linspace(-28, 28, 1500)
@@ -61,19 +61,19 @@ def moved(course, count):
 
 @given(st.lists(st.integers(1, 29), min_size=5, max_size=12), st.integers(1, 40))
 @settings(max_examples=40)
-def test_a_course_that_turns_inside_stays_and_is_found_again(heights, count):
+def test_spare_knots_preserve_paths_that_turn_inside(heights, count):
     x = np.linspace(0, 3, len(heights) + 2)
     course = np.stack([x, [1, *(height / 10 for height in heights), 1]], axis=1)
     course[3, 1] = 2.95 if course[2, 1] < 2.9 and course[4, 1] < 2.9 else 0.05
     course[[2, 4], 1] = 1.5  # so it turns at its fourth knot
     off, found = moved(course, count)
-    assert off < 10 * HAIR
+    assert off < 10 * SPARE_LENGTH
     assert found == pytest.approx(course)
 
 
 @pytest.mark.parametrize("heights", [[], [1.0] * 3, [2.0], [0.5, 1.8], [1.2, 2.0], [1.8, 1.5, 1.2], [1.2, 1.5, 1.8]])
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
-def test_a_straight_course_stays_and_one_that_turns_next_to_its_ends_hardly_moves(heights, count):
+def test_spare_knots_preserve_straight_paths_and_nearly_turns_at_ends(heights, count):
     course = np.stack([np.linspace(0, 3, len(heights) + 2), [1.0, *heights, 1.0]], axis=1)
     off, found = moved(course, count)
     assert off < 0.02

@@ -81,7 +81,7 @@ def test_stiffness_is_twice_modulus_times_contact_radius(indenter, depth):
 
 @given(indenters, st.floats(0.01, 0.19), st.floats(0.02, 6))
 @settings(max_examples=30)
-def test_the_surface_is_that_of_flat_punches_pressed_one_after_another(indenter, depth, r):
+def test_deflection_is_a_superposition_of_flat_punches(indenter, depth, r):
     """Any contact grows as a flat punch of the present radius would be pressed on (Mossakovskii 1963)."""
     a, deflection = float(indenter.contact_radius(depth)), float(indenter.deflection(r, depth))
 
@@ -103,7 +103,7 @@ def test_the_surface_is_that_of_flat_punches_pressed_one_after_another(indenter,
 
 @given(indenters, st.integers(0, 6), st.floats(0.01, 0.19), SEEDS)
 @settings(max_examples=12)
-def test_signals_equal_adaptive_quadrature(indenter, knots, depth, seed):
+def test_indented_signals_match_adaptive_quadrature(indenter, knots, depth, seed):
     rng = np.random.default_rng(seed)
     pad = Morphology.random(2, knots, rng)
     presses = rng.uniform(0, 3, (1, 2))
@@ -114,7 +114,7 @@ def test_signals_equal_adaptive_quadrature(indenter, knots, depth, seed):
 
 @pytest.mark.parametrize("indenter", INDENTERS, ids=lambda indenter: indenter.shape)
 @pytest.mark.parametrize("miss", [0, 1e-12, 1e-6, -1e-6, -1e-12])
-def test_a_fibre_that_grazes_the_contact_has_a_neighbours_signal(indenter, miss):
+def test_indented_signals_are_continuous_at_grazing_fibres(indenter, miss):
     depth = 0.3
     a = float(indenter.contact_radius(depth))
     pad = Morphology.straight(2)
@@ -131,7 +131,7 @@ def test_a_fibre_that_grazes_the_contact_has_a_neighbours_signal(indenter, miss)
     SEEDS,
 )
 @settings(max_examples=25)
-def test_a_mirrored_pad_has_mirrored_signals_and_they_stay_finite_on_wild_pads(pad, shape, size, depth, seed):
+def test_indented_signals_are_invariant_under_reflection_and_finite(pad, shape, size, depth, seed):
     indenter, presses, grid = Indenter(shape, *size), wild_presses(pad, seed, 4), pad.grid
     depth = depth * min(indenter.radius, 1) if shape == "sphere" else depth
     found = indented_signals(pad, presses, depth, indenter)
@@ -146,7 +146,7 @@ def test_a_mirrored_pad_has_mirrored_signals_and_they_stay_finite_on_wild_pads(p
         np.testing.assert_allclose(flipped[:, order], found, rtol=1e-3, atol=1e-6 * max(depth, 1e-9))
 
 
-def test_any_number_of_presses_gives_the_same_signals_and_forces_are_newtons():
+def test_indented_signals_do_not_depend_on_batching():
     pad, rng = Morphology.random(4, 5, 0), np.random.default_rng(3)
     presses, depths = rng.uniform(0, 5, (120, 2)), rng.uniform(0.1, 0.45, 120)
     many = indented_signals(pad, presses, depths, INDENTERS[0])
@@ -172,14 +172,14 @@ def test_any_number_of_presses_gives_the_same_signals_and_forces_are_newtons():
         ({}, [0.1], r"depths have shape \(1,\), expected \(2,\)"),
     ],
 )
-def test_impossible_indenters_and_depths_are_refused(indenter, depths, message):
+def test_indenters_refuse_impossible_shapes_and_depths(indenter, depths, message):
     with pytest.raises(InputError, match=message):
         indented_signals(Morphology.straight(2), [[1, 1], [2, 2]], depths, Indenter(**indenter))
 
 
 @pytest.mark.parametrize("share", [1e-1, 1e-3, 1e-5])
 @pytest.mark.parametrize("shape", ["cone", "flat"])
-def test_a_fibre_close_to_a_tip_or_beside_an_edge_misses_nothing(shape, share):
+def test_indented_signals_resolve_tips_and_edges(shape, share):
     """Its slope turns round within a length that quadrature could step over."""
     depth, pad = 0.3, Morphology.straight(2)
     indenter = Indenter(shape, radius=0.45, angle_deg=50)

@@ -1,4 +1,4 @@
-"""Signals of a measured reach: exact ones against adaptive quadrature, and those that a search takes beside them."""
+"""Signals of a measured profile: exact ones against adaptive quadrature, and those that a search takes beside them."""
 
 import warnings
 from itertools import pairwise
@@ -20,7 +20,7 @@ from padforge.design.settings import DEFAULT_PITCH_MM, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
 
-REACHES = {
+PROFILES = {
     "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),
     "nearly a disc": ((0.0, 1.0), (0.3, 1.0), (0.55, 1.0), (0.6, 0.85), (0.65, 0.15), (0.7, 0.0), (0.9, 0.0)),
     "below 0": ((0.0, -0.3), (0.2, -0.5), (0.35, -0.35), (0.5, 0.1), (0.6, 0.2), (0.9, 0.0)),
@@ -29,9 +29,9 @@ REACHES = {
 """In grid units."""
 
 
-def contact_of(reach, length: Length = "euclidean"):
+def contact_of(profile, length: Length = "euclidean"):
     """The contact on pads of the default pitch."""
-    return Contact(sensitivity_profile=tuple((DEFAULT_PITCH_MM * d, w) for d, w in reach), length=length)
+    return Contact(sensitivity_profile=tuple((DEFAULT_PITCH_MM * d, w) for d, w in profile), length=length)
 
 
 def pads():
@@ -52,12 +52,12 @@ def searched(pad, presses, contact):
 
 
 def measured_oracle(pad, press, length, fibre):
-    """One signal under the broad reach: adaptive quadrature between the circles on which the spline's pieces meet."""
+    """One signal under the broad profile: adaptive quadrature between the circles on which the spline's pieces meet."""
     axis = 0 if fibre < pad.grid else 1
     knots = pad.knots[fibre]
     curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
     slope = curve.derivative()
-    distance, weight = np.array(REACHES["broad"]).T
+    distance, weight = np.array(PROFILES["broad"]).T
     spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
 
     def square(t):
@@ -80,10 +80,10 @@ def measured_oracle(pad, press, length, fibre):
 
 
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
-def test_signals_of_a_measured_reach_equal_the_oracle(length):
+def test_profile_signals_match_the_oracle(length):
     for knots in (0, 5):
         rng = np.random.default_rng(knots)
-        pad, contact = Morphology.random(2, knots, rng), contact_of(REACHES["broad"], length)
+        pad, contact = Morphology.random(2, knots, rng), contact_of(PROFILES["broad"], length)
         presses = rng.uniform(0, 3, (2, 2))
         found = signals(pad, presses, contact)
         with warnings.catch_warnings():
@@ -95,20 +95,22 @@ def test_signals_of_a_measured_reach_equal_the_oracle(length):
         np.testing.assert_allclose(sampled, found, atol=1e-3)
 
 
-def test_a_measured_reach_is_felt_and_has_a_gradient_only_up_to_its_end():
+def test_profile_signals_and_gradient_are_0_beyond_its_end():
     """Of a small pad, and of a large one pressed near one corner."""
-    contact = contact_of(REACHES["broad"])
+    contact = contact_of(PROFILES["broad"])
     found, looked_at = signals_and_spans(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
     assert looked_at == 4  # fibres 1 and 2 of both families
     assert not found[1].any()
     assert found[0, 0] == found[0, 4] > 0 > found[0, 1] == found[0, 5]
     assert not found[0, [2, 3, 6, 7]].any()
-    grid, reach, corner = 40, REACHES["broad"], np.array([[1.0, 1.0], [2.0, 1.5]])
+    grid, profile, corner = 40, PROFILES["broad"], np.array([[1.0, 1.0], [2.0, 1.5]])
     travel = torch.linspace(0, grid + 1, 42, dtype=torch.float64).repeat(2 * grid, 1)
     cross = torch.arange(1.0, grid + 1, dtype=torch.float64).repeat(2)[:, None].repeat(1, 42).requires_grad_()
     slope = torch.zeros_like(cross)
     layout = Layout.create(grid)
-    press_signals(travel, cross, slope, corner, contact_of(reach), fibre_ends(layout), layout.unit_mm).sum().backward()
+    press_signals(
+        travel, cross, slope, corner, contact_of(profile), fibre_ends(layout), layout.unit_mm
+    ).sum().backward()
     assert cross.grad is not None
     moved = cross.grad.numpy().astype(bool)
     assert moved[0, :4].all()
@@ -118,7 +120,7 @@ def test_a_measured_reach_is_felt_and_has_a_gradient_only_up_to_its_end():
 
 @given(wild_pads((1, 2), (0, 6)), st.sampled_from([1e-2, 1.0, 5.0, 20.0, 200.0]), st.integers(8, 20), SEEDS)
 @settings(max_examples=20)
-def test_signals_of_any_reach_on_wild_pads_lie_within_the_whole_fibre_at_its_heaviest(pad, end_mm, points, seed):
+def test_profile_signals_on_wild_pads_are_bounded(pad, end_mm, points, seed):
     rng, distance = np.random.default_rng(seed), np.linspace(0, end_mm, points)
     waves = np.cos(np.pi * rng.uniform(0, 2) * distance / end_mm) * (1 - distance / end_mm) ** 2
     weight = rng.choice([-1e3, -1.0, 1e-3, 1.0]) * waves
@@ -131,9 +133,9 @@ def test_signals_of_any_reach_on_wild_pads_lie_within_the_whole_fibre_at_its_hea
 
 
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
-@pytest.mark.parametrize("reach", REACHES.values(), ids=REACHES)
-def test_a_search_sees_the_signals_to_its_precision(reach, length):
-    contact = contact_of(reach, length)
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+def test_element_signals_are_within_precision(profile, length):
+    contact = contact_of(profile, length)
     for pad in pads():
         presses = np.random.default_rng(0).uniform(0, 4, (60, 2))
         exact = signals(pad, presses, contact)

@@ -17,7 +17,7 @@ from tests.design.pad.wild_pads import SEEDS, wild_pads
 
 @given(grid=st.integers(1, 5), knots=st.integers(0, 6), seed=SEEDS)
 @settings(max_examples=30)
-def test_random_morphologies_hold_the_invariants_and_depend_on_the_seed_alone(grid, knots, seed):
+def test_random_morphologies_are_valid_and_reproducible(grid, knots, seed):
     pad = Morphology.random(grid, knots, seed)
     assert pad.knots.shape == (2 * grid, knots + 2, 2)
     assert pad == Morphology.random(grid, knots, np.random.default_rng(seed))
@@ -29,11 +29,11 @@ def test_random_morphologies_hold_the_invariants_and_depend_on_the_seed_alone(gr
 
 @given(wild_pads((1, 4), (0, 20)))
 @settings(max_examples=30)
-def test_assembled_knots_are_a_pad(pad):
+def test_assemble_knots_restores_a_pad(pad):
     np.testing.assert_allclose(assemble_knots(pad.knots[:, 1:-1]), pad.knots, atol=1e-12)
 
 
-def test_frames_convert_both_ways_and_knots_lie_apart_and_cannot_be_changed():
+def test_positions_convert_both_ways_and_knots_are_separate_and_read_only():
     pad = Morphology.straight((4, 2), (8.0, 12.0))
     assert pad.to_mm(np.array(pad.layout.extent) / 2) == pytest.approx([0, 0])
     assert pad.to_mm([[0, 0], pad.layout.extent]) == pytest.approx(np.array([[-12, -30], [12, 30]]))
@@ -83,7 +83,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("make", "message"), REFUSED)
-def test_arguments_that_make_no_pad_are_refused_in_one_line(make, message):
+def test_morphology_refuses_invalid_arguments_in_one_line(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
@@ -99,7 +99,7 @@ KNOTS = '{"format": "padforge-morphology/1", "knots": [], "pitch_mm": '
     ],
     ids=lambda text: text[:60],
 )
-def test_files_that_hold_no_morphology_are_refused_in_one_line(tmp_path, text):
+def test_load_refuses_other_files_in_one_line(tmp_path, text):
     path = tmp_path / "pad.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"pad\.json"):
@@ -114,7 +114,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory, damage)
     assert pad is None or np.isfinite(pad.knots).all()
 
 
-def test_a_pad_repeated_as_tiles_answers_alike_in_each_of_them():
+def test_tiled_pads_respond_alike_in_every_tile():
     tile = Morphology.random(3, 4, seed=2, pitch_mm=5.0)
     pad = tile.tiled(4)
     assert (pad.grid, pad.pitch_mm) == (12, 5.0)

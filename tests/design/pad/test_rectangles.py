@@ -47,7 +47,7 @@ def places_on(pad, seed=0, count=40):
     return np.random.default_rng(seed).uniform(-0.3, 0.3 + np.array(pad.layout.extent), (count, 2))
 
 
-@pytest.mark.parametrize("contact", CONTACTS, ids=["disc", "square", "reach", "inverse"])
+@pytest.mark.parametrize("contact", CONTACTS, ids=["disc", "square", "profile", "inverse"])
 @given(pad=rectangles())
 @settings(max_examples=15)
 def test_a_pad_that_is_turned_signals_alike(contact, pad):

@@ -1,4 +1,4 @@
-"""The gradient of the signals: Taylor tests for every weight, length, shape and reach."""
+"""The gradient of the signals: Taylor tests for every weight, length, shape and profile."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
 from tests.design.pad.wild_pads import SEEDS, wild_contacts, wild_pads
 
-REACH = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))
+PROFILE = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))
 CONTACTS = [
     PUBLISHED_CONTACT,
     Contact(sides=None),
@@ -22,8 +22,8 @@ CONTACTS = [
     Contact(sides=None, weight="inverse_square", length="euclidean"),
     Contact(weight="inverse"),
     Contact(sides=None, weight="inverse", length="euclidean"),
-    Contact(sensitivity_profile=REACH),
-    Contact(sensitivity_profile=REACH, length="euclidean"),
+    Contact(sensitivity_profile=PROFILE),
+    Contact(sensitivity_profile=PROFILE, length="euclidean"),
     Contact(sensitivity_profile=((0.0, -0.3), (2.3, -0.5), (4.0, -0.35), (5.6, 0.1), (6.8, 0.2), (10.1, 0.0))),
 ]
 
@@ -63,13 +63,15 @@ def taylor_ratio(contact, seed):
 @pytest.mark.parametrize(
     "contact", CONTACTS, ids=lambda c: f"{len(c.sensitivity_profile) or c.sides}-{c.weight}-{c.length}"
 )
-def test_what_the_gradient_leaves_over_shrinks_with_the_square_of_the_step(contact):
+def test_signal_gradient_passes_the_taylor_test(contact):
     assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
 
 
-@pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[5], CONTACTS[9]], ids=["polygon", "inverse square", "reach"])
+@pytest.mark.parametrize(
+    "contact", [CONTACTS[0], CONTACTS[5], CONTACTS[9]], ids=["polygon", "inverse square", "profile"]
+)
 @pytest.mark.parametrize("counts", [(2, 3), (3, 1), (0, 2)])
-def test_the_torch_function_gives_the_exact_signals_and_their_gradient_on_rectangles(contact, counts):
+def test_torch_signals_match_exact_ones_on_rectangles(contact, counts):
     pad, rng = Morphology.random(Layout.create(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0, pad.layout.extent, (20, 2))
     travel, cross, ends, _ = fibre_axes(pad)
@@ -92,7 +94,7 @@ def test_the_torch_function_gives_the_exact_signals_and_their_gradient_on_rectan
 
 @given(wild_pads((1, 2), (1, 5)), wild_contacts, SEEDS)
 @settings(max_examples=20)
-def test_gradients_on_wild_pads_are_finite(pad, contact, seed):
+def test_signal_gradients_on_wild_pads_are_finite(pad, contact, seed):
     travel, cross, ends, _ = fibre_axes(pad)
     assume(np.diff(travel).min() > 1e-6)
     along, across = torch.tensor(travel[0]), torch.tensor(cross[0], requires_grad=True)
@@ -102,7 +104,7 @@ def test_gradients_on_wild_pads_are_finite(pad, contact, seed):
     assert torch.isfinite(across.grad).all()
 
 
-def test_a_fibre_that_grazes_a_circle_has_the_slope_of_the_least_angle_and_an_untouched_one_none():
+def test_gradient_at_grazing_fibres_is_limited():
     """The length cut off at height y is 2 sqrt(r^2 - y^2): it changes by -2 y / sqrt(r^2 - y^2), at most 2 / 0.02."""
     radius, contact = 0.5, Contact(radius=0.5, sides=None)
     for height, expected in (

@@ -31,7 +31,7 @@ def twin() -> Twin:
 READINGS = TwinReadings(noise_mv=2.0, drift_mv=18.0, hysteresis=0.3, hysteresis_s=14.0, information_gain=8.0)
 
 
-def test_a_file_brings_a_twin_back(twin, tmp_path):
+def test_twin_file_round_trip(twin, tmp_path):
     uneven = tuple(None if line is None else np.linspace(0.8, 1.2, len(line) - 1) for line in twin.as_built_mm)
     whole = replace(
         twin, sensitivity=uneven, angular_weight=0.1 * WEIGHT, readings=READINGS, scatter=TwinScatter(0.1, 0.3, 0.9)
@@ -48,7 +48,7 @@ def test_a_file_brings_a_twin_back(twin, tmp_path):
     assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/3"
 
 
-def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
+def test_as_built_stretch_matches_the_contact_model(twin):
     exact = relative_stretch(PAD, PAD.to_grid(twin.frame.to_plan(PLACES)), twin.contact())
     assert twin.as_built_stretch(PLACES)[:, :3] == pytest.approx(exact[:, :3], abs=1e-3)
     assert not twin.as_built_stretch(PLACES)[:, 3].any()
@@ -61,7 +61,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     assert angled.as_built_stretch([over])[0, 0] > plain.as_built_stretch([over])[0, 0]
     assert angled.as_built_stretch([beside])[0, 0] < plain.as_built_stretch([beside])[0, 0]
     for none in ([[]], [1.0, 2.0], [[1.0, 2.0, 3.0]], np.ones((2, 2, 2)), 3.0, [[np.nan, 0.0]]):
-        with pytest.raises(InputError, match="places_mm"):
+        with pytest.raises(InputError, match="positions_mm"):
             twin.as_built_stretch(none)
     assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
         np.array([[0.0, -4.0]])
@@ -73,7 +73,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
     [
         ({"channels": (TwinChannel(0, 9, 0.1, 0.0, 0.9),)}, "a channel reads fibre 9"),
         ({"channels": tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))}, "two channels read the same fibre"),
-        ({"weight": WEIGHT[:-1]}, "weight of reach"),
+        ({"weight": WEIGHT[:-1]}, "weight of sensitivity_profile"),
         ({"weight": np.where(WEIGHT == 0, 0.1, WEIGHT)}, "the last weight must be 0"),
         ({"as_built_mm": (None,)}, "as_built_mm must have"),
         ({"sensitivity": (None, None, None, None)}, "sensitivity must have"),
@@ -82,7 +82,7 @@ def test_fibres_answer_as_the_contact_model_has_it_where_they_lie(twin):
         ({"presses": 0}, "presses"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(twin, change, said):
+def test_twin_refuses_inconsistent_values(twin, change, said):
     with pytest.raises(InputError, match=said):
         replace(twin, **change)
 
@@ -106,7 +106,7 @@ def test_what_does_not_fit_together_is_refused(twin, change, said):
         ),
     ],
 )
-def test_a_file_that_holds_no_twin_is_refused_in_one_line(twin, tmp_path, change, message):
+def test_twin_load_refuses_other_files_in_one_line(twin, tmp_path, change, message):
     path = tmp_path / "twin.json"
     replace(twin, readings=READINGS).save(path)
     document = json.loads(path.read_text())

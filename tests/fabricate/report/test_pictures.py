@@ -168,7 +168,7 @@ def test_any_mesh_is_drawn_with_its_findings(tmp_path):
 @pytest.mark.slow
 def test_pictures_are_small(tmp_path, published):
     plan = Plan(Morphology.load(published / "20para.mat"))
-    findings = [finding("fail", *as_places(plan.pad.to_mm([c.place for c in plan.clashes])))]
+    findings = [finding("fail", *as_places(plan.pad.to_mm([c.position for c in plan.clashes])))]
     draw_mould(plan, findings, tmp_path / "mould")
     draw_tracks(plan, tmp_path / "tracks")
     draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")

@@ -37,7 +37,7 @@ def test_a_tip_is_where_its_pose_was_asked_for_and_a_twins_frame_says_the_same(m
     np.testing.assert_allclose(found[0], places, atol=1e-9)
     np.testing.assert_allclose(found[1], depths, atol=1e-9)
     twin = TwinFrame(mirrored, angle_deg if mirrored else -angle_deg)
-    moved = replace(twin, shift_mm=tuple(-twin.turned(np.array(centre_mm))))
+    moved = replace(twin, shift_mm=tuple(-twin.rotate(np.array(centre_mm))))
     np.testing.assert_allclose(moved.to_plan(poses[:, :2]), places, atol=1e-9)
 
 
