@@ -1,1 +1,1 @@
-"""Run time against error of the package's work, beside plain ways of doing the same."""
+"""Benchmarks: run time against error of the package, beside published and plain implementations."""

@@ -1,4 +1,4 @@
-"""`padforge bench`: run time against error, of whichever benches there are."""
+"""`padforge bench`: measure run time against error."""
 
 from pathlib import Path
 
@@ -16,39 +16,39 @@ BENCHES = ("contact", "objective", "search", "networks", "filter", "localizer", 
     "--against",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="bench.json or NAME.json of an earlier run: say what has become worse since, exit 1 if anything has.",
+    help="bench.json or NAME.json of an earlier run; exit code 1 if anything is worse now.",
 )
 @out_option("out/bench")
 @json_option
 @click.pass_context
 def bench(context: click.Context, names: tuple[str, ...], against: Path | None, out: Path, as_json: bool) -> None:
-    """Measure run time against error, beside plain ways of doing the same.
+    """Measure run time against error, beside published and plain implementations.
 
     \b
-    padforge bench                                all of them, some minutes
-    padforge bench contact filter                 of contact, objective, search, networks, filter,
+    padforge bench                                all benchmarks, some minutes
+    padforge bench contact filter                 some of contact, objective, search, networks, filter,
                                                   localizer, twin, mould
-    padforge bench --against before/bench.json    what has become slower or less accurate, by ratio
+    padforge bench --against before/bench.json    what is slower or less accurate now, as ratios
 
     Writes NAME.json, NAME.csv and NAME.png for each, and bench.json and bench.csv with the summary.
     """
     from dataclasses import asdict
     from pkgutil import resolve_name
 
-    from padforge.benchmarks.comparison import compared, comparison_lines, read_earlier
-    from padforge.benchmarks.suite import run_benches
-    from padforge.benchmarks.table import bench_lines, summary_lines
+    from padforge.benchmarks.harness import run_benches
+    from padforge.benchmarks.results import bench_lines, comparison_lines, read_earlier, summary_lines
 
-    before = read_earlier(against) if against else {}
-    chosen = names or [name for name in BENCHES if not before or name in before]
-    if not chosen:
-        raise InputError(f"{against}: holds none of the benches {', '.join(BENCHES)}")
+    earlier = read_earlier(against) if against else {}
+    names = tuple(dict.fromkeys(names)) or tuple(name for name in BENCHES if not earlier or name in earlier)
+    if not names:
+        raise InputError(f"{against}: has none of the benchmarks {', '.join(BENCHES)}")
     with progress() as bar:
         task = bar.add_task("bench", total=None, note="")
-        found = [resolve_name(f"padforge.benchmarks.{name}:BENCH") for name in dict.fromkeys(chosen)]
-        summary, changes = run_benches(found, out, lambda step: bar.update(task, note=step), before)
-    tables = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
-    verdict = ["", *comparison_lines(changes, compared(before, summary["benches"]))] if against else []
-    document = summary | {"worse": [asdict(change) for change in changes]}
-    show_result(document, [*tables, *summary_lines(summary["summary"]), *verdict], as_json)
+        benches = [resolve_name(f"padforge.benchmarks.{name}:BENCH") for name in names]
+        summary, changes = run_benches(benches, out, lambda step: bar.update(task, note=step), earlier)
+    lines = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
+    lines += summary_lines(summary["summary"])
+    if against:
+        lines += ["", *comparison_lines(changes, earlier, summary["benches"])]
+    show_result(summary | {"worse": [asdict(change) for change in changes]}, lines, as_json)
     context.exit(int(bool(changes)))

@@ -1,59 +1,58 @@
-"""How a benchmark is taken: trials, each some work and a judge of its result, timed in rounds.
+"""Measure benchmarks: trials, each some work and an evaluation of its result, timed in several rounds.
 
-The least time counts, since whatever disturbs a measurement only adds to it; and because disturbances last, the same
-trial is timed again in later rounds, with other trials between, until its two best rounds agree. The pace of the
-machine is told by a fixed piece of work that is timed before and after every trial: runs are compared by times divided
-by the least of all paces, and, since one that is busy throughout never shows its best, by the pace beside the trial.
+Disturbances only add to run time and last for a while. Hence the minimum over rounds counts, with other trials between.
+The pace of the machine is the time of a fixed reference work, measured before and after every trial, so that two runs
+can be compared by relative times.
 """
 
-import os
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-BenchListener = Callable[[str], None]
-"""Hears what is being measured."""
-TrialKey = tuple[str, str, float, int]
-"""Case, way, size and repetition."""
+from padforge.benchmarks.results import SLOWER, TrialKey, Worsening, find_worsenings, write_bench, write_summary
+from padforge.design.common.files import check_writable
 
+ROUNDS = 3
+MAX_RECHECKS = 5
+"""Further rounds of trials that seem slower than in the earlier run."""
 BUDGET_S = 0.2
-"""How long quick work is repeated in a round."""
-QUICK_S = 1.0
-"""Work that takes longer is done once a round."""
-PLAIN_S = 0.1
-"""Plain ways that take longer are left out of later rounds: nobody asks whether they have become slower."""
-AGREE = 1.04
-"""A trial is settled when the times of its two best rounds are within this ratio."""
+"""Time for repetitions of short work in a round, s."""
+LONG_S = 1.0
+"""Work that takes longer is done once a round, s."""
+MAX_BASELINE_S = 0.1
+"""Baselines that take longer are measured in the first round only, s: their run time is not compared between runs."""
 
 
 @dataclass(frozen=True)
 class BenchTrial:
-    """One measurement to take.
+    """One measurement.
 
     Attributes:
-        case: what is computed. way: how. size: the way's own parameter (samples, steps; 0 if it has none).
-        work: what is timed.
-        judge: what is to be known of its result beside time: "error", which the figure's axis explains, "visited", the
-            share of the scene that was looked at, and columns of the bench's own.
-        items: by which the time is divided.
-        repetition: tells trials apart that differ in a seed alone; tables show the median over them.
+        case: the problem.
+        way: the method that solves it.
+        size: parameter of the method, such as samples or steps; 0 if it has none.
+        work: the timed function.
+        evaluate: returns the quality of its result: "error" in the unit of the bench, "visited", the share of the
+            scene that was computed, and columns of the bench.
+        items: number by which the time is divided.
+        repetition: number among trials that differ in the seed only; tables show medians.
     """
 
     case: str
     way: str
     size: float
     work: Callable[[], Any]
-    judge: Callable[[Any], Mapping[str, float | None]] = lambda result: {}
+    evaluate: Callable[[Any], Mapping[str, float | None]] = lambda result: {}
     items: int = 1
     repetition: int = 0
 
     @property
     def key(self) -> TrialKey:
-        """What the trial is known by in every round and every run."""
+        """Identity of the trial in every round and run."""
         return self.case, self.way, self.size, self.repetition
 
 
@@ -62,111 +61,152 @@ class Bench:
     """A benchmark.
 
     Attributes:
-        name: of its files.
-        trials: makes all trials anew, always the same ones, in order.
-        error: what "error" means, with its unit.
-        reference: (way, size) whose time counts as 1.
-        best: (way, size) the package goes by, which summaries set beside the reference.
-        plain: ways that are not the package's work, there for comparison; `--against` does not ask after them.
-        prepare: compiles and imports what plain ways need, before the clock.
+        name: name of its files.
+        trials: yields all trials, in the same order every time.
+        error_label: meaning of "error", with its unit.
+        reference: (way, size) to which speeds are relative.
+        default: (way, size) that the package uses.
+        baselines: ways that are not the package's own; `--against` ignores them.
+        prepare: compiles and imports what baselines need, before anything is timed.
     """
 
     name: str
     trials: Callable[[], Iterator[BenchTrial]]
-    error: str
+    error_label: str
     reference: tuple[str, float]
-    best: tuple[str, float]
-    plain: Collection[str]
+    default: tuple[str, float]
+    baselines: Collection[str] = ()
     prepare: Callable[[], object] = lambda: None
 
 
 @dataclass
 class BenchRounds:
-    """What the rounds of a benchmark have given so far.
+    """Measurements of a benchmark in all rounds so far.
 
     Attributes:
-        found: of every trial, what its judge says.
-        times: of every trial, seconds an item in each round that it was part of.
-        paces: of every trial, those times divided by the time of the fixed piece of work beside them.
-        pace_s: least time of the fixed piece of work, seconds.
+        results: evaluation of every trial.
+        seconds: seconds per item of every trial, one a round.
+        paces: the same relative to the pace of the machine beside the trial.
+        pace_s: best pace, s.
     """
 
-    found: dict[TrialKey, Mapping[str, Any]] = field(default_factory=dict)
-    times: dict[TrialKey, list[float]] = field(default_factory=dict)
+    results: dict[TrialKey, Mapping[str, Any]] = field(default_factory=dict)
+    seconds: dict[TrialKey, list[float]] = field(default_factory=dict)
     paces: dict[TrialKey, list[float]] = field(default_factory=dict)
     pace_s: float = np.inf
 
-    def settled(self, key: TrialKey) -> bool:
-        """Whether another round would hardly tell more of a trial's time."""
-        best, *rest = sorted(self.times[key])
-        return bool(rest) and rest[0] < AGREE * best
 
+def measure_round(
+    bench: Bench, rounds: BenchRounds, on_progress: Callable[[str], None], repeat: Callable[[TrialKey], bool]
+) -> int:
+    """Measure new trials, and repeat others.
 
-def measure_round(bench: Bench, so_far: BenchRounds, report: BenchListener, again: Callable[[TrialKey], bool]) -> int:
-    """Add one round to `so_far`: trials that are new to it are timed and judged, others timed where `again` says so.
+    Args:
+        bench: the benchmark.
+        rounds: measurements so far, to which this round is added.
+        on_progress: receives the name of every trial.
+        repeat: whether to repeat a trial; slow baselines are never repeated.
 
-    Slow plain ways are never timed again. Returns how many trials the round had.
+    Returns:
+        The number of trials measured.
     """
-    if not so_far.times:
+    if not rounds.seconds:
         bench.prepare()
-    taken = 0
+    n_measured = 0
     for trial in bench.trials():
-        known = so_far.times.get(trial.key)
-        slow = known and trial.way in bench.plain and min(known) * trial.items > PLAIN_S
-        if known and (slow or not again(trial.key)):
+        earlier = rounds.seconds.setdefault(trial.key, [])
+        is_slow_baseline = earlier and trial.way in bench.baselines and min(earlier) * trial.items > MAX_BASELINE_S
+        if earlier and (is_slow_baseline or not repeat(trial.key)):
             continue
-        report(f"{trial.case}, {trial.way}" + (f" {trial.size:g}" if trial.size else ""))
-        before = _fixed_work()
-        result, seconds, quick = _timed(trial.work)
-        paces = [*before, *_fixed_work()]
-        so_far.pace_s = min(so_far.pace_s, *paces)
-        so_far.times.setdefault(trial.key, []).append(seconds / trial.items)
-        beside = min(paces) if quick else float(np.median(paces))
-        so_far.paces.setdefault(trial.key, []).append(seconds / trial.items / beside)
-        if trial.key not in so_far.found:
-            so_far.found[trial.key] = trial.judge(result)
-        taken += 1
-    return taken
+        on_progress(f"{trial.case}, {trial.way}" + (f" {trial.size:g}" if trial.size else ""))
+        paces = _measure_pace()
+        result, seconds, is_long = _measure(trial.work)
+        paces += _measure_pace()
+        rounds.pace_s = min(rounds.pace_s, *paces)
+        earlier.append(seconds / trial.items)
+        # short work meets a quiet moment, as the best pace does; long work an average one
+        pace = float(np.median(paces)) if is_long else min(paces)
+        rounds.paces.setdefault(trial.key, []).append(seconds / trial.items / pace)
+        if trial.key not in rounds.results:
+            rounds.results[trial.key] = trial.evaluate(result)
+        n_measured += 1
+    return n_measured
 
 
-def _timed(work: Callable[[], Any]) -> tuple[Any, float, bool]:
-    """What `work` returns, its least time in seconds, and whether it is quick: then its first call only warms up."""
-    result, first = _once(work)
-    if first > QUICK_S:
-        return result, first, False
-    times: list[float] = []
+def _measure(work: Callable[[], Any]) -> tuple[Any, float, bool]:
+    """Return the result, the least time in s, and whether it was measured once or twice only."""
+    result, first = _timed_call(work)
+    if first > LONG_S:
+        return result, first, True
+    times: list[float] = []  # without the first call, which warms up
     while not times or (sum(times) < BUDGET_S and len(times) < 1000):
-        times.append(_once(work)[1])
-    return result, min(times), len(times) > 1
+        times.append(_timed_call(work)[1])
+    return result, min(times), len(times) == 1
 
 
-def _once(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What `work` returns, and the seconds it took, less those that this thread waited for a core others had."""
-    begin = time.perf_counter()
+def _timed_call(work: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result and the time in s, less the time that this thread waited for a core."""
     waited = _waited_s()
+    begin = time.perf_counter()
     result = work()
-    waited = _waited_s() - waited
-    return result, time.perf_counter() - begin - waited
-
-
-@cache
-def _schedule() -> int | None:
-    """File descriptor of what Linux tells of this thread's turns, or None elsewhere."""
-    try:
-        return os.open("/proc/thread-self/schedstat", os.O_RDONLY)
-    except OSError:
-        return None
+    seconds = time.perf_counter() - begin
+    return result, seconds - min(_waited_s() - waited, seconds / 2)
 
 
 def _waited_s() -> float:
-    """Seconds this thread has been ready to run while other programs had the cores; 0 where nobody tells."""
-    file = _schedule()
-    return 0.0 if file is None else int(os.pread(file, 64, 0).split()[1]) * 1e-9
+    """Return how long this thread has been runnable while other programs had the cores, s; 0 except on Linux."""
+    try:
+        return int(Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
+    except OSError:
+        return 0.0
 
 
 _NUMBERS = np.random.default_rng(0).random(20_000)
 
 
-def _fixed_work() -> list[float]:
-    """Seconds that a fixed piece of work takes, in numpy and in the interpreter, ten times: under a millisecond."""
-    return [_once(lambda: (np.sort(_NUMBERS), sum(i * 0.5 for i in range(5000))))[1] for _ in range(10)]
+def _measure_pace() -> list[float]:
+    """Return ten times in s of the reference work, in NumPy and in the interpreter: less than 1 ms each."""
+    return [_timed_call(lambda: (np.sort(_NUMBERS), sum(i * 0.5 for i in range(5000))))[1] for _ in range(10)]
+
+
+def run_benches(
+    benches: Sequence[Bench], out: Path, on_progress: Callable[[str], None], earlier: Mapping[str, Mapping[str, Any]]
+) -> tuple[dict[str, Any], list[Worsening]]:
+    """Measure benchmarks, write the files of each, and `bench.json` and `bench.csv` with the summary.
+
+    Args:
+        benches: benchmarks to measure.
+        out: folder of the files.
+        on_progress: receives what is being measured.
+        earlier: documents of an earlier run by name of the bench, to compare with; may be empty.
+
+    Returns:
+        The content of `bench.json`, and what is worse than in the earlier run. A trial counts as slower only if it was
+        slower in all of its rounds.
+
+    Raises:
+        InputError: `out` is not writable; nothing was measured.
+    """
+    check_writable(out)
+    rounds = {bench.name: BenchRounds() for bench in benches}
+    documents: dict[str, dict[str, Any]] = {}
+
+    def measure(bench: Bench, label: str, repeat: Callable[[TrialKey], bool]) -> None:
+        measured = rounds[bench.name]
+        if measure_round(bench, measured, lambda step: on_progress(f"{bench.name}, {label}, {step}"), repeat):
+            measured.pace_s = min(other.pace_s for other in rounds.values())
+            documents[bench.name] = write_bench(bench, measured, out)
+
+    def slower_trials() -> set[tuple[str, TrialKey]]:
+        return {(change.bench, change.key) for change in find_worsenings(earlier, documents) if change.what == SLOWER}
+
+    for number in range(ROUNDS):
+        for bench in benches:
+            measure(bench, f"round {number + 1}", lambda key: True)
+    for number in range(MAX_RECHECKS):
+        time.sleep(number if slower_trials() else 0)  # a disturbance may take a while
+        for bench in benches:
+            slower = {key for name, key in slower_trials() if name == bench.name}
+            if slower:
+                measure(bench, "recheck", slower.__contains__)
+    return write_summary(documents, out), find_worsenings(earlier, documents)

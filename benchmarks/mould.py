@@ -1,4 +1,4 @@
-"""How near the mould's surface comes to the exact tracks, against the time and the size of the file it takes."""
+"""Deviation of the mould's surface from the exact tracks against run time and file size."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from build123d import Edge, GeomType, PositionMode
+from build123d import GeomType, PositionMode
 from numpy.typing import NDArray
 
 from padforge.benchmarks.harness import Bench, BenchTrial
@@ -25,105 +25,103 @@ from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
 GRID, KNOTS = 4, (1, 5, 20)
 TOLERANCES_MM = (0.05, 0.01, 0.002)
-FUSED_UP_TO = 5
-"""Beyond so many knots a fibre, Boolean operations of the CAD kernel take minutes."""
+MAX_FUSED_KNOTS = 5
+"""Beyond as many knots per fibre, Boolean operations of the CAD kernel take minutes."""
 SEED = 0
-_EXACT_MM = 1e-5
-"""What exact curves are flattened to for comparison."""
-_CLEAR_MM = 1.0
-"""Near the walls outlines belong to exits."""
-_PLACES = 33
-"""In so many places of every curve of a CAD solid it is looked how far it strays."""
+EXACT_MM = 1e-5
+"""Flattening tolerance of the exact curves, mm."""
+MARGIN_MM = 1.0
+"""Distance from the walls within which outlines belong to exits and are not compared, mm."""
+POINTS = 33
+"""Points along every curve of a CAD solid at which its deviation is measured."""
 
 
 def trials() -> Iterator[BenchTrial]:
-    """Every way at every tolerance for random pads of N in KNOTS, from the fibres to the solid.
+    """Yield all ways at all tolerances, from the fibres of random pads to the solid.
 
-    The error is the greatest deviation, mm, and the size the tolerance, micrometres: true curves have one of their own.
-    "faces" are triangles of the mesh or faces of the CAD solid, "file_bytes" the size of its STL or of its STEP.
+    The error is the largest deviation in mm, the size the tolerance in micrometres. "faces" are triangles of the mesh
+    or faces of the CAD solid, "file_bytes" the size of its STL or STEP.
     """
     for knots in KNOTS:
         pad = Morphology.random(GRID, knots, SEED)
-        for tolerance in TOLERANCES_MM:
-            for way, (work, judge) in (DIRECT if knots > FUSED_UP_TO else DIRECT | FUSED).items():
-                plan = partial(_plan, pad, tolerance)
-                yield BenchTrial(f"N={knots}", way, 1000 * tolerance, partial(work, plan), partial(judge, plan))
+        for tolerance_mm in TOLERANCES_MM:
+            plan = partial(_plan, pad, tolerance_mm)
+            for way, (work, evaluate) in WAYS.items():
+                if way != "fused CAD" or knots <= MAX_FUSED_KNOTS:
+                    yield BenchTrial(
+                        f"N={knots}", way, 1000 * tolerance_mm, partial(work, plan), partial(evaluate, plan)
+                    )
         plan = partial(_plan, pad)
-        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FITS_MM[0], partial(_curved, plan), partial(_cad_row, plan))
+        work, evaluate = partial(_curved_solid, plan), partial(_evaluate_solid, plan)
+        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FITS_MM[0], work, evaluate)
 
 
 def _plan(pad: Morphology, tolerance_mm: float = DEFAULTS.mould.tolerance_mm) -> Plan:
     return Plan(pad, replace(DEFAULTS, mould=MouldSettings(tolerance_mm=tolerance_mm, number_mm=0)))
 
 
-def _curved(new_plan: Callable[[], Plan]) -> Any:
+def _curved_solid(new_plan: Callable[[], Plan]) -> Any:
     return mould_model(new_plan(), "mould").shape
 
 
-def _mesh_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
+def _evaluate_mesh(new_plan: Callable[[], Plan], mesh: Any) -> Mapping[str, float]:
     plan = new_plan()
-    outline = solid.slice(plan.settings.mould.floor_mm + plan.heights_mm[0] / 2).to_polygons()
-    points = np.vstack([_with_middles(np.asarray(ring)) for ring in outline])
-    faces = solid.num_tri()
-    return {"error": _deviation(plan, points), "faces": faces, "file_bytes": 84 + 50 * faces}
+    rings = mesh.slice(plan.settings.mould.floor_mm + plan.heights_mm[0] / 2).to_polygons()
+    # vertices and middles of edges, where a chord is farthest from its arc
+    points = np.vstack([np.vstack([ring, (ring + np.roll(ring, -1, axis=0)) / 2]) for ring in map(np.asarray, rings)])
+    faces = mesh.num_tri()
+    return {"error": _max_deviation_mm(plan, points), "faces": faces, "file_bytes": 84 + 50 * faces}
 
 
-def _cad_row(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
+def _evaluate_solid(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     plan = new_plan()
-    points = np.vstack(list(_level_curves(solid, plan.settings.mould.floor_mm)))
+    points = np.vstack(list(_horizontal_edges(solid, plan.settings.mould.floor_mm)))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mould.step"
         write_step(path, solid)
-        written = path.stat().st_size
-    return {"error": _deviation(plan, points), "faces": len(solid.faces()), "file_bytes": written}
+        size = path.stat().st_size
+    return {"error": _max_deviation_mm(plan, points), "faces": len(solid.faces()), "file_bytes": size}
 
 
-Way = tuple[Callable[..., Any], Callable[..., Mapping[str, float]]]
-DIRECT: dict[str, Way] = {
-    "manifold3d": (lambda new_plan: plan_mesh(new_plan()), _mesh_row),
-    "direct CAD": (lambda new_plan: faceted_solid(plan_mesh(new_plan())), _cad_row),
+WAYS: dict[str, tuple[Callable[..., Any], Callable[..., Mapping[str, float]]]] = {
+    "manifold3d": (lambda new_plan: plan_mesh(new_plan()), _evaluate_mesh),
+    "direct CAD": (lambda new_plan: faceted_solid(plan_mesh(new_plan())), _evaluate_solid),
+    "fused CAD": (lambda new_plan: body_solid(mould_body(new_plan())), _evaluate_solid),
 }
-FUSED: dict[str, Way] = {"fused CAD": (lambda new_plan: body_solid(mould_body(new_plan())), _cad_row)}
 
 
-def _level_curves(solid: Any, z: float) -> Iterator[NDArray[np.float64]]:
-    """Points (n, 2) along every edge of a solid that lies at a height: of straight ones the ends and the middle."""
+def _horizontal_edges(solid: Any, z: float) -> Iterator[NDArray[np.float64]]:
+    """Yield points along every edge of a solid at a height; shape (n, 2), mm."""
     for edge in solid.edges():
-        points = _along(edge, 3)
+
+        def sample(count: int, edge: Any = edge) -> NDArray[np.float64]:
+            positions = np.linspace(0, 1, count).tolist()
+            return np.array([tuple(edge.position_at(at, position_mode=PositionMode.PARAMETER)) for at in positions])
+
+        points = sample(3)
         if np.abs(points[:, 2] - z).max() < 1e-6:
-            yield (points if edge.geom_type == GeomType.LINE else _along(edge, _PLACES))[:, :2]
+            yield (points if edge.geom_type == GeomType.LINE else sample(POINTS))[:, :2]
 
 
-def _along(edge: Edge, count: int) -> NDArray[np.float64]:
-    """Points (count, 3) along an edge, its ends among them."""
-    places = np.linspace(0, 1, count).tolist()
-    return np.array([tuple(edge.position_at(at, position_mode=PositionMode.PARAMETER)) for at in places])
-
-
-def _with_middles(ring: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vertices of a ring and the middles of its edges, where a chord is furthest from its arc."""
-    return np.vstack([ring, (ring + np.roll(ring, -1, axis=0)) / 2])
-
-
-def _deviation(plan: Plan, points: NDArray[np.float64]) -> float:
-    """How far ridge outlines stray, at most, from where they belong: half a ridge's width from a level's fibres."""
-    inside = shapely.points(points[shapely.contains_xy(box_around(plan.cavity, -_CLEAR_MM), points)])
-    curves = [plan.pad.to_mm(line) for line in flatten(plan.pad, _EXACT_MM / plan.pad.unit_mm)]
-    off = []
-    for level in range(len(plan.heights_mm)):
-        own = [curve for curve, at in zip(curves, plan.levels, strict=True) if at == level]
-        edges = np.concatenate([np.stack([curve[:-1], curve[1:]], axis=1) for curve in own])
+def _max_deviation_mm(plan: Plan, points: NDArray[np.float64]) -> float:
+    """Return the largest deviation of ridge outlines from half a ridge's width beside the fibres of a layer, mm."""
+    inside = shapely.points(points[shapely.contains_xy(box_around(plan.cavity, -MARGIN_MM), points)])
+    curves = [plan.pad.to_mm(line) for line in flatten(plan.pad, EXACT_MM / plan.pad.unit_mm)]
+    deviations = []
+    for layer in range(len(plan.heights_mm)):
+        fibres = [curve for curve, level in zip(curves, plan.levels, strict=True) if level == layer]
+        edges = np.concatenate([np.stack([curve[:-1], curve[1:]], axis=1) for curve in fibres])
         tree = shapely.STRtree(np.asarray(shapely.linestrings(edges)))
         _, distance = tree.query_nearest(inside, return_distance=True, all_matches=False)
-        off.append(np.abs(distance - plan.settings.mould.ridge_width_mm / 2))
-    return float(np.min(off, axis=0).max())
+        deviations.append(np.abs(distance - plan.settings.mould.ridge_width_mm / 2))
+    return float(np.min(deviations, axis=0).max())
 
 
 BENCH = Bench(
     "mould",
     trials,
     "deviation from the exact tracks (mm)",
-    ("fused CAD", 10),
-    ("manifold3d", 10),
-    plain=("fused CAD", "direct CAD"),
+    reference=("fused CAD", 10),
+    default=("manifold3d", 10),
+    baselines=("fused CAD", "direct CAD"),
 )

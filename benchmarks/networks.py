@@ -1,4 +1,4 @@
-"""The networks of a robustness study: trained as batches, beside one after another by plain Levenberg-Marquardt."""
+"""Run time of training the networks of a study as a batch, beside plain Levenberg-Marquardt one after another."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -24,92 +24,110 @@ from padforge.design.settings import PUBLISHED_CONTACT
 
 HIDDEN = 50
 EPOCHS = 1000
-FAILURES = 6
-LOST, SETS = 2, 14
-"""Fibres lost at once, and how many sets of them: as many networks as are trained as one batch."""
+PATIENCE = 6
+"""Steps without improvement on the validation samples before training stops."""
+FAILED, SETS = 2, 14
+"""Failed fibres, and number of sets of them: the networks that are trained as one batch."""
+MAX_DAMPING = 1e10
 
 
 def trials() -> Iterator[harness.BenchTrial]:
-    """Networks for SETS of lost fibres of two 4 x 4 pads, the square grid and a random one, both ways.
+    """Yield the networks for SETS sets of failed fibres of two 4 x 4 pads by both ways.
 
-    The plain way makes the whole Jacobian and solves for all weights, as textbooks have it, on as many threads as NumPy
-    takes; both ways learn from the same samples, and are tested on the same fresh presses.
+    Both ways train on the same samples and are tested on the same fresh presses; the plain way uses as many threads as
+    NumPy does.
     """
     with one_torch_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
-            trial = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
-            losses = failure_subsets(len(pad.knots), LOST, SETS)
-            judge = partial(_judge, trial, losses)
-            yield harness.BenchTrial(case, "batched", 0, partial(trial.fit, losses, HIDDEN), judge, items=SETS)
-            yield harness.BenchTrial(case, "plain numpy", 0, partial(_learn_plain, trial, losses), judge, items=SETS)
+            presses = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
+            failures = failure_subsets(len(pad.knots), FAILED, SETS)
+            evaluate = partial(_evaluate, presses, failures)
+            for way, work in (
+                ("batched", partial(presses.fit, failures, HIDDEN)),
+                ("plain numpy", partial(_fit_all_plain, presses, failures)),
+            ):
+                yield harness.BenchTrial(case, way, 0, work, evaluate, items=SETS)
 
 
-def _judge(trial: SimulatedPresses, losses: Sequence[FailureSet], networks: Sequence[Network]) -> Mapping[str, float]:
-    errors = [trial.test_errors(network, loss).mean() for network, loss in zip(networks, losses, strict=True)]
+def _evaluate(
+    presses: SimulatedPresses, failures: Sequence[FailureSet], networks: Sequence[Network]
+) -> Mapping[str, float]:
+    errors = [presses.test_errors(network, failed).mean() for network, failed in zip(networks, failures, strict=True)]
     return {"error": float(np.mean(errors))}
 
 
-def _learn_plain(trial: SimulatedPresses, losses: Sequence[FailureSet]) -> list[Network]:
-    kept = [np.setdiff1d(np.arange(trial.train_signals.shape[1]), loss) for loss in losses]
-    rngs = [np.random.default_rng([2, 0, len(loss), *loss]) for loss in losses]
-    return [
-        fit_plain(trial.train_signals[:, left], trial.train_positions, rng)
-        for left, rng in zip(kept, rngs, strict=True)
-    ]
+def _fit_all_plain(presses: SimulatedPresses, failures: Sequence[FailureSet]) -> list[Network]:
+    networks = []
+    for failed in failures:
+        inputs = np.delete(presses.train_signals, list(failed), axis=1)
+        networks.append(fit_plain(inputs, presses.train_positions, np.random.default_rng([2, 0, len(failed), *failed])))
+    return networks
 
 
 def fit_plain(inputs: Array, targets: Array, rng: np.random.Generator) -> Network:
-    """`levenberg_marquardt.fit` as textbooks have it: whole Jacobian, all weights at once, damping in tens."""
-    into, onto = RangeScaler.fit(inputs), RangeScaler.fit(targets)
+    """Fit the published network by textbook Levenberg-Marquardt: full Jacobian, all weights at once.
+
+    Args:
+        inputs: signals; shape (Q, F).
+        targets: positions; shape (Q, 2).
+        rng: draws the initial weights and the split into training and validation samples.
+    """
+    input_scale, target_scale = RangeScaler.fit(inputs), RangeScaler.fit(targets)
     order = rng.permutation(len(inputs))
-    learnt = round(TRAINING_SHARE * len(inputs))
-    learn, held = order[:learnt], order[learnt : learnt + round(VALIDATION_SHARE * len(inputs))]
-    x, y = np.column_stack([into.transform(inputs), np.ones(len(inputs))]), onto.transform(targets)
-    outputs, inner = y.shape[1], HIDDEN * x.shape[1]
-    first = initial_weights(into.half > 0, HIDDEN, rng)
+    n_train = round(TRAINING_SHARE * len(inputs))
+    train, validation = order[:n_train], order[n_train : n_train + round(VALIDATION_SHARE * len(inputs))]
+    x, y = np.column_stack([input_scale.transform(inputs), np.ones(len(inputs))]), target_scale.transform(targets)
+    outputs, n_hidden_weights = y.shape[1], HIDDEN * x.shape[1]
+    first = initial_weights(input_scale.half > 0, HIDDEN, rng)
     weights = np.concatenate([first.ravel(), rng.uniform(-0.5, 0.5, outputs * (HIDDEN + 1))])
 
-    def parts(weights: Array) -> tuple[Array, Array]:
-        return weights[:inner].reshape(HIDDEN, -1), weights[inner:].reshape(outputs, HIDDEN + 1)
+    def split(weights: Array) -> tuple[Array, Array]:
+        return weights[:n_hidden_weights].reshape(HIDDEN, -1), weights[n_hidden_weights:].reshape(outputs, HIDDEN + 1)
 
-    def found(weights: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-        hidden, output = parts(weights)
+    def forward(weights: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return the neurons, with a column of ones, and the residuals."""
+        hidden, output = split(weights)
         neurons = np.column_stack([np.tanh(x[rows] @ hidden.T), np.ones(len(rows))])
         return neurons, neurons @ output.T - y[rows]
 
-    neurons, error = found(weights, learn)
-    best, least, failures, damping = weights, (found(weights, held)[1] ** 2).sum(), 0, 1e-3
-    steps = 0
-    while steps < EPOCHS and failures < FAILURES:
-        jacobian = _jacobian(x[learn], neurons, parts(weights)[1])
-        curvature, slope = jacobian.T @ jacobian, jacobian.T @ error.ravel()
-        while damping <= 1e10:
-            candidate = weights - np.linalg.solve(curvature + damping * np.eye(len(weights)), slope)
-            moved = found(candidate, learn)
-            if (moved[1] ** 2).sum() < (error**2).sum():
+    neurons, residual = forward(weights, train)
+    best, best_loss = weights, (forward(weights, validation)[1] ** 2).sum()
+    steps, n_failures, damping = 0, 0, 1e-3
+    while steps < EPOCHS and n_failures < PATIENCE:
+        jacobian = _jacobian(x[train], neurons, split(weights)[1])
+        hessian, gradient = jacobian.T @ jacobian, jacobian.T @ residual.ravel()
+        while damping <= MAX_DAMPING:  # until a step reduces the training loss
+            candidate = weights - np.linalg.solve(hessian + damping * np.eye(len(weights)), gradient)
+            new_neurons, new_residual = forward(candidate, train)
+            if (new_residual**2).sum() < (residual**2).sum():
                 break
             damping *= 10
         else:
             break
-        weights, (neurons, error), damping, steps = candidate, moved, damping / 10, steps + 1
-        checked = (found(weights, held)[1] ** 2).sum()
-        if checked < least:
-            best, least, failures = weights, checked, 0
+        weights, neurons, residual, damping, steps = candidate, new_neurons, new_residual, damping / 10, steps + 1
+        loss = (forward(weights, validation)[1] ** 2).sum()
+        if loss < best_loss:
+            best, best_loss, n_failures = weights, loss, 0
         else:
-            failures += 1
-    hidden, output = parts(best)
-    return Network(hidden, output, into, onto, steps)
+            n_failures += 1
+    return Network(*split(best), input_scale, target_scale, steps)
 
 
 def _jacobian(x: Array, neurons: Array, output: Array) -> Array:
-    """(Q O, P) derivatives of the outputs by all weights."""
+    """Return the derivatives of the outputs by all weights; shape (Q outputs, weights)."""
     samples, outputs = len(x), len(output)
-    bent = 1 - neurons[:, :-1] ** 2
-    inner = [((bent * own[:-1])[:, :, None] * x[:, None, :]).reshape(samples, -1) for own in output]
-    outer = [np.kron(np.eye(outputs)[k], neurons) for k in range(outputs)]
-    return np.stack([np.hstack(pair) for pair in zip(inner, outer, strict=True)], axis=1).reshape(samples * outputs, -1)
+    slope = 1 - neurons[:, :-1] ** 2
+    hidden = [((slope * row[:-1])[:, :, None] * x[:, None, :]).reshape(samples, -1) for row in output]
+    linear = [np.kron(row, neurons) for row in np.eye(outputs)]
+    blocks = [np.hstack(pair) for pair in zip(hidden, linear, strict=True)]
+    return np.stack(blocks, axis=1).reshape(samples * outputs, -1)
 
 
 BENCH = harness.Bench(
-    "networks", trials, "mean error (grid units)", ("plain numpy", 0), ("batched", 0), plain=("plain numpy",)
+    "networks",
+    trials,
+    "mean error (grid units)",
+    reference=("plain numpy", 0),
+    default=("batched", 0),
+    baselines=("plain numpy",),
 )

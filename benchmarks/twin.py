@@ -1,7 +1,7 @@
-"""What identification finds against the presses it is given, on printed pads whose truth is known.
+"""Error of the identified twin against the number of presses, on simulated printed pads whose truth is known.
 
-The error is that of predicted responses at fresh places, against what the pad answers there without noise; beside it
-stand the plan believed as it is, wired and framed as is true, and a smooth function of place alone.
+The error is that of predicted responses at test positions, against the noiseless responses of the pad. Baselines are
+the plan as designed, with the true wiring and pose, and a smooth function of position alone.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -25,40 +25,39 @@ from padforge.sense.twin.laid_pad import Plan
 from padforge.sense.twin.responses import responses
 
 PRESSES = (150, 300, 600, 1500, 3000)
-FRESH = 400
+TEST = 400
 GRID, KNOTS = 4, 5
 WORLDS: Mapping[str, tuple[str, float, int]] = {
     "gaussian, 0.5 mm, 1 dead": ("gaussian", 0.5, 1),
     "disc, 1 mm, 2 dead": ("disc", 1.0, 2),
     "skirted, 2 mm, 3 dead": ("skirted", 2.0, 3),
 }
-"""Reach, how far fibres lie beside their plan, and dead channels."""
-CLOSE = Contact(radius=0.6)
-"""What a plan that is believed takes a press for."""
+"""Sensitivity profile, standard deviation of the lateral offset of fibres in mm, and number of dead channels."""
+PLAN_CONTACT = Contact(radius=0.6)
+"""Contact of the baseline that believes the plan."""
 
-REACHES = ("gaussian", "disc", "skirted")
+PROFILES = ("gaussian", "disc", "skirted")
 WIDTH = 0.55
-"""Standard deviation of the Gaussian reach, grid units; the others are about as wide."""
-GAIN_V, UNEVEN_GAIN = -0.5, 0.2
-"""V for a relative stretch of 1, and how far channels differ in it: standard deviation of its logarithm."""
-SMOOTH = 1.5
-"""Length over which the way beside the plan changes, grid units."""
+"""Standard deviation of the Gaussian profile, grid units; the others are about as wide."""
+GAIN_V, GAIN_SD = -0.5, 0.2
+"""Response to a relative stretch of 1, V, and standard deviation of its logarithm over channels."""
+OFFSET_SCALE = 1.5
+"""Correlation length of lateral offsets along a fibre, grid units."""
 
 Predict = Callable[[Array], Array]
 
 
 def trials() -> Iterator[BenchTrial]:
-    """Identification of every world from more and more presses, and the plain ways."""
+    """Yield identifications from more and more presses of every world, and the baselines."""
+    ways = {"twin": _identify, "plan": _fit_plan, "place": _fit_smooth}
     for world in WORLDS:
         for presses in PRESSES:
-            judge = partial(_judged, world)
-            yield BenchTrial(world, "twin", presses, partial(_identified, world, presses), judge)
-            yield BenchTrial(world, "plan", presses, partial(_believed, world, presses), judge)
-            yield BenchTrial(world, "place", presses, partial(_smoothed, world, presses), judge)
+            for way, fit in ways.items():
+                yield BenchTrial(world, way, presses, partial(fit, world, presses), partial(_evaluate, world))
 
 
-def reach_of(kind: str) -> tuple[Array, Array]:
-    """Distances (n,), grid units, and weights (n,) of one of `REACHES`."""
+def sensitivity_profile(kind: str) -> tuple[Array, Array]:
+    """Return distances in grid units and weights of one of PROFILES; shape (n,) each."""
     distance = np.linspace(0, 3.2 * WIDTH, 17)
     if kind == "disc":
         weight = np.clip((1.0 - distance) / 0.2 + 0.5, 0, 1)
@@ -74,144 +73,148 @@ def printed_pad(
     plan: Morphology,
     rng: np.random.Generator,
     *,
-    reach: str = "gaussian",
-    laid_mm: float = 0.5,
-    dead: int = 1,
+    profile: str = "gaussian",
+    lateral_offset_mm: float = 0.5,
+    n_dead: int = 1,
     noise: float = 0.015,
 ) -> Twin:
-    """A pad as it might come off the bench: turned over, wired in any order, laid beside its plan.
+    """Simulate a printed pad: turned over, wired in random order, with fibres beside their planned paths.
 
     Args:
-        reach: one of `REACHES`. laid_mm: standard deviation of fibres beside their plan. dead: channels that read
-            nothing. noise: of a response, share of full scale.
+        plan: the designed pad.
+        rng: draws pose, wiring, gains and offsets.
+        profile: one of PROFILES.
+        lateral_offset_mm: standard deviation of the distance of fibres from their planned paths, mm.
+        n_dead: channels that read nothing.
+        noise: standard deviation of a response, share of full scale.
     """
     fibres, unit_mm = len(plan.knots), plan.unit_mm
-    distance, weight = reach_of(reach)
+    distance, weight = sensitivity_profile(profile)
     turn, shift = rng.choice([-3.0, 3.0]), rng.uniform(2, 3, 2) * rng.choice([-1, 1], 2)
-    wired, lost = rng.permutation(fibres), set(rng.choice(fibres, dead, replace=False).tolist())
-    gains = GAIN_V * np.exp(UNEVEN_GAIN * rng.standard_normal(fibres))
-    laid = [plan.to_mm(line) for line in _laid(Plan.of(plan), laid_mm / unit_mm, rng)]
-    read = [None if channel in lost else int(fibre) for channel, fibre in enumerate(wired)]
+    wiring, dead = rng.permutation(fibres), set(rng.choice(fibres, n_dead, replace=False).tolist())
+    gains_v = GAIN_V * np.exp(GAIN_SD * rng.standard_normal(fibres))
+    as_built_mm = [plan.to_mm(path) for path in _offset_paths(Plan.of(plan), lateral_offset_mm / unit_mm, rng)]
+    channel_fibres = [None if channel in dead else int(fibre) for channel, fibre in enumerate(wiring)]
     low, high = np.array(sensed_rectangle(plan.layout))
     width, height = (unit_mm * (high - low)).tolist()
 
     def twin(noise_v: float) -> Twin:
         channels = [
             TwinChannel(
-                channel, fibre, 0.0 if fibre is None else float(gains[channel]), noise_v, float(fibre is not None)
+                channel, fibre, 0.0 if fibre is None else float(gains_v[channel]), noise_v, float(fibre is not None)
             )
-            for channel, fibre in enumerate(read)
+            for channel, fibre in enumerate(channel_fibres)
         ]
-        courses = tuple(line if fibre in read else None for fibre, line in enumerate(laid))
-        frame = PlanTransform(True, float(turn), (float(shift[0]), float(shift[1])))
-        return Twin(
-            plan, tuple(channels), frame, distance * unit_mm, weight, courses, noise, (width, height), presses=1
-        )
+        paths = tuple(path if fibre in channel_fibres else None for fibre, path in enumerate(as_built_mm))
+        pose = PlanTransform(True, float(turn), (float(shift[0]), float(shift[1])))
+        return Twin(plan, tuple(channels), pose, distance * unit_mm, weight, paths, noise, (width, height), presses=1)
 
-    silent = twin(0.0)
-    places = rng.uniform(-0.5, 0.5, (400, 2)) * (width, height)
-    signals = silent.as_built_stretch(places)
-    largest = [abs(gains[c]) * signals[:, fibre].max() for c, fibre in enumerate(read) if fibre is not None]
-    return twin(noise * float(np.mean(largest)))
+    noiseless = twin(0.0)
+    stretch = noiseless.as_built_stretch(rng.uniform(-0.5, 0.5, (400, 2)) * (width, height))
+    full_scale_v = [
+        abs(gains_v[c]) * stretch[:, fibre].max() for c, fibre in enumerate(channel_fibres) if fibre is not None
+    ]
+    return twin(noise * float(np.mean(full_scale_v)))
 
 
-def _laid(plan: Plan, aside: float, rng: np.random.Generator) -> list[Array]:
-    """Courses (F, 2), grid units, beside their plan by smooth curves of standard deviation `aside`."""
-    out = []
-    for course, length in zip(plan.course, plan.length, strict=True):
-        run = np.cumsum(length) - length / 2
-        at = np.linspace(0, run[-1], 24)
-        alike = np.exp(-0.5 * ((at[:, None] - at) / SMOOTH) ** 2) + 1e-9 * np.eye(len(at))
-        curves = aside * np.linalg.cholesky(alike) @ rng.standard_normal((len(at), 2))
-        line = course + np.column_stack([np.interp(run, at, curve) for curve in curves.T])
-        out.append(np.vstack([1.5 * line[0] - 0.5 * line[1], line, 1.5 * line[-1] - 0.5 * line[-2]]))
-    return out
+def _offset_paths(plan: Plan, std: float, rng: np.random.Generator) -> list[Array]:
+    """Return paths beside the planned ones, offset by Gaussian processes of a standard deviation; grid units."""
+    paths = []
+    for path, length in zip(plan.course, plan.length, strict=True):
+        arc = np.cumsum(length) - length / 2
+        nodes = np.linspace(0, arc[-1], 24)
+        covariance = np.exp(-0.5 * ((nodes[:, None] - nodes) / OFFSET_SCALE) ** 2) + 1e-9 * np.eye(len(nodes))
+        offsets = std * np.linalg.cholesky(covariance) @ rng.standard_normal((len(nodes), 2))
+        points = path + np.column_stack([np.interp(arc, nodes, offset) for offset in offsets.T])
+        ends = 1.5 * points[0] - 0.5 * points[1], 1.5 * points[-1] - 0.5 * points[-2]
+        paths.append(np.vstack([ends[0], points, ends[1]]))
+    return paths
 
 
 @cache
 def printed(world: str) -> Twin:
-    reach, laid_mm, dead = WORLDS[world]
+    """Simulate the printed pad of a world."""
+    profile, lateral_offset_mm, n_dead = WORLDS[world]
     plan = Morphology.random(GRID, knots=KNOTS, seed=0)
-    return printed_pad(plan, np.random.default_rng(0), reach=reach, laid_mm=laid_mm, dead=dead)
+    rng = np.random.default_rng(0)
+    return printed_pad(plan, rng, profile=profile, lateral_offset_mm=lateral_offset_mm, n_dead=n_dead)
 
 
 @cache
 def recorded(world: str, presses: int) -> Recording:
+    """Simulate presses of the pad of a world."""
     return simulate(printed(world), RigSettings(presses=presses, seed=presses))
 
 
-def _identified(world: str, presses: int) -> Identification:
+def _identify(world: str, presses: int) -> Identification:
     return identify(recorded(world, presses), printed(world).morphology)
 
 
-def _believed(world: str, presses: int) -> Predict:
-    """The plan as it is, its gains fitted."""
-    pad, recording = printed(world), recorded(world, presses)
+def _fit_plan(world: str, presses: int) -> Predict:
+    """Fit the gains of the plan as designed."""
+    pad = printed(world)
+    measured = responses(recorded(world, presses), np.ones(presses, bool))
     fibres = [channel.fibre for channel in pad.channels]
-    answers = responses(recording, np.ones(presses, bool))
 
-    def planned(places_mm: Array) -> Array:
-        return signals(pad.morphology, pad.morphology.to_grid(pad.frame.to_plan(places_mm)), CLOSE)
+    def plan_signals(positions_mm: Array) -> Array:
+        return signals(pad.morphology, pad.morphology.to_grid(pad.frame.to_plan(positions_mm)), PLAN_CONTACT)
 
-    told = planned(answers.places_mm)
+    inputs = plan_signals(measured.places_mm)
     lines = [
-        None if fibre is None else np.polyfit(told[:, fibre], answers.volts[:, channel], 1)
+        np.zeros(2) if fibre is None else np.polyfit(inputs[:, fibre], measured.volts[:, channel], 1)
         for channel, fibre in enumerate(fibres)
     ]
 
-    def predict(places_mm: Array) -> Array:
-        found = planned(places_mm)
-        columns = [
-            np.zeros(len(found)) if fibre is None or line is None else np.polyval(line, found[:, fibre])
-            for fibre, line in zip(fibres, lines, strict=True)
-        ]
+    def predict(positions_mm: Array) -> Array:
+        inputs = plan_signals(positions_mm)
+        columns = [np.polyval(line, inputs[:, fibre or 0]) for fibre, line in zip(fibres, lines, strict=True)]
         return np.column_stack(columns).astype(np.float64)
 
     return predict
 
 
-def _smoothed(world: str, presses: int) -> Predict:
-    """Ridge regression on bumps over the pad, as the localizer's model of responses has it."""
-    pad, recording = printed(world), recorded(world, presses)
-    answers = responses(recording, np.ones(presses, bool))
-    half_mm = max(pad.sensed_mm) / 2
-    known = bumps(answers.places_mm / half_mm)
-    mean = answers.volts.mean(axis=0)
-    weights = np.linalg.solve(known.T @ known + RIDGE_PLACE * np.eye(known.shape[1]), known.T @ (answers.volts - mean))
-    return lambda places_mm: np.asarray(mean + bumps(places_mm / half_mm) @ weights, np.float64)
+def _fit_smooth(world: str, presses: int) -> Predict:
+    """Fit a smooth function of position by ridge regression on radial basis functions, as the localizer does."""
+    measured = responses(recorded(world, presses), np.ones(presses, bool))
+    half_mm = max(printed(world).sensed_mm) / 2
+    design_matrix, mean = bumps(measured.places_mm / half_mm), measured.volts.mean(axis=0)
+    gram = design_matrix.T @ design_matrix + RIDGE_PLACE * np.eye(design_matrix.shape[1])
+    weights = np.linalg.solve(gram, design_matrix.T @ (measured.volts - mean))
+    return lambda positions_mm: np.asarray(mean + bumps(positions_mm / half_mm) @ weights, np.float64)
 
 
-def _judged(world: str, found: Identification | Predict) -> Mapping[str, float | None]:
-    """Error of responses at fresh places, share of their spread; and of an identification what else it found."""
+def _evaluate(world: str, fitted: Identification | Predict) -> Mapping[str, float | None]:
+    """Return the relative error of responses at test positions, and of an identification its other results."""
     pad = printed(world)
-    places_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (FRESH, 2)) * pad.sensed_mm
-    signals_there, live = pad.as_built_stretch(places_mm), [c for c in pad.channels if c.fibre is not None]
-    true = np.column_stack([channel.gain_v * signals_there[:, channel.fibre] for channel in live])
-    if not isinstance(found, Identification):
-        return {"error": _off(found(places_mm)[:, [channel.channel for channel in live]], true)}
-    twin = found.twin()
-    rows = {channel: row for row, channel in enumerate(found.live.tolist())}
-    told = found.fit.pad.predict(places_mm)
-    columns = [told[:, rows[c.channel]] if c.channel in rows else np.zeros(FRESH) for c in live]
-    right = [twin.channels[channel.channel].fibre == channel.fibre for channel in pad.channels]
+    positions_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (TEST, 2)) * pad.sensed_mm
+    stretch, live = pad.as_built_stretch(positions_mm), [c for c in pad.channels if c.fibre is not None]
+    true = np.column_stack([channel.gain_v * stretch[:, channel.fibre] for channel in live])
+    if not isinstance(fitted, Identification):
+        return {"error": _relative_error(fitted(positions_mm)[:, [channel.channel for channel in live]], true)}
+    twin = fitted.twin()
+    rows = {channel: row for row, channel in enumerate(fitted.live.tolist())}
+    predicted = fitted.fit.pad.predict(positions_mm)
+    columns = [predicted[:, rows[c.channel]] if c.channel in rows else np.zeros(TEST) for c in live]
+    wired = [twin.channels[channel.channel].fibre == channel.fibre for channel in pad.channels]
     return {
-        "error": _off(np.column_stack(columns), true),
-        "right": float(np.mean(right)),
-        "explained": float(found.explained.mean()),
+        "error": _relative_error(np.column_stack(columns), true),
+        "right": float(np.mean(wired)),
+        "explained": float(fitted.explained.mean()),
         "noise": twin.noise / pad.noise,
     }
 
 
-def _off(told: Array, true: Array) -> float:
-    left = (told - told.mean(axis=0)) - (true - true.mean(axis=0))
-    return float(np.sqrt((left**2).mean(axis=0) / true.var(axis=0)).mean())
+def _relative_error(predicted: Array, true: Array) -> float:
+    """Return the rms error relative to the standard deviation, mean over channels, without constant offsets."""
+    residual = (predicted - predicted.mean(axis=0)) - (true - true.mean(axis=0))
+    return float(np.sqrt((residual**2).mean(axis=0) / true.var(axis=0)).mean())
 
 
 BENCH = Bench(
     "twin",
     trials,
-    error="error of predicted responses at fresh places, share of their spread",
+    "error of predicted responses at test positions, relative to their standard deviation",
     reference=("place", 1500),
-    best=("twin", 1500),
-    plain=("plan", "place"),
+    default=("twin", 1500),
+    baselines=("plan", "place"),
 )

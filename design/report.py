@@ -1,4 +1,4 @@
-"""What a report has to say of the design of a pad, and of where all its results came from."""
+"""Write the sections of a report on the design of a pad and on the provenance of all results."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -8,180 +8,162 @@ from padforge.design.common.files import find_unchanged, read_json, reraise_as_i
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
 
-
-def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """The fibres of a `design.json` in `folder`: plan, rules with their verdicts, terms of the objective.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: the plan is no picture.
-    """
-    terms, broken = document["terms"], document["violations"]
-    descriptions = document.get("descriptions", {})
-    described = [[name, value, descriptions.get(name, "")] for name, value in terms.items()]
-    settings = document["provenance"]["settings"]
-    pad, enforced = settings["pad"], settings["rules"]["enforce"]
-    layout = PadSettings(**pad).layout
-    unit_mm, (low, high) = layout.unit_mm, sensed_rectangle(layout)
-    levels = sorted(int(name[-1]) for name in terms if name.startswith("expected_error"))
-    both = terms, document.get("straight", {})
-    holds = f"{len(broken)} broken" if broken else "all hold" if enforced else "not asked for"
-    size = " x ".join(f"{round((b - a) * unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
-    plan = (
-        f"The plan of the pad, {size}: horizontal and vertical fibres, their crossings, and the contact in the middle."
-    )
-    fibres = PageSection(
-        "Fibres",
-        [
-            columns(
-                [figures([(folder / "design.svg", plan)])],
-                [
-                    heading("Errors by lost fibres"),
-                    paragraph(
-                        "What a localizer is expected to err, in mm, on average over all sets of so many failed"
-                        " fibres, and as much for straight fibres: before anything is built, by a formula that goes"
-                        " with the errors of trained networks within some 5 %. Responses are taken to scatter by"
-                        f" {float(settings['search']['scatter']):.0%} of themselves from press to press, and by"
-                        f" {float(settings['search']['noise']):.1%} of full scale."
-                    ),
-                    table(
-                        ["fibres failed", "expected error (mm)", "straight (mm)"],
-                        [[failed, *(_mm(each, f"expected_error_mm_{failed}") for each in both)] for failed in levels],
-                    ),
-                ],
-            ),
-            heading("Design rules"),
-            paragraph(f"Checked on the exact curves: {holds}."),
-            table(["rule", "limit", "verdict", "setting"], list(_rules(settings["rules"], broken))),
-            *([table(["broken rule", "fibres", "place (mm)", "measured", "limit"], _places(broken))] if broken else []),
-            collapsible("All terms of the objective", [table(["term", "value", "what it is"], described)]),
-        ],
-        [
-            (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
-            (holds, "design rules"),
-            (f"{_mm(terms, 'expected_error_mm_0')} mm", "expected error of the design"),
-        ],
-    )
-    return [fibres]
-
-
 PAD = "morphology.json"
 Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
-"""Its name, the document that it has left, and what a report has to say of that."""
+"""Name of a stage, its document, and the function that writes the sections on it."""
 
 
-def stage_pages(
-    folder: Path, stages: Sequence[Stage], recording: Callable[[], str | None] = lambda: None
-) -> tuple[list[PageSection], list[list[object]], list[str]]:
-    """What the documents in `folder` give to a report, as far as they are there.
+def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+    """Write the section on the fibres: plan, expected errors, design rules, terms of the objective.
 
     Args:
-        recording: gives the digest of the recording there, None where there is none; asked for if a stage is of one.
+        folder: folder of the pad.
+        document: its `design.json`.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is damaged.
+        InputError: the plan is not a picture.
+    """
+    terms, violations = document["terms"], document["violations"]
+    settings = document["provenance"]["settings"]
+    enforced, search = settings["rules"]["enforce"], settings["search"]
+    layout = PadSettings(**settings["pad"]).layout
+    low, high = sensed_rectangle(layout)
+    size = " x ".join(f"{round((b - a) * layout.unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
+    errors = [
+        [name[-1], *(f"{float(errors_mm[name]):#.3g}" for errors_mm in (terms, document["straight"]))]
+        for name in sorted(terms)
+        if name.startswith("expected_error")
+    ]
+    check = f"{len(violations)} broken" if violations else "all hold" if enforced else "not enforced"
+    plan = f"Plan of the pad, {size}: horizontal and vertical fibres, their crossings, and the contact at the centre."
+    error_text = (
+        "Expected error of a localizer in mm, averaged over all sets of failed fibres of a size. It is computed before"
+        " anything is built, by a formula that agrees with the errors of trained networks within about 5 %. Responses"
+        f" to a press vary by {float(search['scatter']):.0%} of their value from press to press, plus"
+        f" {float(search['noise']):.1%} of full scale."
+    )
+    body = [
+        columns(
+            [figures([(folder / "design.svg", plan)])],
+            [
+                heading("Errors by failed fibres"),
+                paragraph(error_text),
+                table(["failed fibres", "expected error (mm)", "straight fibres (mm)"], errors),
+            ],
+        ),
+        heading("Design rules"),
+        paragraph(f"Checked on the exact curves: {check}."),
+        table(["rule", "limit", "result", "setting"], list(_rule_rows(settings["rules"], violations))),
+    ]
+    if violations:
+        rows = [_violation_row(violation) for violation in violations]
+        body.append(table(["broken rule", "fibres", "position (mm)", "measured", "limit"], rows))
+    rows = [[name, value, document["descriptions"].get(name, "")] for name, value in terms.items()]
+    body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], rows)]))
+    key_figures = [
+        (f"{layout.horizontals} + {layout.verticals}", f"fibres on {size}"),
+        (check, "design rules"),
+        (f"{errors[0][1]} mm", "expected error of the design"),
+    ]
+    return [PageSection("Fibres", body, key_figures)]
+
+
+def _rule_rows(rules: Mapping[str, Any], violations: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
+    broken = {violation["rule"] for violation in violations}
+    for name, limit in rules.items():
+        if name != "enforce":
+            result = "fail" if name in broken else "pass" if rules["enforce"] else "not enforced"
+            field = RulesSettings.model_fields.get(name)
+            yield [field.description if field else name, limit, result, name]
+
+
+def _violation_row(violation: Mapping[str, Any]) -> list[object]:
+    fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
+    position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
+    return [violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]]
+
+
+def stage_sections(
+    folder: Path, stages: Sequence[Stage], recording: Callable[[], str | None] = lambda: None
+) -> tuple[list[PageSection], list[list[object]], list[str]]:
+    """Write the sections on all stages that have a document in a folder.
+
+    Args:
+        folder: folder of the pad.
+        stages: stages in the order of the report.
+        recording: returns the digest of the recording in the folder, None if there is none; called only if needed.
 
     Returns:
-        Parts of the page, rows of their provenance, and what does not belong together, which the first part tells too.
+        Sections, rows of their provenance, and results that are of another pad or recording; these are listed in a
+        section of their own, the first.
 
     Raises:
         InputError: a document is damaged.
     """
     sections: list[PageSection] = []
-    origins: list[list[object]] = []
-    strange: list[str] = []
-    for name, path, made_of in stages:
+    rows: list[list[object]] = []
+    mismatches: list[str] = []
+    for name, path, write_sections in stages:
         if path.exists():
             document = read_json(path, f"padforge-{name}/{2 if name == 'design' else 1}")
             with reraise_as_input_error(path):
-                strange += _misfits(folder, name, document, recording)
-                sections += made_of(folder, document)
-                origins.append(provenance_row(folder, name, document))
-    return [*([_misfits_section(strange)] if strange else []), *sections], origins, strange
+                mismatches += _find_mismatches(folder, name, document, recording)
+                sections += write_sections(folder, document)
+                rows.append(provenance_row(folder, name, document))
+    if mismatches:
+        advice = "This folder has files of two pads. Run these stages again, or use a folder for each pad."
+        sections.insert(0, PageSection("Files of different pads", list(map(paragraph, [advice, *mismatches]))))
+    return sections, rows, mismatches
 
 
-def _misfits(
+def _find_mismatches(
     folder: Path, stage: str, document: Mapping[str, Any], recording: Callable[[], str | None]
 ) -> Iterator[str]:
-    """What of a stage's result in `folder` is of another pad than the morphology.json there, or another recording.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-    """
-    made_by = document["provenance"]
-    inputs, told = made_by.get("inputs", {}), f"{stage} ({made_by.get('command')})"
-    made_of = inputs.get(PAD) if stage != "design" else document.get("morphology_sha256")
-    if isinstance(made_of, str) and (folder / PAD).is_file() and not find_unchanged(folder, {PAD: made_of}):
-        yield f"{told} is of another pad than the {PAD} here"
-    learnt_from = inputs.get("recording")
-    if isinstance(learnt_from, str) and recording() not in (None, learnt_from):
-        yield f"{told} is of another recording than the one here"
-
-
-def _misfits_section(found: Sequence[str]) -> PageSection:
-    """What does not belong together, as `_misfits` tells it."""
-    advice = paragraph("Files of two pads lie in this folder. Do these stages again, or put the pads into two folders.")
-    return PageSection("Does not belong together", [advice, *(paragraph(each) for each in found)])
+    """Yield whether a result is of another pad than the morphology.json in the folder, or of another recording."""
+    origin = document["provenance"]
+    inputs, name = origin.get("inputs", {}), f"{stage} ({origin.get('command')})"
+    pad = document.get("morphology_sha256") if stage == "design" else inputs.get(PAD)
+    if isinstance(pad, str) and (folder / PAD).is_file() and not find_unchanged(folder, {PAD: pad}):
+        yield f"{name} is of another pad than the {PAD} here"
+    if isinstance(inputs.get("recording"), str) and recording() not in (None, inputs["recording"]):
+        yield f"{name} is of another recording than the one here"
 
 
 def provenance_row(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
-    """Where the result of a stage came from: a row for `provenance_section`.
+    """Return the row of `provenance_section` on a document.
 
     Args:
-        folder: of the report; inputs that lie in it are compared with those that were used.
+        folder: folder of the report; inputs in it are compared with those that were used.
+        stage: name of the stage.
+        document: its document.
 
     Raises:
-        KeyError, TypeError, ValueError, AttributeError: the provenance is not as padforge writes it.
+        KeyError, TypeError, ValueError, AttributeError: the document is damaged.
     """
-    made_by = document["provenance"]
-    versions = ", ".join(f"{package} {version}" for package, version in made_by.get("versions", {}).items())
-    inputs = "; ".join(_inputs(folder, made_by.get("inputs", {})))
-    return [stage, made_by.get("command"), made_by.get("seed"), versions or "-", inputs or "-"]
+    origin = document["provenance"]
+    versions = ", ".join(f"{package} {version}" for package, version in origin.get("versions", {}).items())
+    inputs = "; ".join(_describe_inputs(folder, origin.get("inputs", {})))
+    return [stage, origin.get("command"), origin.get("seed"), versions or "-", inputs or "-"]
+
+
+def _describe_inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
+    for name, digest in inputs.items():
+        if not isinstance(digest, str):  # the provenance of an input that was computed
+            yield f"{name}: {digest['command']}" if digest else name
+        elif Path(name).name == name and (folder / name).is_file():  # never opens a file in another folder
+            match = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
+            yield f"{name} {digest} ({match})"
+        else:
+            yield f"{name} {digest}"
 
 
 def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
-    """Where all results came from, as rows of `origin` say."""
-    head = ["stage", "command", "seed", "versions", "inputs (sha256)"]
+    """Write the section on the provenance of all results, from the rows that `provenance_row` returns."""
+    header = ["stage", "command", "seed", "versions", "inputs (sha256)"]
     return PageSection(
-        "Provenance", [collapsible("Commands, seeds, versions and inputs of every stage", [table(head, rows)])]
+        "Provenance", [collapsible("Commands, seeds, versions and inputs of all stages", [table(header, rows)])]
     )
-
-
-def _mm(terms: Mapping[str, Any], name: str) -> str:
-    """A term in mm; nothing where a search before this version left none."""
-    value = terms.get(name)
-    return "-" if value is None else f"{float(value):#.3g}"
-
-
-def _rules(rules: Mapping[str, Any], broken: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
-    for name, limit in rules.items():
-        if name == "enforce":
-            continue
-        fails = any(violation["rule"] == name for violation in broken)
-        verdict = "fail" if fails else "pass" if rules["enforce"] else "not asked for"
-        known = RulesSettings.model_fields.get(name)
-        yield [known.description if known else name, limit, verdict, name]
-
-
-def _places(broken: Sequence[Mapping[str, Any]]) -> list[list[object]]:
-    return [
-        [
-            violation["rule"],
-            ", ".join(map(str, violation["fibres"])) or "pad",
-            "-" if violation["place_mm"] is None else "({:.1f}, {:.1f})".format(*violation["place_mm"]),
-            violation["measured"],
-            violation["limit"],
-        ]
-        for violation in broken
-    ]
-
-
-def _inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
-    for name, digest in inputs.items():
-        if not isinstance(digest, str):
-            yield f"{name}: {digest['command']}" if digest else name
-        elif Path(name).name == name and (folder / name).is_file():  # no name leads to files of others
-            here = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
-            yield f"{name} {digest} ({here})"
-        else:
-            yield f"{name} {digest}"
 
 
 def contact_line(document: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""The command line: the commands of all packages, and `run`, `init`, `report` and `bench`."""
+"""The command line: the commands of the three stages and of the studies, `run`, `init`, `report` and `bench`."""
 
 import sys
 from pathlib import Path
@@ -6,8 +6,7 @@ from pkgutil import resolve_name
 
 import click
 
-from padforge.benchmarks.cli import bench
-from padforge.design.cli import compare_command
+from padforge.design.cli import compare_command, search_progress
 from padforge.design.cli import design as design_group
 from padforge.design.common.command_line import (
     INTERRUPTED,
@@ -26,13 +25,23 @@ from padforge.sense.cli.main import sense as sense_group
 from padforge.sense.studies.cli import study as study_group
 
 from .report import write_report
-from .run import SECTIONS, Run, check_ahead, run_stages, sections
+from .run import SECTIONS, Run, check_run, run_stages, section_models
+
+try:
+    from padforge.benchmarks.cli import bench
+except ModuleNotFoundError:  # an installed wheel
+
+    @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+    def bench() -> None:
+        """Measure run time against error, in a checkout of the repository."""
+        raise InputError("bench runs in a checkout of the repository only, whose benchmarks are not installed")
+
 
 PRESETS = {"published": "padforge.design.settings:PUBLISHED"}
 """Settings other than the defaults, by section, that `padforge init` can write."""
 
 EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
-"""What of `pyproject.toml` each stage needs to be installed; what chains stages needs all of it."""
+"""Optional dependencies in `pyproject.toml` of each stage; commands that chain stages need all of them."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -42,17 +51,17 @@ def cli(context: click.Context) -> None:
     """From an idea to a calibrated soft strain-sensor pad.
 
     \b
-    padforge run                                     all of it, on built-in defaults, into out/pad
-    padforge design --out out/pad                    optimise the fibres
+    padforge run                                     all stages, on built-in defaults, into out/pad
+    padforge design --out out/pad                    optimise the paths of the fibres
     padforge fabricate out/pad/morphology.json       make the mould
-    padforge sense calibrate out/pad/recording       learn places from presses
-    padforge study robustness                        the paper's figures, for pads of your own
+    padforge sense calibrate out/pad/recording       train a localizer on recorded presses
+    padforge study robustness                        the figures of the paper, for your own pads
     """
     context.obj = list(SECTIONS)
 
 
-for group in (design_group, fabricate_group, sense_group, study_group, bench):
-    cli.add_command(group)
+for command in (design_group, fabricate_group, sense_group, study_group, bench):
+    cli.add_command(command)
 design_group.add_command(compare_command(mould_costs))
 
 
@@ -60,7 +69,7 @@ design_group.add_command(compare_command(mould_costs))
 @click.argument("path", type=click.Path(dir_okay=False, path_type=Path), default="pad.toml")
 @click.option("--preset", type=click.Choice(list(PRESETS)), help="published: contact, noise and area of the paper.")
 def _init(path: Path, preset: str | None) -> None:
-    """Write a settings file, pad.toml, with every default and a comment a key.
+    """Write a settings file, pad.toml, with every default and a comment on each key.
 
     \b
     padforge init
@@ -71,15 +80,15 @@ def _init(path: Path, preset: str | None) -> None:
 
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or move it away")
-    write_text(path, commented_toml(sections(), resolve_name(PRESETS[preset]) if preset else None))
+    write_text(path, commented_toml(section_models(), resolve_name(PRESETS[preset]) if preset else None))
     click.echo(f"settings -> {path}")
 
 
 @cli.command("run")
 @spec_option
 @formats_option
-@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Take about S seconds for all of it.")
-@click.option("--resume", is_flag=True, help="Go on where a run into the same folder was broken off.")
+@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Seconds for all stages together.")
+@click.option("--resume", is_flag=True, help="Reuse the finished stages of an earlier run into the same folder.")
 @seed_option
 @out_option("out/pad")
 @force_option
@@ -95,7 +104,7 @@ def _run(
     out: Path,
     force: bool,
 ) -> None:
-    """Do the whole job: optimise, mould, record presses on the simulated rig, calibrate, report.
+    """Run all stages: optimise, mould, record presses on the simulated rig, calibrate, report.
 
     \b
     padforge run
@@ -103,19 +112,21 @@ def _run(
     padforge run --time-budget 600 --formats 3mf,dxf
     padforge run --resume
 
-    Of a time budget the search takes half at most, and the calibration what is left after all else. --resume keeps
-    what is finished and was made of the same settings and files; a search goes on from its states. A calibration of
-    other than simulated presses, and a pad from which more was made than a run makes, give way with --force only.
+    The search uses at most half of a time budget, the calibration what remains after all other stages. --resume reuses
+    the stages whose settings and input files are unchanged, and continues an interrupted search. A localizer that was
+    not trained on simulated presses, and a pad from which files were made that a run does not make, are replaced with
+    --force only.
 
-    Exit 1 if the pad breaks a design rule or its mould fails a check; everything is written all the same.
+    Exit code 1 if the pad breaks a design rule or its mould fails a check; all files are written nevertheless.
     """
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
     run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
-    check_ahead(run)
+    check_run(run)
     with locked_folder(out):
-        if (code := run_stages(run)) != INTERRUPTED:
+        code = run_stages(run, click.echo, lambda message: click.echo(message, err=True), search_progress)
+        if code != INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")
     context.exit(code)
@@ -124,7 +135,7 @@ def _run(
 @cli.command("report")
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path), default="out/pad")
 def _report(folder: Path) -> None:
-    """Write report.html for the pad in FOLDER: whatever its stages have left there, on one page.
+    """Write report.html, one page on all results in the FOLDER of a pad.
 
     \b
     padforge report out/pad

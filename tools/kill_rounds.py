@@ -65,7 +65,7 @@ _TOGETHER = (
     {"out.mcap"},
     {"dataset"},
 )
-_OF_DESIGN = ("torch", "matplotlib.figure", "padforge.design.run")
+_OF_DESIGN = ("torch", "matplotlib.figure", "padforge.design.design_run")
 _OF_OTHERS = (
     *("build123d", "shapely", "trimesh", "h5py", "rosbags.rosbag2", "pyarrow", "numba"),
     *("padforge.fabricate.export", "padforge.sense.localizer.calibration.training", "padforge.sense.report.sections"),

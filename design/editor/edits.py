@@ -1,4 +1,4 @@
-"""What is told of fibres as they are drawn: the rules they break, and where they confuse presses."""
+"""Edit the paths of fibres knot by knot, and evaluate them: broken rules and the ambiguity of presses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,136 +15,148 @@ from padforge.design.paths.curves import beziers
 from padforge.design.paths.fitting import add_spare_knots
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
 
-NEAREST = 1e-3
-"""Least distance of two knots along a fibre, grid units."""
-MOST_KNOTS = 64
-"""Inner knots of a fibre at most, as of [search] knots."""
-HANDLES = 5
-"""Inner knots of a straight fibre, to take hold of."""
+MIN_DISTANCE = 1e-3
+"""Smallest distance of two knots along a fibre, grid units."""
+MAX_KNOTS = 64
+"""Inner knots of a fibre, as for [search] knots."""
+STRAIGHT_KNOTS = 5
+"""Inner knots of a straight fibre, as handles for editing."""
 
-Courses = tuple[Array, ...]
-"""Of every fibre its knots (n, 2), grid units."""
+Paths = tuple[Array, ...]
+"""Knots of every fibre, shape (n, 2), grid units."""
 
 
-def straight_courses(layout: Layout) -> Courses:
-    """Straight fibres with knots to take hold of."""
-    share = np.linspace(0, 1, HANDLES + 2)[:, None]
+def straight_paths(layout: Layout) -> Paths:
+    """Return straight fibres with STRAIGHT_KNOTS inner knots."""
+    share = np.linspace(0, 1, STRAIGHT_KNOTS + 2)[:, None]
     return tuple(line[0] + share * (line[-1] - line[0]) for line in Morphology.straight(layout).knots)
 
 
-def moved(courses: Courses, layout: Layout, fibre: int, knot: int, place: Sequence[float]) -> Courses:
-    """With an inner knot at `place`, or as near to it as it may be: between its neighbours, on the pad."""
-    course, axis = courses[fibre].copy(), layout.family(fibre)
-    low, high = course[knot - 1, axis] + NEAREST, course[knot + 1, axis] - NEAREST
-    if low <= high:  # else it lies between two others that leave no room
-        course[knot, axis] = np.clip(place[axis], low, high)
-    course[knot, 1 - axis] = np.clip(place[1 - axis], 0, layout.extent[1 - axis])
-    return _with(courses, fibre, course)
+def replace_path(paths: Paths, fibre: int, path: Array) -> Paths:
+    """Return the paths with another one for a fibre."""
+    return (*paths[:fibre], path, *paths[fibre + 1 :])
 
 
-def with_knot(courses: Courses, layout: Layout, fibre: int, place: Sequence[float] | None) -> tuple[Courses, int]:
-    """With one more knot of a fibre on its curve, next to `place` or in the middle of its longest span, and its index.
+def move_knot(paths: Paths, layout: Layout, fibre: int, knot: int, position: Sequence[float]) -> Paths:
+    """Move an inner knot to a position, clipped to the pad and to the range between its neighbours.
+
+    Args:
+        paths: paths of all fibres.
+        layout: layout of the pad.
+        fibre: index of the fibre.
+        knot: index of the knot.
+        position: x and y, grid units.
+    """
+    path, axis = paths[fibre].copy(), layout.family(fibre)
+    low, high = path[knot - 1, axis] + MIN_DISTANCE, path[knot + 1, axis] - MIN_DISTANCE
+    if low <= high:  # else there is no room between its neighbours
+        path[knot, axis] = np.clip(position[axis], low, high)
+    path[knot, 1 - axis] = np.clip(position[1 - axis], 0, layout.extent[1 - axis])
+    return replace_path(paths, fibre, path)
+
+
+def insert_knot(paths: Paths, layout: Layout, fibre: int, position: Sequence[float] | None) -> tuple[Paths, int]:
+    """Insert a knot on the curve of a fibre, so that its shape hardly changes.
+
+    Args:
+        paths: paths of all fibres.
+        layout: layout of the pad.
+        fibre: index of the fibre.
+        position: x and y near which to insert it, grid units; the middle of the longest span if None.
+
+    Returns:
+        The paths, and the index of the new knot.
 
     Raises:
-        InputError: it has as many as it may have, or they leave no room there.
+        InputError: the fibre has MAX_KNOTS already, or there is no room between its knots.
     """
     from scipy.interpolate import PchipInterpolator
 
-    course, axis = courses[fibre], layout.family(fibre)
-    travel = course[:, axis]
-    if len(course) >= MOST_KNOTS + 2:
-        raise InputError(f"fibre {fibre + 1} has {MOST_KNOTS} knots, which is all that it may have")
-    longest = int(np.argmax(np.diff(travel)))
-    at = float(travel[longest : longest + 2].mean() if place is None else place[axis])
-    knot = int(np.clip(np.searchsorted(travel, at), 1, len(course) - 1))
-    low, high = travel[knot - 1] + NEAREST, travel[knot] - NEAREST
+    path, axis = paths[fibre], layout.family(fibre)
+    along, across = path[:, axis], path[:, 1 - axis]
+    if len(path) >= MAX_KNOTS + 2:
+        raise InputError(f"fibre {fibre + 1} has {MAX_KNOTS} knots, which is the maximum")
+    longest = int(np.argmax(np.diff(along)))
+    target = float(along[longest : longest + 2].mean() if position is None else position[axis])
+    knot = int(np.clip(np.searchsorted(along, target), 1, len(path) - 1))
+    low, high = along[knot - 1] + MIN_DISTANCE, along[knot] - MIN_DISTANCE
     if low > high:
         raise InputError(f"fibre {fibre + 1} has no room for a knot there")
-    at = float(np.clip(at, low, high))
-    new = np.empty(2)
-    new[axis], new[1 - axis] = at, PchipInterpolator(travel, course[:, 1 - axis])(at)
-    return _with(courses, fibre, np.insert(course, knot, new, axis=0)), knot
-
-
-def without_knot(courses: Courses, fibre: int, knot: int) -> Courses:
-    """With one inner knot of a fibre less."""
-    return _with(courses, fibre, np.delete(courses[fibre], knot, axis=0))
-
-
-def _with(courses: Courses, fibre: int, course: Array) -> Courses:
-    return (*courses[:fibre], course, *courses[fibre + 1 :])
+    target = float(np.clip(target, low, high))
+    inserted = np.empty(2)
+    inserted[axis], inserted[1 - axis] = target, PchipInterpolator(along, across)(target)
+    return replace_path(paths, fibre, np.insert(path, knot, inserted, axis=0)), knot
 
 
 @dataclass(frozen=True)
-class Answers:
-    """What a pad is judged by.
+class PathEvaluator:
+    """Evaluates edited paths by the settings of a pad.
 
     Attributes:
-        size: of the pad, whose layout all courses have.
+        pad_settings: the pad, whose layout all paths have.
+        rules: design rules to check.
+        contact: contact of the presses.
+        search: number of failed fibres.
     """
 
-    size: PadSettings
+    pad_settings: PadSettings
     rules: RulesSettings
     contact: Contact
     search: SearchSettings
 
-    def morphology(self, courses: Courses) -> Morphology:
-        """The courses as a pad."""
-        layout = self.size.layout
-        return Morphology.from_layout(add_spare_knots(courses, layout), layout)
+    def to_morphology(self, paths: Paths) -> Morphology:
+        """Return the pad of these paths, with as many knots on every fibre as on the one with most."""
+        layout = self.pad_settings.layout
+        return Morphology.from_layout(add_spare_knots(paths, layout), layout)
 
-    def of(self, courses: Courses) -> dict[str, Any]:
-        """All that is told of courses, JSON, in mm from the middle of the pad and grid units."""
-        pad = self.morphology(courses)
-        spread = self._spread(pad)
-        broken = check_rules(pad, self.rules, self.size)
-        spans = pad.to_mm(beziers(pad)).round(4)
+    def evaluate(self, paths: Paths) -> dict[str, Any]:
+        """Return knots, curves, broken rules and ambiguities of the paths as JSON, mm from the centre of the pad."""
+        pad = self.to_morphology(paths)
+        ambiguity_mm = self._ambiguity_mm(pad)
+        spans_mm = pad.to_mm(beziers(pad)).round(4).tolist()
         return {
             "fibres": [
-                {"family": pad.layout.family(fibre), "knots": _told(pad, course), "spans": spans[fibre].tolist()}
-                for fibre, course in enumerate(courses)
+                {"family": pad.layout.family(n), "knots": pad.to_mm(path).round(4).tolist(), "spans": spans_mm[n]}
+                for n, path in enumerate(paths)
             ],
             "rules": [
-                {"text": str(found), "fibres": found.fibres, "place_mm": found.place_mm and list(found.place_mm)}
-                for found in broken
+                {"text": str(rule), "fibres": rule.fibres, "place_mm": rule.place_mm and list(rule.place_mm)}
+                for rule in check_rules(pad, self.rules, self.pad_settings)
             ],
-            "map": np.round(spread, 4).tolist(),
-            "ambiguity": spread.mean(axis=1).tolist(),
+            "ambiguity_map_mm": np.round(ambiguity_mm, 4).tolist(),
+            "ambiguity_mm": ambiguity_mm.mean(axis=1).tolist(),
         }
 
     @cached_property
-    def fixed(self) -> dict[str, Any]:
-        """What stays while fibres are drawn, JSON."""
-        layout = self.size.layout
+    def constants(self) -> dict[str, Any]:
+        """What does not depend on the paths, as JSON: the pad, its pressed positions, and straight fibres beside it."""
+        layout = self.pad_settings.layout
         straight = Morphology.straight(layout)
-        low, high = (straight.to_mm(corner) for corner in self.size.sensed)
-        places = straight.to_mm(self._presses)
+        low, high = (straight.to_mm(corner) for corner in self.pad_settings.sensed)
+        positions_mm = straight.to_mm(self._presses)
         return {
             "middle_mm": [0, 0],
             "half_mm": [side / 2 for side in layout.size_mm],
             "unit_mm": layout.unit_mm,
             "mirrored": False,
-            "deep": int(self.size.deep_family == "vertical"),
+            "deep_family": int(self.pad_settings.deep_family == "vertical"),
             "sensed_mm": [*low.tolist(), *high.tolist()],
-            "keep_out_mm": self.size.keep_out_mm,
-            "places_mm": places.round(3).tolist(),
-            "cell_mm": [_step(places[:, axis]) for axis in (0, 1)],
-            "straight": self._spread(straight).mean(axis=1).tolist(),
+            "keep_out_mm": self.pad_settings.keep_out_mm,
+            "positions_mm": positions_mm.round(3).tolist(),
+            "cell_mm": [_lattice_step(column) for column in positions_mm.T],
+            "straight_mm": self._ambiguity_mm(straight).mean(axis=1).tolist(),
         }
 
     @cached_property
     def _presses(self) -> Array:
-        return free_presses(self.size)
+        return free_presses(self.pad_settings)
 
-    def _spread(self, pad: Morphology) -> Array:
-        return ambiguity_map(pad, self._presses, self.contact, self.search.max_failures, AMBIGUITY_NOISE)
-
-
-def _told(pad: Morphology, course: Array) -> list[list[float]]:
-    return pad.to_mm(course).round(4).tolist()
+    def _ambiguity_mm(self, pad: Morphology) -> Array:
+        noise = AMBIGUITY_NOISE
+        return pad.unit_mm * ambiguity_map(pad, self._presses, self.contact, self.search.max_failures, noise)
 
 
-def _step(places: Array) -> float:
-    """Distance of neighbouring rows or columns of a lattice."""
-    apart = np.diff(np.unique(places.round(6)))
-    return float(apart.min()) if len(apart) else 1.0
+def _lattice_step(values: Array) -> float:
+    """Return the distance of neighbouring rows or columns of a lattice; 1 if there is only one."""
+    steps = np.diff(np.unique(values.round(6)))
+    return float(steps.min()) if len(steps) else 1.0

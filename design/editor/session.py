@@ -1,4 +1,4 @@
-"""One pad being drawn: what a page posts goes in, what it shows comes out, and a morphology is saved."""
+"""Edit one pad in a browser: apply the edits that a page posts, publish its view, and save the morphology."""
 
 import json
 import os
@@ -9,237 +9,245 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import numpy as np
+
 from padforge.design.common.files import check_replaceable, find_dependents, provenance
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
-from padforge.design.editor.edits import Answers, Courses, moved, straight_courses, with_knot, without_knot
 from padforge.design.morphology import MAX_COORDINATE, Morphology
 from padforge.design.paths.fitting import remove_spare_knots
 
-MOST_STEPS = 1000
-"""That are remembered."""
+from .edits import PathEvaluator, Paths, insert_knot, move_knot, replace_path, straight_paths
+
+MAX_STEPS = 1000
+"""Edits that can be undone."""
+MAX_GESTURE = 40
+"""Characters of the name of a gesture."""
 
 
 class EditHistory:
-    """The courses as they are, and as they were before.
+    """The paths being edited, with undo and redo."""
 
-    Attributes:
-        now: the courses.
-    """
+    def __init__(self, paths: Paths) -> None:
+        self._states, self._index, self._saved, self._gesture = [paths], 0, paths, ""
 
-    def __init__(self, begin: Courses) -> None:
-        self.now = begin
-        self._before: list[Courses] = []
-        self._after: list[Courses] = []
-        self._saved = begin
-        self._gesture = ""
+    @property
+    def paths(self) -> Paths:
+        """The current paths."""
+        return self._states[self._index]
 
-    def do(self, courses: Courses, gesture: str = "") -> None:
-        """These are the courses from now on; what belongs to one gesture, such as a drag, is one step."""
+    def do(self, paths: Paths, gesture: str = "") -> None:
+        """Replace the paths; edits of one gesture, such as a drag, are undone together.
+
+        Args:
+            paths: the new paths.
+            gesture: name of the gesture, if the edit belongs to one.
+        """
         if not gesture or gesture != self._gesture:
-            self._before = [*self._before, self.now][-MOST_STEPS:]
-        self.now, self._after, self._gesture = courses, [], gesture
+            self._index += 1
+        self._states[self._index :] = [paths]
+        del self._states[: -MAX_STEPS - 1]
+        self._index, self._gesture = len(self._states) - 1, gesture
 
     def undo(self) -> None:
-        """Take the last step back, if there is one."""
-        if self._before:
-            self._after.append(self.now)
-            self.now, self._gesture = self._before.pop(), ""
+        """Undo the last step, if there is one."""
+        self._index, self._gesture = max(self._index - 1, 0), ""
 
     def redo(self) -> None:
-        """Take the step again that was taken back last, if there is one."""
-        if self._after:
-            self._before.append(self.now)
-            self.now, self._gesture = self._after.pop(), ""
+        """Redo the step that was undone last, if there is one."""
+        self._index, self._gesture = min(self._index + 1, len(self._states) - 1), ""
 
-    def keep(self, courses: Courses) -> None:
-        """These were saved."""
-        self._saved = courses
+    def mark_saved(self) -> None:
+        """Note that the current paths are saved."""
+        self._saved = self.paths
 
     @property
     def unsaved(self) -> bool:
-        """Whether something has changed since it was saved, or begun."""
-        return self.now is not self._saved
+        """Whether the paths differ from those saved last."""
+        return self.paths is not self._saved
 
     @property
-    def steps(self) -> tuple[int, int]:
-        """How many can be taken back, and taken again."""
-        return len(self._before), len(self._after)
+    def can_undo(self) -> bool:
+        """Whether there is a step to undo."""
+        return self._index > 0
 
-
-_LONGEST_GESTURE = 40
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is a step to redo."""
+        return self._index < len(self._states) - 1
 
 
 class EditSession:
-    """A pad being drawn; several threads may ask at once.
+    """A pad being edited; thread-safe.
 
     Attributes:
-        out: the file it is saved to: the next free name beside it where another one came there after this began, or
-            others were made from it since.
+        out: the file to save to; the next free name if another program wrote to it after the session began, or other
+            files were made from the pad saved there.
     """
 
     def __init__(
         self,
-        answers: Answers,
+        evaluator: PathEvaluator,
         source: Path | None,
         out: Path,
-        show: Callable[[dict[str, Any]], None],
+        publish: Callable[[dict[str, Any]], None],
         force: bool = False,
     ) -> None:
-        """Begin with the pad of a file, or with straight fibres.
+        """Load the pad to edit.
 
         Args:
-            show: takes what pages show whenever that has changed.
-            force: whether a pad is replaced that others beside it were made from.
+            evaluator: evaluates the edited paths.
+            source: file of a morphology; straight fibres if None.
+            out: file to save to.
+            publish: sends a view to all pages.
+            force: whether to replace a pad from which other files beside it were made.
 
         Raises:
-            InputError: a pad that cannot be read, or others were made from the one at `out`.
+            InputError: an unreadable pad, or other files were made from the pad at `out`.
         """
-        self.out, self._ours, self._force = out, out.exists(), force
-        self._answers, self._source, self._show = answers, source, show
-        layout = answers.size.layout
-        self._made_by = provenance("padforge design edit", None, [] if source is None else [source])
-        self._made_by["settings"] = {"pad": answers.size.model_dump(mode="json")}
-        check_replaceable(out, self._made_by, force=force)
-        begin = (
-            straight_courses(layout) if source is None else remove_spare_knots(Morphology.load(source).knots, layout)
-        )
-        self._history = EditHistory(tuple(begin))
-        self._lock, self._number, self._name = Lock(), 0, secrets.token_hex(8)
-        self._told = "" if source is None else f"as {source} has it"
+        self.out, self._out_is_ours, self._force = out, out.exists(), force
+        self._evaluator, self._publish = evaluator, publish
+        self._provenance = provenance("padforge design edit", None, [] if source is None else [source])
+        self._provenance["settings"] = {"pad": evaluator.pad_settings.model_dump(mode="json")}
+        check_replaceable(out, self._provenance, force=force)
+        layout = evaluator.pad_settings.layout
+        paths = straight_paths(layout) if source is None else remove_spare_knots(Morphology.load(source).knots, layout)
+        self._history = EditHistory(tuple(paths))
+        self._lock, self._number, self._id = Lock(), 0, secrets.token_hex(8)
+        self._title = f"{source or 'straight fibres'}, {layout}"
+        self._saved_message = "" if source is None else f"as in {source}"
         self._view: dict[str, Any] = {"ready": False, "title": self._title, "ended": ""}
 
     def begin(self) -> None:
-        """Show the pad for the first time, which takes long where kernels are not compiled yet."""
-        self._show(self._view)
+        """Publish the first view, which takes long if kernels must be compiled."""
+        self._publish(self._view)
         with self._lock:
-            self._changed((0, 1))
+            self._update((0, 1))
+
+    def end(self) -> None:
+        """Tell all pages that the session has ended."""
+        with self._lock:
+            self._publish(self._view | {"ended": "ended in the terminal"})
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether there are edits that are not saved."""
+        return self._history.unsaved
 
     def edit(self, body: bytes) -> Mapping[str, Any]:
-        """Do what a page asks for: {"do": "move", "fibre": 1, "knot": 2, "x_mm": .., "y_mm": .., "gesture": ".."}.
+        """Apply an edit, such as {"do": "move", "fibre": 1, "knot": 2, "x_mm": 3.0, "y_mm": 4.0, "gesture": "a"}.
 
-        "add" takes a fibre and perhaps a place, "remove" a fibre and a knot, "undo" and "redo" nothing. Fibres count
-        from 1, inner knots as well. What belongs to one gesture is undone at once.
+        "add" takes a fibre and optionally a position, "remove" a fibre and a knot, "undo" and "redo" nothing. Fibres
+        and inner knots count from 1. Edits of one gesture are undone together.
+
+        Args:
+            body: the edit as JSON.
 
         Returns:
-            What the page shows.
+            The new view.
 
         Raises:
-            InputError: no such thing can be done; nothing has changed then.
+            InputError: an invalid edit, which changes nothing.
         """
-        asked = _document(body)
+        edit = _parse_object(body)
         with self._lock:
-            history = self._history
-            at = (0, 1)
-            match asked.get("do"):
+            history, layout, selected = self._history, self._evaluator.pad_settings.layout, (0, 1)
+            match edit.get("do"):
                 case "move":
-                    fibre, knot = self._knot(asked)
-                    at, gesture = (fibre, knot), asked.get("gesture", "")
-                    if not isinstance(gesture, str) or len(gesture) > _LONGEST_GESTURE:
-                        raise InputError(
-                            f"gesture is {short_repr(gesture)}, expected up to {_LONGEST_GESTURE} characters"
-                        )
-                    place = self._place(asked)
-                    history.do(moved(history.now, self._answers.size.layout, fibre, knot, place), gesture)
+                    fibre, knot = selected = self._knot(edit)
+                    gesture = edit.get("gesture", "")
+                    if not isinstance(gesture, str) or len(gesture) > MAX_GESTURE:
+                        raise InputError(f"gesture is {short_repr(gesture)}, expected up to {MAX_GESTURE} characters")
+                    history.do(move_knot(history.paths, layout, fibre, knot, self._position(edit)), gesture)
                 case "add":
-                    fibre = self._fibre(asked)
-                    place = self._place(asked) if "x_mm" in asked else None
-                    courses, knot = with_knot(history.now, self._answers.size.layout, fibre, place)
-                    history.do(courses)
-                    at = fibre, knot
+                    fibre = self._fibre(edit)
+                    position = self._position(edit) if "x_mm" in edit else None
+                    paths, knot = insert_knot(history.paths, layout, fibre, position)
+                    history.do(paths)
+                    selected = fibre, knot
                 case "remove":
-                    fibre, knot = self._knot(asked)
-                    history.do(without_knot(history.now, fibre, knot))
-                    at = fibre, max(knot - 1, 1)
+                    fibre, knot = self._knot(edit)
+                    history.do(replace_path(history.paths, fibre, np.delete(history.paths[fibre], knot, axis=0)))
+                    selected = fibre, max(knot - 1, 1)
                 case "undo":
                     history.undo()
                 case "redo":
                     history.redo()
                 case other:
                     raise InputError(f"do is {short_repr(other)}, allowed are move, add, remove, undo and redo")
-            return self._changed(at)
+            return self._update(selected)
 
     def save(self, body: bytes) -> Mapping[str, Any]:
-        """Write the pad to `out`, whole or not at all.
+        """Write the pad to `out`, atomically.
+
+        Args:
+            body: ignored.
+
+        Returns:
+            The new view.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         with self._lock:
-            courses = self._history.now
-            kept = not self._ours or (self.unsaved and not self._force and find_dependents(self.out))
-            if self.out.is_file() and kept:
+            replaces = self._out_is_ours and (self._force or not self.unsaved or not find_dependents(self.out))
+            if self.out.is_file() and not replaces:
                 self.out = free_name(self.out)
-            pad = self._answers.morphology(courses)
-            Morphology.from_layout(pad.knots, pad.layout, self._made_by).save(self.out)
-            self._ours = True
-            self._history.keep(courses)
-            self._told = f"saved to {self.out}"
-            return self._changed((0, 1))
+            pad = self._evaluator.to_morphology(self._history.paths)
+            Morphology.from_layout(pad.knots, pad.layout, self._provenance).save(self.out)
+            self._out_is_ours = True
+            self._history.mark_saved()
+            self._saved_message = f"saved to {self.out}"
+            return self._update((0, 1))
 
-    def end(self) -> None:
-        """Tell pages that nothing more comes."""
-        with self._lock:
-            self._show(self._view | {"ended": "ended in the terminal"})
-
-    @property
-    def unsaved(self) -> bool:
-        """Whether something has changed since it was saved, or begun."""
-        return self._history.unsaved
-
-    @property
-    def _title(self) -> str:
-        return f"{self._source or 'straight fibres'}, {self._answers.size.layout}"
-
-    def _changed(self, at: tuple[int, int]) -> dict[str, Any]:
-        """What there is to show now, shown. The knot at `at` is the one to look at."""
-        back, forth = self._history.steps
+    def _update(self, selected: tuple[int, int]) -> dict[str, Any]:
+        """Publish and return a new view, with the fibre and the knot to select."""
         self._number += 1
         self._view = {
-            **self._answers.fixed,
-            **self._answers.of(self._history.now),
+            **self._evaluator.constants,
+            **self._evaluator.evaluate(self._history.paths),
             "ready": True,
             "title": self._title,
-            "session": self._name,
+            "session": self._id,
             "number": self._number,
-            "at": at,
-            "can_undo": back > 0,
-            "can_redo": forth > 0,
+            "selected": selected,
+            "can_undo": self._history.can_undo,
+            "can_redo": self._history.can_redo,
             "unsaved": self.unsaved,
             "out": str(self.out),
-            "told": "" if self.unsaved else self._told,
+            "message": "" if self.unsaved else self._saved_message,
             "ended": "",
         }
-        self._show(self._view)
+        self._publish(self._view)
         return self._view
 
-    def _fibre(self, asked: Mapping[str, Any]) -> int:
-        return check_int("fibre", asked.get("fibre"), 1, len(self._history.now)) - 1
+    def _fibre(self, edit: Mapping[str, Any]) -> int:
+        return check_int("fibre", edit.get("fibre"), 1, len(self._history.paths)) - 1
 
-    def _knot(self, asked: Mapping[str, Any]) -> tuple[int, int]:
-        fibre = self._fibre(asked)
-        inner = len(self._history.now[fibre]) - 2
+    def _knot(self, edit: Mapping[str, Any]) -> tuple[int, int]:
+        fibre = self._fibre(edit)
+        inner = len(self._history.paths[fibre]) - 2
         if not inner:
-            raise InputError(f"fibre {fibre + 1} has no knot but its ends")
-        return fibre, check_int("knot", asked.get("knot"), 1, inner)
+            raise InputError(f"fibre {fibre + 1} has no inner knot")
+        return fibre, check_int("knot", edit.get("knot"), 1, inner)
 
-    def _place(self, asked: Mapping[str, Any]) -> list[float]:
-        """Where something is asked for, grid units."""
-        layout = self._answers.size.layout
-        place_mm = (check_float(name, asked.get(name), -MAX_COORDINATE, MAX_COORDINATE) for name in ("x_mm", "y_mm"))
-        return [at / layout.unit_mm + extent / 2 for at, extent in zip(place_mm, layout.extent, strict=True)]
+    def _position(self, edit: Mapping[str, Any]) -> list[float]:
+        """Return the position of an edit, grid units from the lower left corner of the pad."""
+        layout = self._evaluator.pad_settings.layout
+        position_mm = (check_float(name, edit.get(name), -MAX_COORDINATE, MAX_COORDINATE) for name in ("x_mm", "y_mm"))
+        return [value / layout.unit_mm + extent / 2 for value, extent in zip(position_mm, layout.extent, strict=True)]
 
 
 def free_name(path: Path) -> Path:
-    """The first of NAME.json, NAME-2.json, NAME-3.json, ... that no file has."""
+    """Return the first of NAME.json, NAME-2.json, NAME-3.json, ... that does not exist."""
     names = (path.with_stem(f"{path.stem}{f'-{number}' * (number > 1)}") for number in count(1))
-    return next(each for each in names if not os.path.lexists(each))
+    return next(name for name in names if not os.path.lexists(name))
 
 
-def _document(body: bytes) -> Mapping[str, Any]:
+def _parse_object(body: bytes) -> Mapping[str, Any]:
     try:
         document = json.loads(body)
     except (ValueError, RecursionError) as error:
-        raise InputError("what was posted is no JSON") from error
+        raise InputError("the request is not JSON") from error
     if not isinstance(document, dict):
-        raise InputError(f"{short_repr(document)} was posted, expected an object")
+        raise InputError(f"the request is {short_repr(document)}, expected an object")
     return document

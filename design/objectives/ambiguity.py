@@ -10,12 +10,10 @@ posterior
 """
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numba import njit
-from torch import Tensor
 
 from padforge.design.common.validation import InputError
 from padforge.design.contact import fibre_axes, grid_positions, press_shape, relative_stretch, signals
@@ -26,6 +24,9 @@ from padforge.design.objectives.fibre_loss import failure_masks, failure_shares,
 from padforge.design.paths.curves import lengths
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SIDE, MAX_SUBSETS = 20, 64
 """Presses along a side of the grid, and sets of failed fibres of a size."""
@@ -50,7 +51,7 @@ def free_presses(size: PadSettings) -> Array:
     return presses
 
 
-def ambiguity(signals: Tensor, presses: Tensor, masks: Tensor, weights: Tensor, noise: float) -> Tensor:
+def ambiguity(signals: "Tensor", presses: "Tensor", masks: "Tensor", weights: "Tensor", noise: float) -> "Tensor":
     """Compute A of the module's formula, weighted over sets of failed fibres; differentiable.
 
     Args:
@@ -60,6 +61,8 @@ def ambiguity(signals: Tensor, presses: Tensor, masks: Tensor, weights: Tensor, 
         weights: of each set, sum 1; shape (L,).
         noise: sigma of a signal, grid units, > 0.
     """
+    import torch  # not above: the editor maps the ambiguity without it
+
     scaled = masks.double()[:, None, :] * (signals.T.double() / (2 * noise))
     # |s_a|^2 is the same for every b and cancels in the posterior; what remains is one product of matrices, in double
     # precision since it cancels
@@ -84,6 +87,8 @@ def ambiguities(
     Returns:
         Means over sets of failed fibres, grid units.
     """
+    import torch
+
     presses = free_presses(size)
     stretch = torch.tensor(relative_stretch(pad, presses, contact).T, dtype=torch.float32)
     touched = stretch.any(dim=1)  # the other fibres have no information; on a large pad they are most
@@ -98,7 +103,7 @@ def ambiguities(
     return values
 
 
-def full_scale(signals: Tensor) -> float:
+def full_scale(signals: "Tensor") -> float:
     """Return the mean over touched fibres of their largest signal, from signals (F, Q); 1 if none is touched."""
     largest = signals.detach().amax(dim=1)
     touched = largest[largest > 0]

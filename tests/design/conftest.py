@@ -7,13 +7,13 @@ from padforge.benchmarks import harness
 
 @pytest.fixture
 def taken(monkeypatch):
-    """What one quick round of a bench finds, by trial."""
+    """Evaluations of one quick round of a benchmark, by trial."""
     monkeypatch.setattr(harness, "BUDGET_S", 0)
 
     def found(bench):
         rounds = harness.BenchRounds()
         harness.measure_round(bench, rounds, lambda step: None, lambda key: False)
-        return rounds.found
+        return rounds.results
 
     return found
 

@@ -10,7 +10,7 @@ from padforge.design import compare as comparison
 from tests.helpers.door import called
 
 
-def test_pads_that_are_there_are_judged_as_they_are(tmp_path):
+def test_compare_evaluates_finished_pads(tmp_path):
     Morphology.straight((2, 3), (8.0, 15.0)).save(tmp_path / "plain.json")
     Morphology.random(2, 3, seed=1).save(tmp_path / "bent.json")
     result = called("design", "compare", "plain.json", "bent.json", "--out", "both", "--json", cwd=tmp_path)
@@ -25,7 +25,7 @@ def test_pads_that_are_there_are_judged_as_they_are(tmp_path):
     assert (tmp_path / "both" / "comparison.png").stat().st_size > 10_000
 
 
-def test_values_in_turn_are_designed_each_in_its_folder(tmp_path):
+def test_compare_designs_every_variant_in_its_folder(tmp_path):
     (tmp_path / "pad.toml").write_text("[search]\nsteps = 2\nstarts = 1\nknots = 2\n[rules]\nenforce = false\n")
     result = called(
         "design", "compare", "--vary", "pad.grid=1", "--vary", "pad.pitch_mm=9,[8,12]", "--out", "c", cwd=tmp_path
@@ -34,21 +34,21 @@ def test_values_in_turn_are_designed_each_in_its_folder(tmp_path):
     folders = sorted(path.name for path in (tmp_path / "c").iterdir() if path.is_dir())
     assert folders == ["grid-1-pitch_mm-8-x-12", "grid-1-pitch_mm-9"]
     assert "grid 1, pitch_mm 8 x 12" in result.out
-    assert "1 lost (mm)" in result.out
+    assert "1 failed (mm)" in result.out
     pad = Morphology.load(tmp_path / "c" / folders[0] / "morphology.json")
     assert (pad.layout.counts, pad.pitch_mm) == ((1, 1), (8.0, 12.0))
 
 
-def test_no_two_pads_share_a_folder_and_none_leaves_that_of_the_comparison(tmp_path):
+def test_variants_have_distinct_folders_inside_comparison(tmp_path):
     for name in ("a b.json", "a-b.json"):
         Morphology.straight(1).save(tmp_path / name)
     result = called("design", "compare", "a b.json", "a-b.json", cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "a-b: one of this name" in result.err
+    assert "a-b: two pads have this name" in result.err
     assert comparison.Variant("..", Spec({})).folder == "pad"
 
 
-def test_folders_are_such_as_every_system_takes_and_tells_apart(tmp_path):
+def test_variant_folders_are_valid_on_every_system(tmp_path):
     names = ["con", "AUX.v2", "lpt1", "console", "comb"]
     folders = [comparison.Variant(name, Spec({})).folder for name in names]
     assert folders == ["pad-con", "pad-AUX.v2", "pad-lpt1", "console", "comb"]
@@ -56,35 +56,35 @@ def test_folders_are_such_as_every_system_takes_and_tells_apart(tmp_path):
         Morphology.straight(1).save(tmp_path / name)
     result = called("design", "compare", "one.json", "ONE.json", cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "one: one of this name" in result.err
+    assert "one: two pads have this name" in result.err
 
 
-def test_ctrl_c_ends_the_comparison_and_not_one_search_alone(tmp_path, monkeypatch):
-    begun = []
+def test_interrupt_ends_whole_comparison(tmp_path, monkeypatch):
+    started = []
 
     def interrupted(spec, folder, *arguments, **options):
-        begun.append(folder)
+        started.append(folder)
         return {}, SimpleNamespace(stopped="interrupted")
 
-    monkeypatch.setattr(comparison, "run_search", interrupted)
+    monkeypatch.setattr(comparison, "run_design", interrupted)
     result = called("design", "compare", "--vary", "pad.grid=1,2", cwd=tmp_path)
-    assert (result.code, len(begun)) == (130, 1)
+    assert (result.code, len(started)) == (130, 1)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("arguments", "message"),
     [
-        ((), "these are 1 pads to compare"),
+        ((), "there are 1 pads to compare"),
         (("--vary", "grid=3"), "SECTION.KEY=VALUE"),
-        (("--vary", "pad.grid=3,"), "these are 1 pads"),
-        (("--vary", "pad.grid=three,4"), "none of TOML"),
+        (("--vary", "pad.grid=3,"), "there are 1 pads"),
+        (("--vary", "pad.grid=three,4"), "not TOML"),
         (("--vary", "pad.grid=0,4"), "greater than or equal to 1"),
         (("--vary", "pads.grid=3,4"), "pads"),
-        (("--vary", "pad.grid=3,3"), "one of this name"),
+        (("--vary", "pad.grid=3,3"), "two pads have this name"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_before_a_search_begins(tmp_path, given, said):
-    result = called("design", "compare", *given, cwd=tmp_path)
+def test_compare_refuses_invalid_variants_before_searching(tmp_path, arguments, message):
+    result = called("design", "compare", *arguments, cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert said in result.err
+    assert message in result.err
     assert not list(tmp_path.iterdir())

@@ -99,7 +99,7 @@ def litter(folder: Path) -> list[str]:
         ("record", 0),
     ],
 )
-def test_a_full_disk_leaves_old_files_and_no_litter(room: Path, name: str, limit: int):
+def test_full_disk_leaves_old_files_and_no_temporary_files(room: Path, name: str, limit: int):
     before = (room / "pad" / "morphology.json").read_bytes()
     child = start(room, *COMMANDS[name], limit=limit)
     _, err = child.communicate(timeout=120)
@@ -114,7 +114,7 @@ def test_a_full_disk_leaves_old_files_and_no_litter(room: Path, name: str, limit
 
 @pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write everywhere")
 @pytest.mark.parametrize("name", ["fabricate", "init", "design", "record"])
-def test_a_closed_folder_is_one_line(room: Path, name: str):
+def test_read_only_folder_is_refused_in_one_line(room: Path, name: str):
     (room / "pad").chmod(0o555)
     before = contents(room)
     child = start(room, *COMMANDS[name], tied=True)
@@ -125,7 +125,7 @@ def test_a_closed_folder_is_one_line(room: Path, name: str):
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
-def test_an_end_while_writing_leaves_one_mould(room: Path, ending: signal.Signals):
+def test_kill_while_writing_leaves_one_mould(room: Path, ending: signal.Signals):
     child = start(room, *COMMANDS["fabricate"])
     begun = time.monotonic()
     while not litter(room / "pad") and child.poll() is None and time.monotonic() < begun + 60:
@@ -146,7 +146,7 @@ def test_an_end_while_writing_leaves_one_mould(room: Path, ending: signal.Signal
 
 
 @pytest.mark.parametrize("name", ["fabricate", "design", "genetic"])
-def test_two_at_once_leave_one_result(room: Path, name: str):
+def test_concurrent_runs_leave_one_result(room: Path, name: str):
     children = [start(room, *COMMANDS[name]) for _ in range(2)]
     for child in children:
         _, err = child.communicate(timeout=120)

@@ -19,7 +19,7 @@ def loaded_by(code: str) -> set[str]:
     return set(result.stdout.rsplit("@", 1)[1].split())
 
 
-def test_help_loads_no_heavy_library() -> None:
+def test_help_imports_no_heavy_library() -> None:
     modules = loaded_by("sys.argv = ['padforge', '--help']; from padforge.cli import main; main()")
     assert not modules & {"torch", "build123d", "OCP", "numpy", "numba", "pydantic", "matplotlib", "shapely"}
 
@@ -30,7 +30,16 @@ def test_design_works_without_torch_and_without_cad() -> None:
     assert not modules & {"torch", "build123d", "OCP"}
 
 
-def test_a_bare_command_shows_its_help(tmp_path: Path) -> None:
+def test_bench_of_a_wheel_is_refused_in_one_line() -> None:
+    code = "import sys; sys.modules['padforge.benchmarks'] = None; from padforge.cli import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code, "bench", "contact", "--out", "x"], capture_output=True, text=True
+    )
+    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (2, "", 1)
+    assert "checkout" in result.stderr
+
+
+def test_command_without_arguments_shows_help(tmp_path: Path) -> None:
     result = started(cwd=tmp_path)
     assert result.returncode == 2
     assert "Commands:\n" in result.stderr
@@ -47,7 +56,7 @@ def test_init_writes_settings_that_every_command_reads(tmp_path: Path) -> None:
     assert "pad.toml: [search] steps: got 0" in refused("run", cwd=tmp_path)
 
 
-def test_init_writes_the_world_of_the_paper_if_asked(tmp_path: Path) -> None:
+def test_init_writes_published_preset(tmp_path: Path) -> None:
     """And says which presets there are, where one is asked for that is none."""
     assert called("init", "--preset", "published", cwd=tmp_path).code == 0
     spec = Spec.load(tmp_path / "pad.toml")
@@ -86,13 +95,13 @@ def test_init_writes_the_world_of_the_paper_if_asked(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_end_in_one_line_and_exit_2(tmp_path: Path, settings: str, words: str, said: str) -> None:
+def test_mistakes_are_refused_in_one_line(tmp_path: Path, settings: str, words: str, said: str) -> None:
     """What would fail late, too: before anything is done."""
     (tmp_path / "pad.toml").write_text(settings)
     assert said in refused(*words.split(), cwd=tmp_path)
 
 
-def test_the_readme_names_files_that_are_there() -> None:
+def test_readme_names_existing_files() -> None:
     root = Path(__file__).parents[2]
     text = (root / "README.md").read_text()
     for name in ("out/gallery/plan.png", "out/gallery/mould.png", "out/gallery/error_map.png", "constraints.txt"):
@@ -100,7 +109,7 @@ def test_the_readme_names_files_that_are_there() -> None:
         assert (root / name).exists()
 
 
-def test_all_that_the_packages_hand_out_is_there() -> None:
+def test_package_reexports_all_stages() -> None:
     """Each name once; and settings with a default for everything."""
     names = [name for package in (design, fabricate, sense) for name in package.__all__]
     assert len(names) == len(set(names))
@@ -120,7 +129,7 @@ def test_all_that_the_packages_hand_out_is_there() -> None:
             __import__(name)
 
 
-def test_the_stages_have_one_import_name(tmp_path: Path) -> None:
+def test_stages_have_one_import_name(tmp_path: Path) -> None:
     """A checkout shows `design` beside a lab's own folder of that name only to who works in the checkout."""
     code = "import padforge.design.morphology as m, padforge; print(m.__name__, m.Morphology is padforge.Morphology)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)

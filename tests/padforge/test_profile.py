@@ -30,7 +30,7 @@ def clock(monkeypatch):
     return passes
 
 
-def test_a_stage_has_the_time_that_no_stage_within_it_has(clock):
+def test_stage_time_excludes_nested_stages(clock):
     with profiling.profiled() as profile:
         clock(1)
         with profiling.stage("outer"):
@@ -49,7 +49,7 @@ def test_a_stage_has_the_time_that_no_stage_within_it_has(clock):
     ]
 
 
-def test_stages_of_other_threads_are_the_main_ones(clock):
+def test_stages_of_other_threads_count_for_main_thread(clock):
     def work():
         with profiling.stage("aside"):
             clock(3)
@@ -62,7 +62,7 @@ def test_stages_of_other_threads_are_the_main_ones(clock):
     assert profile.seconds["main"] == 3
 
 
-def test_a_failing_stage_ends_and_so_does_the_profile():
+def test_failing_stage_ends_profile():
     finders = list(sys.meta_path)
     with pytest.raises(ValueError, match="on purpose"), profiling.profiled() as profile, profiling.stage("failing"):
         raise ValueError("on purpose")
@@ -73,7 +73,7 @@ def test_a_failing_stage_ends_and_so_does_the_profile():
     assert not profile.counts
 
 
-def test_the_import_of_a_heavy_library_is_a_stage(clock, monkeypatch, tmp_path):
+def test_import_of_heavy_library_is_a_stage(clock, monkeypatch, tmp_path):
     (tmp_path / "weighty.py").write_text("import passing\npassing.passes(5)\n")
     (tmp_path / "passing.py").write_text("passes = None\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -91,14 +91,14 @@ def test_the_import_of_a_heavy_library_is_a_stage(clock, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("of", [signals, signals_sparse])
-def test_of_a_straight_pad_a_press_looks_at_the_fibres_it_reaches(of):
+def test_press_visits_only_fibres_in_reach(of):
     presses = [[1, 1], [2.5, 3.0], [0.7, 2.5]]  # reaching 1 + 1, 2 + 1 and 1 + 2 of 4 + 4 fibres
     with profiling.profiled() as profile:
         of(Morphology.straight(4), presses, PUBLISHED_CONTACT)
     assert profile.counts == {"fibres, press by press": [8, 24], "spans, press by press": [8, 24]}
 
 
-def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
+def test_press_visits_only_spans_below_it():
     knots = Morphology.straight(2).knots
     line = np.linspace(0, 3, 7)
     wavy = np.empty((4, 7, 2))
@@ -113,7 +113,7 @@ def test_of_a_wavy_pad_only_spans_beneath_the_press_are_looked_at():
     assert profile.counts["fibres, press by press"] == [2, 4]
 
 
-def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
+def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
     settings = SearchSettings(knots=1, starts=2, steps=2, max_failures=0)
     asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
     monkeypatch.setattr("padforge.design.common.checkpoints.Checkpoints.clear", lambda self: None)
@@ -129,7 +129,7 @@ def test_starts_that_are_done_are_not_done_again(tmp_path, monkeypatch):
     np.testing.assert_array_equal(first.morphology.knots, again.morphology.knots)
 
 
-def test_formats_that_nobody_asked_for_are_not_written(tmp_path):
+def test_only_requested_formats_are_written(tmp_path):
     with profiling.profiled() as profile:
         build(Morphology.straight(1), tmp_path, ("svg", "dxf"))
     assert profile.counts["formats"] == [2, 8]
@@ -137,7 +137,7 @@ def test_formats_that_nobody_asked_for_are_not_written(tmp_path):
     assert not {"CAD solid", "write mould.stl"} & set(profile.seconds)
 
 
-def test_calibration_tells_its_stages():
+def test_calibration_has_profile_stages():
     recording = simulate(Morphology.straight(2), RigSettings(presses=40, seed=0))
     options = LocalizerSettings(members=2, hidden=8, epochs=10, batch=16, lost=1)
     with profiling.profiled() as profile:
@@ -146,7 +146,7 @@ def test_calibration_tells_its_stages():
 
 
 @pytest.mark.slow
-def test_the_command_line_profiles_on_stderr_and_loads_what_it_needs(tmp_path):
+def test_profile_option_prints_to_stderr(tmp_path):
     (tmp_path / "pad.toml").write_text(
         "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 0\n"
     )

@@ -50,12 +50,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     [
         f"{DESIGN} --seed 1",
         f"{DESIGN} --seed 1 --resume",
-        f"{DESIGN} --from pad/morphology.json",
+        f"{DESIGN} --start-from pad/morphology.json",
         "design import plan.svg --out pad",
         "design edit other.json --out pad/morphology.json",
     ],
 )
-def test_a_pad_that_others_were_made_from_is_kept(pad: Path, words: str) -> None:
+def test_pad_in_use_is_not_replaced(pad: Path, words: str) -> None:
     before = contents(pad)
     ended = called(*words.split(), cwd=pad)
     assert (ended.code, ended.err.count("\n")) == (2, 1), ended
@@ -64,7 +64,7 @@ def test_a_pad_that_others_were_made_from_is_kept(pad: Path, words: str) -> None
     assert contents(pad) == before
 
 
-def test_a_run_replaces_what_it_makes_again_and_keeps_the_rest(pad: Path) -> None:
+def test_run_replaces_only_files_it_regenerates(pad: Path) -> None:
     shutil.rmtree(pad / "pad" / "recording")
     said = refused("run", "--seed", "1", "--out", "pad", cwd=pad)
     assert "twin.json" in said
@@ -72,20 +72,20 @@ def test_a_run_replaces_what_it_makes_again_and_keeps_the_rest(pad: Path) -> Non
 
 
 @pytest.mark.parametrize("words", [f"{DESIGN} --seed 1", "design import plan.svg --out pad"])
-def test_by_force_it_is_replaced(pad: Path, words: str) -> None:
+def test_force_replaces_pad_in_use(pad: Path, words: str) -> None:
     before = sha256(pad / "pad" / "morphology.json")
     assert called(*words.split(), "--force", cwd=pad).code in (0, 1)
     assert sha256(pad / "pad" / "morphology.json") != before
 
 
-def test_the_same_pad_again_replaces_nothing(pad: Path) -> None:
+def test_same_pad_replaces_nothing(pad: Path) -> None:
     before = contents(pad / "pad")
     for again in (DESIGN, f"{DESIGN} --resume"):
         assert called(*again.split(), cwd=pad).code == 0
         assert {**contents(pad / "pad"), "design.json": b""} == {**before, "design.json": b""}  # times are in it
 
 
-def test_a_search_that_ends_elsewhere_is_kept_to_be_gone_on_with(pad: Path) -> None:
+def test_refused_search_keeps_checkpoints(pad: Path) -> None:
     """As on another machine: that it is another pad shows only at its end."""
     path = pad / "pad" / "morphology.json"
     path.write_text(path.read_text() + "\n")
@@ -100,14 +100,14 @@ def test_a_search_that_ends_elsewhere_is_kept_to_be_gone_on_with(pad: Path) -> N
 
 
 @pytest.mark.parametrize("told", [{}, {"recording_kind": "ur5"}])
-def test_a_run_keeps_a_localizer_of_other_presses(tmp_path: Path, told: dict[str, str]) -> None:
+def test_run_does_not_replace_localizer_of_measured_presses(tmp_path: Path, told: dict[str, str]) -> None:
     (tmp_path / "pad").mkdir()
     write_json(tmp_path / "pad" / "localizer.json", {"format": "padforge-localizer/2", "provenance": told})
     said = refused("run", "--out", "pad", cwd=tmp_path)
     assert f"of kind {told.get('recording_kind')!r}, not a simulated one" in said
 
 
-def test_a_run_keeps_a_recording_that_cannot_give_way(folder: Path) -> None:
+def test_run_does_not_replace_measured_recording(folder: Path) -> None:
     """Of a real pad, at work, with files of others in it, behind a link, or none at all."""
     recording = folder / "out" / "pad" / "recording"
     kept = contents(recording)
@@ -159,7 +159,7 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "words",
     [
         *(f"design {name} pad/morphology.json" for name in ("show", "check", "score", "edit")),
-        "design --from pad/morphology.json --out other",
+        "design --start-from pad/morphology.json --out other",
         "fabricate check pad/morphology.json",
         "fabricate pad/morphology.json --out other",
         *(f"sense {name} --model pad pad/recording.csv" for name in ("locate", "evaluate", "health")),
@@ -170,5 +170,5 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "design show other/morphology.json --out pad/plan.svg",
     ],
 )
-def test_no_command_carries_out_what_was_begun_elsewhere(unpacked: Path, words: str) -> None:
+def test_commands_ignore_unfinished_writes_of_others(unpacked: Path, words: str) -> None:
     assert f"{EXCHANGE}: begun in another folder" in refused(*words.split(), cwd=unpacked)

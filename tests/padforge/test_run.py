@@ -20,7 +20,7 @@ from padforge.design.common.files import sha256
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
 
-ALL = "fibres, mould, recording, contacts, calibration"
+ALL = "design, mould, recording, contacts, calibration"
 VOLATILE = ("design.json", "run.json", "report.html")
 """With seconds in them, and digests of these."""
 
@@ -33,8 +33,8 @@ def resumed(folder: Path, *more: str) -> str:
     """Go on; what is said to be kept of the earlier run."""
     ended = called("run", "--resume", *more, cwd=folder)
     assert ended.code == 0, ended
-    kept = [line for line in ended.err.splitlines() if "kept as an earlier run has made it" in line]
-    return kept[0].partition("made it: ")[2] if kept else ""
+    kept = [line for line in ended.err.splitlines() if "reused from an earlier run" in line]
+    return kept[0].partition("earlier run: ")[2] if kept else ""
 
 
 def breaks(*_: object, **__: object) -> None:
@@ -76,7 +76,7 @@ def test_run_compares_contacts(finished: tuple[Path, str]) -> None:
 
 
 @pytest.mark.slow
-def test_running_again_gives_the_same_pad(folder: Path) -> None:
+def test_run_is_deterministic(folder: Path) -> None:
     """In a process of its own, as people run it."""
     before = digests(folder, *VOLATILE)
     result = started("run", cwd=folder)
@@ -86,15 +86,15 @@ def test_running_again_gives_the_same_pad(folder: Path) -> None:
     assert again["morphology.json"] == before["morphology.json"]
 
 
-def test_of_a_finished_run_nothing_is_done_anew(folder: Path) -> None:
+def test_resume_reuses_finished_run(folder: Path) -> None:
     before = digests(folder)
     assert resumed(folder) == ALL
     assert digests(folder) == before
 
 
-def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing of an earlier run counts as finished once it has begun."""
-    monkeypatch.setattr(padforge.run, "_designed", breaks)
+    monkeypatch.setattr(padforge.run, "_design", breaks)
     assert called("run", cwd=folder).code == 130
     assert not (folder / "out" / "pad" / "run.json").exists()
 
@@ -102,13 +102,13 @@ def test_without_resume_all_is_done_anew(folder: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("old", "new", "more", "kept", "others"),
     [
-        ("epochs = 4", "epochs = 5", (), "fibres, mould, recording, contacts", set()),
-        ("presses = 80", "presses = 90", (), "fibres, mould, contacts", {"recording"}),
-        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "fibres, recording, contacts, calibration", {"mould.stl"}),
+        ("epochs = 4", "epochs = 5", (), "design, mould, recording, contacts", set()),
+        ("presses = 80", "presses = 90", (), "design, mould, contacts", {"recording"}),
+        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "design, recording, contacts, calibration", {"mould.stl"}),
         pytest.param("", "", ("--seed", "1"), "", {"recording"}, marks=pytest.mark.slow),
     ],
 )
-def test_what_was_made_of_other_settings_is_made_anew(
+def test_resume_repeats_stages_of_changed_settings(
     folder: Path, old: str, new: str, more: tuple[str, ...], kept: str, others: set[str]
 ) -> None:
     before = digests(folder)
@@ -118,17 +118,17 @@ def test_what_was_made_of_other_settings_is_made_anew(
     assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
 
 
-def test_a_file_that_is_gone_or_another_one_is_made_anew(folder: Path) -> None:
+def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
     before = digests(folder)
     (folder / "out" / "pad" / "mould.stl").unlink()
     (folder / "out" / "pad" / "localizer.safetensors").write_bytes(b"torn")
     (folder / "out" / "pad" / "recording" / "readings.bin").write_bytes(b"")
-    assert resumed(folder) == "fibres, contacts"
+    assert resumed(folder) == "design, contacts"
     assert digests(folder) == before
 
 
 @pytest.mark.slow
-def test_a_broken_off_calibration_is_all_that_is_done_again(
+def test_resume_repeats_interrupted_calibration_only(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And two runs give the same files."""
@@ -136,14 +136,12 @@ def test_a_broken_off_calibration_is_all_that_is_done_again(
     with monkeypatch.context() as patch:
         patch.setattr(padforge.sense.cli.calibration, "run_calibration", breaks)
         assert called("run", cwd=tmp_path).code == 130
-    assert resumed(tmp_path) == "fibres, mould, recording, contacts"
+    assert resumed(tmp_path) == "design, mould, recording, contacts"
     assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
 
 
 @pytest.mark.slow
-def test_a_search_goes_on_from_its_states(
-    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resume_continues_search(finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "pad.toml").write_text(SMALL)
     save, begin, found = Checkpoints.save, Checkpoints.begin, []
 
@@ -167,7 +165,7 @@ def test_a_search_goes_on_from_its_states(
 
 
 @pytest.mark.slow
-def test_fibres_of_another_search_are_not_kept(folder: Path) -> None:
+def test_resume_does_not_reuse_pad_of_other_search(folder: Path) -> None:
     """One that was made in the folder meanwhile, with other settings than the run has."""
     before = digests(folder)
     (folder / "other.toml").write_text(SMALL.replace("starts = 1", "starts = 1\nseed = 5"))
@@ -177,7 +175,7 @@ def test_fibres_of_another_search_are_not_kept(folder: Path) -> None:
     assert digests(folder)["morphology.json"] == before["morphology.json"]
 
 
-def test_an_interrupted_run_keeps_the_recording_of_the_one_before(folder: Path) -> None:
+def test_interrupted_run_keeps_earlier_recording(folder: Path) -> None:
     """Whose mould and recording are of another pad than what was found so far, as the report then tells."""
     recording = folder / "out" / "pad" / "recording" / "readings.bin"
     before = recording.read_bytes()
@@ -209,7 +207,7 @@ def test_an_interrupted_run_keeps_the_recording_of_the_one_before(folder: Path) 
         ("[printer]\nbed_mm = [30, 30, 30]\n", "bed"),
     ],
 )
-def test_a_run_that_breaks_a_rule_or_a_check_ends_in_exit_1(folder: Path, wrong: str, said: str) -> None:
+def test_run_exits_1_on_broken_rule_or_check(folder: Path, wrong: str, said: str) -> None:
     (folder / "pad.toml").write_text(SMALL + wrong)
     ended = called("run", "--resume", "--formats", "svg", cwd=folder)
     assert ended.code == 1, ended
@@ -217,7 +215,7 @@ def test_a_run_that_breaks_a_rule_or_a_check_ends_in_exit_1(folder: Path, wrong:
 
 
 @pytest.mark.slow
-def test_a_time_budget_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_budget_covers_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A search and a training of hours end in time, and what they left is finished."""
     (tmp_path / "pad.toml").write_text(
         SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
@@ -238,16 +236,16 @@ def test_a_time_budget_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(given) == 1
     assert 0 <= given[0] < 8
     again = called(*words, "--resume", cwd=tmp_path)
-    assert f"made it: {ALL}" in again.err, again
+    assert f"earlier run: {ALL}" in again.err, again
 
 
-@pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/1"}', '{"format": "padforge-run/1", "stages": 3}'])
-def test_a_note_that_is_none_of_padforge_is_named(folder: Path, content: str) -> None:
+@pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/2"}', '{"format": "padforge-run/2", "stages": 3}'])
+def test_damaged_note_is_refused(folder: Path, content: str) -> None:
     (folder / "out" / "pad" / "run.json").write_text(content)
     assert "run.json: " in refused("run", "--resume", cwd=folder)
 
 
-def test_a_report_made_again_is_the_same(folder: Path) -> None:
+def test_report_is_deterministic(folder: Path) -> None:
     page = folder / "out" / "pad" / "report.html"
     pages = []
     for _ in range(2):
@@ -259,7 +257,7 @@ def test_a_report_made_again_is_the_same(folder: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
-def test_a_pipe_in_place_of_a_result_is_not_waited_for(folder: Path) -> None:
+def test_pipe_in_place_of_result_is_refused(folder: Path) -> None:
     (folder / "out" / "pad" / "mould.stl").unlink()
     os.mkfifo(folder / "out" / "pad" / "mould.stl")
     shutil.rmtree(folder / "out" / "pad" / "recording")

@@ -17,9 +17,9 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.fabricate.checks import plan_checks
 from padforge.fabricate.settings import FabricationSettings
-from padforge.run import Run, check_ahead, sections
+from padforge.run import Run, check_run, section_models
 
-MODELS = sections()
+MODELS = section_models()
 DEFAULTS = commented_toml(MODELS).encode()
 KEYS = [(name, key) for name, model in MODELS.items() for key in model.model_fields]
 VALUES = (
@@ -57,7 +57,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @settings(max_examples=150)
 @given(st.lists(st.tuples(st.sampled_from(KEYS), st.sampled_from(VALUES) | st.floats().map(repr)), min_size=1))
-def test_settings_of_any_value(path: Path, lines: list[tuple[tuple[str, str], str]]) -> None:
+def test_settings_of_any_value_are_valid_or_refused(path: Path, lines: list[tuple[tuple[str, str], str]]) -> None:
     tables: dict[str, list[str]] = {}
     for (section, key), value in lines:
         tables.setdefault(section, []).append(f"{key} = {value}")
@@ -67,7 +67,7 @@ def test_settings_of_any_value(path: Path, lines: list[tuple[tuple[str, str], st
 
 @settings(max_examples=60)
 @given(st.integers(0, len(DEFAULTS)), st.integers(0, 200), st.binary(max_size=8))
-def test_damaged_settings(path: Path, at: int, less: int, more: bytes) -> None:
+def test_damaged_settings_are_refused_in_one_line(path: Path, at: int, less: int, more: bytes) -> None:
     read(path, DEFAULTS[:at] + more + DEFAULTS[at + less :])
 
 
@@ -88,7 +88,7 @@ def test_damaged_settings(path: Path, at: int, less: int, more: bytes) -> None:
     ],
     ids=range(11),
 )
-def test_settings_made_to_be_awkward_are_refused(path: Path, content: bytes) -> None:
+def test_hostile_settings_are_refused(path: Path, content: bytes) -> None:
     assert isinstance(read(path, content), str)
 
 
@@ -124,19 +124,17 @@ def extremes(draw: st.DrawFn, *sections: str) -> Spec:
 
 @settings(max_examples=40)
 @given(extremes())
-def test_a_whole_run_with_extreme_settings_is_checked_or_refused_in_one_line(path: Path, spec: Spec) -> None:
+def test_check_run_handles_extreme_settings(path: Path, spec: Spec) -> None:
     assert EXTREMES["pad", "grid"] == [4, 1, 256]
     try:
-        check_ahead(Run(spec, path.parent / "none"))
+        check_run(Run(spec, path.parent / "none"))
     except InputError as error:
         one_line(error)
 
 
 @settings(max_examples=15)
 @given(extremes("pad", "rules", "mould", "printer"), st.integers(1, 2), st.integers(0, 2), st.integers(0, 2**32 - 1))
-def test_rules_and_moulds_at_their_extremes_are_measured_or_refused(
-    spec: Spec, grid: int, knots: int, seed: int
-) -> None:
+def test_rules_and_moulds_handle_extreme_settings(spec: Spec, grid: int, knots: int, seed: int) -> None:
     pad = Morphology.random(grid, knots, seed, spec.section(PadSettings).pitch_mm)
     found = check_rules(pad, spec.section(RulesSettings))
     assert all(math.isfinite(violation.measured) for violation in found)

@@ -23,7 +23,7 @@ RIGHT: dict[str, tuple[str, ...]] = {
     "--out": FOLDERS,
     "--model": ("pad", "again"),
     "--twin": ("pad/twin.json",),
-    "--from": ("random", "straight", "pad/morphology.json"),
+    "--start-from": ("random", "straight", "pad/morphology.json"),
     "--knots": ("1", "2"),
     "--starts": ("1",),
     "--device": ("cpu",),

@@ -32,7 +32,7 @@ _RECORDING = (
     "sense live --model pad --replay {} --speed 1e6 --port 0",
 )
 _PAD = (
-    *("design check {}", "design show {} --out new.svg", "design score {}", "design --from {} --out new"),
+    *("design check {}", "design show {} --out new.svg", "design score {}", "design --start-from {} --out new"),
     *("fabricate {} --formats stl,svg --out new", "fabricate {} --formats gcode,urscript --out new"),
     *("fabricate check {}", "sense record --morphology {} --presses 4 --out new", "report pad"),
     *("design edit {} --port 0", "sense identify long --morphology {} --out new"),

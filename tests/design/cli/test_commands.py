@@ -13,10 +13,10 @@ from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
+from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
 from padforge.design.optimize.twin_search import settings_for_twin, state_folders
-from padforge.design.run import load_result, search_lines
 from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
@@ -38,12 +38,12 @@ def designed(*arguments, spec):
     return ended.output.splitlines(), json.loads(Path("out/pad/design.json").read_text())
 
 
-def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_read_again(here):
-    told, document = designed(spec=QUICK)
-    pad, asked = Morphology.straight(2), {"max_failures": 1, "size": PadSettings(grid=2)}
+def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
+    printed, document = designed(spec=QUICK)
+    pad, options = Morphology.straight(2), {"max_failures": 1, "size": PadSettings(grid=2)}
     straight = [
-        *expected_errors(pad, Contact(), SearchSettings(max_failures=1), asked["size"]),
-        *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **asked),
+        *expected_errors(pad, Contact(), SearchSettings(max_failures=1), options["size"]),
+        *ambiguities(pad, Contact(), noise=AMBIGUITY_NOISE, **options),
     ]
     straight_mm = [pad.unit_mm * value for value in straight]
     assert list(document["straight"].values()) == pytest.approx(straight_mm, rel=1e-6)
@@ -53,12 +53,12 @@ def test_straight_fibres_are_told_beside_what_was_found_or_as_such_and_all_is_re
     assert (result.terms, result.straight) == (document["terms"], document["straight"])
     assert document["descriptions"].keys() == document["terms"].keys()
     assert document["candidate"] == result.candidate == "straight fibres"
-    assert search_lines(result, Path("out/pad"))[1:] == told[1:]
+    assert summary_lines(result, Path("out/pad"))[1:] == printed[1:]
     first, second = straight_mm[:2]
-    assert told[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 fibres failed")
-    assert (told[3].startswith("  these are straight fibres"), told[4:]) == (True, ["  all rules hold"])
-    alike = search_lines(replace(result, candidate="start 1"), Path("out/pad"))
-    assert alike[3].startswith("  no better than straight fibres")
+    assert printed[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
+    assert (printed[3].startswith("  the search found no better pad"), printed[4:]) == (True, ["  all rules hold"])
+    similar = summary_lines(replace(result, candidate="start 1"), Path("out/pad"))
+    assert similar[3].startswith("  not significantly better than straight fibres")
     wrong = {"terms": {"ambiguity": {}}}, {"terms": []}, {"straight": {"ambiguity": "a"}}, {"violations": [{"rule": 1}]}
     for change in wrong:
         Path("out/pad/design.json").write_text(json.dumps(document | change))
@@ -80,7 +80,7 @@ def twin(tmp_path_factory):
     return path
 
 
-def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_stated(here, twin):
+def test_settings_for_twin_take_profile_noise_area_and_layout(here, twin):
     """Of the rectangle what lies on the pad; the defaults of a contact that are written out contradict none."""
     Path("pad.toml").write_text(QUICK_SEARCH + commented_toml({"contact": Contact}))
     spec, contact = settings_for_twin(Spec.load(Path("pad.toml")), twin), Twin.load(twin).contact()
@@ -94,25 +94,25 @@ def test_settings_for_a_twin_are_its_reach_noise_rectangle_and_size_but_what_is_
     assert (wider.section(PadSettings).pitch_mm, wider.section(PadSettings).sensed_mm) == (20, (18, 31.5))
     Morphology.straight(2, 10.0).save(here / "pad.json")
     scored = CliRunner().invoke(design, ["score", "pad.json", "--twin", str(twin)], catch_exceptions=False)
-    terms = judged(Morphology.straight(2, 10.0), contact, used.noise)
+    terms = evaluate(Morphology.straight(2, 10.0), contact, used.noise)
     assert json.loads(scored.output)["terms"] == pytest.approx(terms, rel=1e-9)
 
 
-def judged(pad, contact, noise):
+def evaluate(pad, contact, noise):
     """What a pad scores and errs for the contact and noise of the twin."""
-    asked = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
-    return score(pad, contact, **asked, scatter=Scatter(noise, 0.05, 0.5))
+    options = {"max_failures": 1, "size": PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)}
+    return score(pad, contact, **options, scatter=Scatter(noise, 0.05, 0.5))
 
 
 @pytest.mark.slow
-def test_a_pad_is_designed_for_the_twin_of_a_printed_one(here, twin):
+def test_design_for_twin_uses_its_contact(here, twin):
     _, document = designed("--twin", twin, spec=QUICK_SEARCH)
     used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
     assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
     assert document["candidate"] in ("twin", "from default", "default", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
-    assert document["terms"] == pytest.approx(judged(pad, contact, used["search"]["noise"]), rel=1e-9)
+    assert document["terms"] == pytest.approx(evaluate(pad, contact, used["search"]["noise"]), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -125,32 +125,32 @@ def test_a_pad_is_designed_for_the_twin_of_a_printed_one(here, twin):
         ("", "other.json"),
     ],
 )
-def test_settings_that_contradict_a_twin_and_files_that_are_none_are_refused(here, twin, stated, message):
+def test_design_for_twin_refuses_contradicting_settings_and_invalid_files(here, twin, stated, message):
     Morphology.straight(2).save(here / "other.json")
     with pytest.raises(InputError, match=message):
         designed("--twin", twin if stated else message, spec=QUICK_SEARCH + stated)
 
 
 @pytest.mark.slow
-def test_a_search_for_a_twin_is_resumed(here, twin):
+def test_search_for_twin_resumes(here, twin):
     long = QUICK_SEARCH.replace("steps = 3", "steps = 20")
-    _, whole = designed("--twin", twin, spec=long)
+    _, unbroken = designed("--twin", twin, spec=long)
 
     def stop(*step):
         raise SystemError
 
     spec = settings_for_twin(Spec.load(Path("pad.toml")), twin)
     pad, contact, settings = spec.section(PadSettings), spec.section(Contact), spec.section(SearchSettings)
-    begun = state_folders(Path("out/pad/search"))["twin"]
+    states = state_folders(Path("out/pad/search"))["twin"]
     with pytest.raises(SystemError):
-        search(pad, contact, settings, run=SearchOptions(stop, begun))
-    assert list(begun.glob("start_*.npz"))
+        search(pad, contact, settings, run=SearchOptions(stop, states))
+    assert list(states.glob("start_*.npz"))
     _, resumed = designed("--twin", twin, "--resume", spec=long)
-    assert resumed["terms"] == whole["terms"]
+    assert resumed["terms"] == unbroken["terms"]
     assert not list(Path("out/pad").glob("search*"))
 
 
-def test_the_plan_goes_to_the_folder_of_the_pad_unless_told_otherwise(here):
+def test_show_writes_plan_to_folder_of_pad_or_out(here):
     Morphology.straight(2).save(here / "pad" / "morphology.json")
     shown = CliRunner().invoke(design, ["show", "pad/morphology.json"], catch_exceptions=False)
     assert shown.output == "plan -> pad/plan.svg\n"
@@ -161,7 +161,7 @@ def test_the_plan_goes_to_the_folder_of_the_pad_unless_told_otherwise(here):
         CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.pdf"], catch_exceptions=False)
 
 
-def test_rules_that_cannot_be_are_told_before_an_import_writes_anything(here):
+def test_import_refuses_invalid_rules_before_writing(here):
     Path("plan.svg").touch()
     Path("pad.toml").write_text("[pad]\ngrid = 2\n[rules]\nlost = 1\n")
     with pytest.raises(InputError, match=r"\[rules\] lost: no such key"):
@@ -169,13 +169,13 @@ def test_rules_that_cannot_be_are_told_before_an_import_writes_anything(here):
     assert sorted(path.name for path in here.iterdir()) == ["pad.toml", "plan.svg"]
 
 
-def test_a_plan_has_x_to_the_right_and_y_upwards():
+def test_plan_axes_point_right_and_up():
     axes = draw_plan(Morphology.straight(2), Contact()).axes[0]
     assert axes.get_xlim()[0] < 0 < axes.get_xlim()[1]
     assert axes.get_ylim()[0] < 0 < axes.get_ylim()[1]
 
 
-def test_a_pad_is_checked_by_the_keep_outs_and_the_rules_of_its_settings(here):
+def test_check_applies_keep_outs_of_settings(here):
     Morphology.straight(2).save(here / "pad.json")
     for settings, code in (("", 0), ("[pad]\nkeep_out_mm = [[[-9, 3], [-3, 3], [-3, 8], [-9, 8]]]\n", 1)):
         (here / "pad.toml").write_text(f"[pad]\ngrid = 2\n{settings.removeprefix('[pad]')}")
@@ -183,7 +183,7 @@ def test_a_pad_is_checked_by_the_keep_outs_and_the_rules_of_its_settings(here):
 
 
 @pytest.mark.parametrize("pitch_mm", [5.0, (20.0, 8.0)])
-def test_a_plan_shows_keep_outs_as_stated_and_to_where_half_of_the_contact_is_felt_in_mm(pitch_mm):
+def test_plan_draws_keep_outs_and_half_width_of_contact(pitch_mm):
     holes = [((-3.0, 1.0), (2.0, 1.0), (0.0, 4.0)), [[5, 5], [6, 5], [6, 6], [5, 6]]]
     patches = draw_plan(Morphology.straight(2, pitch_mm), Contact(), (), holes).axes[0].patches
     drawn = [patch.get_xy()[:-1].tolist() for patch in patches if isinstance(patch, Polygon)]

@@ -9,101 +9,102 @@ from click.testing import CliRunner
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
 from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
-from padforge.design.editor.edits import Answers
+from padforge.design.editor.edits import PathEvaluator
 from padforge.design.editor.session import EditSession
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 
 
 def session(tmp_path, pad=None, **size):
-    shown, source = [], None
+    views, source = [], None
     if pad is not None:
         source = tmp_path / "pad.json"
         pad.save(source)
         size = dict(pad.layout.settings)
-    judged = Answers(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(max_failures=1))
-    begun = EditSession(judged, source, tmp_path / "out.json", shown.append)
-    begun.begin()
-    return begun, shown
+    evaluator = PathEvaluator(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(max_failures=1))
+    editor = EditSession(evaluator, source, tmp_path / "out.json", views.append)
+    editor.begin()
+    return editor, views
 
 
-def ask(begun, **edit):
-    return begun.edit(json.dumps(edit).encode())
+def ask(editor, **edit):
+    return editor.edit(json.dumps(edit).encode())
 
 
-def move(begun, fibre, knot, x_mm, y_mm, gesture=""):
-    return ask(begun, do="move", fibre=fibre, knot=knot, x_mm=x_mm, y_mm=y_mm, gesture=gesture)
+def move(editor, fibre, knot, x_mm, y_mm, gesture=""):
+    return ask(editor, do="move", fibre=fibre, knot=knot, x_mm=x_mm, y_mm=y_mm, gesture=gesture)
 
 
-def test_a_pad_is_shown_with_its_rules_and_ambiguity(tmp_path):
+def test_view_has_rules_and_ambiguity(tmp_path):
     pad = Morphology.random((1, 2), 4, 1, (9.0, 12.0))
-    _, shown = session(tmp_path, pad)
-    assert [view["ready"] for view in shown] == [False, True]
-    view = shown[-1]
+    _, views = session(tmp_path, pad)
+    assert [view["ready"] for view in views] == [False, True]
+    view = views[-1]
     size = PadSettings().for_layout(pad.layout)
-    assert [rule["text"] for rule in view["rules"]] == [str(found) for found in check_rules(pad, RulesSettings(), size)]
-    assert view["ambiguity"] == pytest.approx(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size), abs=3e-4)
-    assert np.mean(view["map"], axis=1) == pytest.approx(view["ambiguity"], abs=1e-4)
+    assert [rule["text"] for rule in view["rules"]] == [str(rule) for rule in check_rules(pad, RulesSettings(), size)]
+    ambiguity = np.array(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size))
+    assert view["ambiguity_mm"] == pytest.approx(pad.unit_mm * ambiguity, abs=3e-3)
+    assert np.mean(view["ambiguity_map_mm"], axis=1) == pytest.approx(view["ambiguity_mm"], abs=1e-4)
     assert np.array(view["fibres"][2]["knots"]) == pytest.approx(pad.to_mm(pad.knots[2]), abs=1e-4)
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
 
 
-def test_a_knot_goes_where_it_is_dragged_and_drags_are_undone_and_done_again(tmp_path):
-    begun, shown = session(tmp_path, grid=2)
-    first = shown[-1]["fibres"]
+def test_move_clips_knot_and_gestures_are_undone_together(tmp_path):
+    editor, views = session(tmp_path, grid=2)
+    first = views[-1]["fibres"]
     for y_mm in (1.0, 2.0, 3.0):
-        move(begun, 1, 2, -5.0, y_mm, "drag 1")
-    after = move(begun, 1, 2, -5.0, 4.0, "drag 2")
+        move(editor, 1, 2, -5.0, y_mm, "drag 1")
+    after = move(editor, 1, 2, -5.0, 4.0, "drag 2")
     assert (after["unsaved"], after["can_undo"], after["can_redo"]) == (True, True, False)
-    assert ask(begun, do="undo")["fibres"][0]["knots"][2][1] == pytest.approx(3.0)
-    undone = ask(begun, do="undo")
+    assert ask(editor, do="undo")["fibres"][0]["knots"][2][1] == pytest.approx(3.0)
+    undone = ask(editor, do="undo")
     assert (undone["fibres"], undone["unsaved"], undone["can_undo"]) == (first, False, False)
-    assert ask(begun, do="undo")["fibres"] == first
-    ask(begun, do="redo")
-    assert ask(begun, do="redo")["fibres"] == after["fibres"]
-    assert [view["number"] for view in shown[1:]] == list(range(1, len(shown)))
-    begun, _ = session(tmp_path, grid=2, pitch_mm=10.0)
-    knots = np.array(move(begun, 1, 3, 0.7, 4.0)["fibres"][0]["knots"])
+    assert ask(editor, do="undo")["fibres"] == first
+    ask(editor, do="redo")
+    assert ask(editor, do="redo")["fibres"] == after["fibres"]
+    assert [view["number"] for view in views[1:]] == list(range(1, len(views)))
+    editor, _ = session(tmp_path, grid=2, pitch_mm=10.0)
+    knots = np.array(move(editor, 1, 3, 0.7, 4.0)["fibres"][0]["knots"])
     assert knots[3] == pytest.approx([0.7, 4.0])
-    knots = np.array(move(begun, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
+    knots = np.array(move(editor, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
     assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
     assert knots[3, 1] == -15
-    knots = np.array(move(begun, 3, 1, 900.0, -900.0)["fibres"][2]["knots"])
+    knots = np.array(move(editor, 3, 1, 900.0, -900.0)["fibres"][2]["knots"])
     assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
 
 
-def test_knots_come_on_the_curve_and_go_and_others_stay(tmp_path):
-    begun, shown = session(tmp_path, Morphology.random(2, 5, 3))
-    before = shown[-1]
-    more = ask(begun, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
-    fibre, knot = more["at"]
+def test_add_and_remove_change_one_fibre(tmp_path):
+    editor, views = session(tmp_path, Morphology.random(2, 5, 3))
+    before = views[-1]
+    more = ask(editor, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
+    fibre, knot = more["selected"]
     assert (fibre, len(more["fibres"][1]["knots"])) == (1, 8)
     assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
-    for each in (0, 2, 3):
-        assert more["fibres"][each]["knots"] == before["fibres"][each]["knots"]
-    assert len(ask(begun, do="add", fibre=2)["fibres"][1]["knots"]) == 9
-    ask(begun, do="undo")
-    fewer = ask(begun, do="remove", fibre=2, knot=knot)
+    for other in (0, 2, 3):
+        assert more["fibres"][other]["knots"] == before["fibres"][other]["knots"]
+    assert len(ask(editor, do="add", fibre=2)["fibres"][1]["knots"]) == 9
+    ask(editor, do="undo")
+    fewer = ask(editor, do="remove", fibre=2, knot=knot)
     assert fewer["fibres"][1]["knots"] == before["fibres"][1]["knots"]
 
 
-def test_saving_writes_what_is_shown_and_says_where_from(tmp_path):
-    begun, _ = session(tmp_path, Morphology.random(2, 3, 3))
+def test_save_writes_view_with_provenance(tmp_path):
+    editor, _ = session(tmp_path, Morphology.random(2, 3, 3))
     read = sha256(tmp_path / "pad.json")
     Morphology.straight(2).save(tmp_path / "pad.json")  # what was read counts
-    ask(begun, do="add", fibre=1)
-    move(begun, 1, 1, -10.0, 2.0)
-    saved = begun.save(b"{}")
-    assert (saved["unsaved"], saved["told"]) == (False, f"saved to {tmp_path / 'out.json'}")
+    ask(editor, do="add", fibre=1)
+    move(editor, 1, 1, -10.0, 2.0)
+    saved = editor.save(b"{}")
+    assert (saved["unsaved"], saved["message"]) == (False, f"saved to {tmp_path / 'out.json'}")
     pad = Morphology.load(tmp_path / "out.json")
     assert pad.to_mm(pad.knots[0])[1] == pytest.approx(saved["fibres"][0]["knots"][1], abs=1e-4)
     assert saved["fibres"][0]["knots"][1][1] == 2.0
     assert pad.provenance["command"] == "padforge design edit"
     assert pad.provenance["inputs"] == {"pad.json": read}
-    broken = [str(found) for found in check_rules(pad, RulesSettings())]
+    broken = [str(rule) for rule in check_rules(pad, RulesSettings())]
     assert [rule["text"] for rule in saved["rules"]] == broken
     checked = CliRunner().invoke(design, ["check", str(tmp_path / "out.json")], catch_exceptions=False)
     assert checked.output.splitlines() == broken
-    assert (begun.unsaved, ask(begun, do="undo")["unsaved"]) == (False, True)
+    assert (editor.unsaved, ask(editor, do="undo")["unsaved"]) == (False, True)
 
 
 MOVE = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0, "gesture": %s}'
@@ -117,52 +118,52 @@ HOSTILE = (
 )
 
 
-def test_what_cannot_be_done_is_told_and_changes_nothing(tmp_path):
-    begun, shown = session(tmp_path, grid=2)
+def test_invalid_edits_are_refused_and_change_nothing(tmp_path):
+    editor, views = session(tmp_path, grid=2)
     for body in HOSTILE:
-        with pytest.raises(InputError) as refused:
-            begun.edit(body)
-        assert len(str(refused.value)) < 300, body
-    assert len(shown) == 2
-    assert ask(begun, do="undo")["fibres"] == shown[1]["fibres"]
-    begun, _ = session(tmp_path, Morphology.straight(1))
-    assert ask(begun, do="add", fibre=1)["at"] == (0, 1)
-    ask(begun, do="remove", fibre=1, knot=1)
-    with pytest.raises(InputError, match="no knot"):
-        ask(begun, do="remove", fibre=1, knot=1)
-    most = Morphology.random(1, 64, 0)
-    full, _ = session(tmp_path, most)
+        with pytest.raises(InputError) as error:
+            editor.edit(body)
+        assert len(str(error.value)) < 300, body
+    assert len(views) == 2
+    assert ask(editor, do="undo")["fibres"] == views[1]["fibres"]
+    editor, _ = session(tmp_path, Morphology.straight(1))
+    assert ask(editor, do="add", fibre=1)["selected"] == (0, 1)
+    ask(editor, do="remove", fibre=1, knot=1)
+    with pytest.raises(InputError, match="no inner knot"):
+        ask(editor, do="remove", fibre=1, knot=1)
+    full_pad = Morphology.random(1, 64, 0)
+    full, _ = session(tmp_path, full_pad)
     with pytest.raises(InputError, match="64 knots"):
         ask(full, do="add", fibre=1)
-    begun, _ = session(tmp_path, grid=1)
-    move(begun, 1, 1, 0.0, 3.0)
+    editor, _ = session(tmp_path, grid=1)
+    move(editor, 1, 1, 0.0, 3.0)
     (tmp_path / "out.json").mkdir()
     with pytest.raises(InputError, match=r"out.json: cannot be written"):
-        begun.save(b"{}")
-    assert begun.unsaved
+        editor.save(b"{}")
+    assert editor.unsaved
 
 
-def test_what_another_has_saved_meanwhile_stays(tmp_path):
-    """Two that are begun on one pad are to be saved to the same free name."""
+def test_save_does_not_replace_file_of_other_session(tmp_path):
+    """Two that are editor on one pad are to be saved to the same free name."""
     first, second = (session(tmp_path, grid=1)[0] for _ in range(2))
-    for number, begun in enumerate((first, second, second, first)):
-        move(begun, 1, 1, 0.0, float(number))
-        begun.save(b"{}")
-    assert [begun.out.name for begun in (first, second)] == ["out.json", "out-2.json"]
-    found = [Morphology.load(begun.out) for begun in (first, second)]
-    assert [pad.to_mm(pad.knots[0])[1, 1] for pad in found] == pytest.approx([3.0, 2.0])
+    for number, editor in enumerate((first, second, second, first)):
+        move(editor, 1, 1, 0.0, float(number))
+        editor.save(b"{}")
+    assert [editor.out.name for editor in (first, second)] == ["out.json", "out-2.json"]
+    pads = [Morphology.load(editor.out) for editor in (first, second)]
+    assert [pad.to_mm(pad.knots[0])[1, 1] for pad in pads] == pytest.approx([3.0, 2.0])
 
 
-def test_a_pad_that_a_mould_was_made_from_stays(tmp_path):
+def test_save_does_not_replace_pad_with_mould(tmp_path):
     """One that was saved before, and one that lies there from the beginning."""
-    begun, _ = session(tmp_path, Morphology.straight(2))
-    begun.save(b"{}")
+    editor, _ = session(tmp_path, Morphology.straight(2))
+    editor.save(b"{}")
     made = {"provenance": {"inputs": {"out.json": sha256(tmp_path / "out.json")}}}
     write_json(tmp_path / "fabrication.json", made)
-    begun.save(b"{}")  # as it is
+    editor.save(b"{}")  # as it is
     before = (tmp_path / "out.json").read_bytes()
-    ask(begun, do="add", fibre=1)
-    assert begun.save(b"{}")["told"] == f"saved to {tmp_path / 'out-2.json'}"
+    ask(editor, do="add", fibre=1)
+    assert editor.save(b"{}")["message"] == f"saved to {tmp_path / 'out-2.json'}"
     assert (tmp_path / "out.json").read_bytes() == before
     with pytest.raises(InputError, match=r"out.json: fabrication.json was made from it"):
         session(tmp_path)

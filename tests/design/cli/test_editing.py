@@ -80,7 +80,7 @@ def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
         yield program
 
 
-def test_it_refuses_what_is_hostile_and_saves_beside_the_pad(program: Program, tmp_path: Path, pad: Path) -> None:
+def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, tmp_path: Path, pad: Path) -> None:
     before = pad.read_bytes()
     assert "saves to pad-edited.json" in program.said
     first = program.ask(do="undo")
@@ -104,7 +104,7 @@ def test_it_refuses_what_is_hostile_and_saves_beside_the_pad(program: Program, t
     assert program.post("/save", b"{}")[0] == 200
     program.ask(do="undo")
     code, said = program.end()
-    assert (code, said.splitlines()[0]) == (130, "what was drawn since the last save is not kept")
+    assert (code, said.splitlines()[0]) == (130, "edits since the last save are discarded")
     assert "Traceback" not in said
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pad-edited.json", "pad.json"]
     assert Morphology.load(tmp_path / "pad-edited.json").knots.shape == (4, 6, 2)
@@ -112,13 +112,13 @@ def test_it_refuses_what_is_hostile_and_saves_beside_the_pad(program: Program, t
 
 
 @pytest.mark.slow
-def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None:
+def test_editor_announces_file_it_replaces(tmp_path: Path, pad: Path) -> None:
     with at_work(tmp_path, "pad.json", "--out", "pad.json") as program:
-        assert program.said.endswith("saves to pad.json in place of what it has\n")
+        assert program.said.endswith("saves to pad.json in place of its content\n")
         program.ask(do="add", fibre=1)
         assert program.post("/save", b"{}")[0] == 200
         code, said = program.end()
-    assert (code, "not kept" in said) == (130, False)
+    assert (code, "discarded" in said) == (130, False)
     assert Morphology.load(pad).knots.shape == (4, 6, 2)
 
 
@@ -130,13 +130,13 @@ def test_a_file_that_it_is_to_replace_is_said(tmp_path: Path, pad: Path) -> None
         (["pad.json", "--out", "pad.json/x.json"], r"pad.json: cannot be written"),
     ],
 )
-def test_mistakes_are_told_before_a_page_is_there(tmp_path: Path, pad: Path, arguments: list[str], told: str) -> None:
+def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path, arguments: list[str], told: str) -> None:
     with chdir(tmp_path):
         assert re.search(told, str(CliRunner().invoke(edit, arguments).exception))
 
 
 @pytest.mark.slow
-def test_it_takes_no_torch() -> None:
+def test_editor_does_not_import_torch() -> None:
     code = "import padforge.design.editor.session, sys; sys.exit('torch' in sys.modules)"
     root = Path(__file__).resolve().parents[3]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
@@ -173,19 +173,19 @@ def control_key(browser: Chromium, key: str, modifiers: int = 2) -> None:
 
 
 @pytest.mark.slow
-def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
+def test_dragging_updates_page_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
     first = {name: browser.ask(TEXT.format(name)) for name in ("rules", "ambiguity")}
     colours = "[...document.querySelectorAll('#map rect')].map(each => each.getAttribute('fill-opacity')).join()"
     coloured = browser.ask(colours)
     begin = browser.ask(CENTRE.format(".knot .dot", 0))
     drag(browser, begin, (20, -60))
-    browser.wait_for("document.getElementById('told').textContent.startsWith('not saved yet')")
-    browser.wait_for("!busy && !waiting.length")
+    browser.wait_for("document.getElementById('message').textContent.startsWith('not saved yet')")
+    browser.wait_for("!busy && !queue.length")
     assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx([begin[0] + 20, begin[1] - 60], abs=1)
     for name, before in first.items():
         assert browser.ask(TEXT.format(name)) != before
     assert browser.ask(colours) != coloured
-    assert browser.ask("document.querySelectorAll('#places path').length") > 0
+    assert browser.ask("document.querySelectorAll('#violations path').length") > 0
     control_key(browser, "z")
     browser.wait_for("document.getElementById('undo').disabled")
     assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx(begin, abs=0.5)
@@ -193,7 +193,7 @@ def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, bro
     control_key(browser, "Z", modifiers=10)
     browser.wait_for("document.getElementById('redo').disabled")
     control_key(browser, "s")
-    browser.wait_for("document.getElementById('told').textContent == 'saved to pad-edited.json'")
+    browser.wait_for("document.getElementById('message').textContent == 'saved to pad-edited.json'")
     checked = CliRunner().invoke(design, ["check", str(tmp_path / "pad-edited.json")], catch_exceptions=False)
     assert checked.output.splitlines() == browser.ask(TEXT.format("rules")).splitlines()
     assert browser.complaints == []
@@ -203,7 +203,7 @@ def test_a_knot_is_dragged_and_the_answer_is_there_at_once(program: Program, bro
 
 
 @pytest.mark.slow
-def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: Chromium) -> None:
+def test_editor_works_by_keyboard_and_touch(program: Program, browser: Chromium) -> None:
     browser.ask("document.getElementById('fibre').focus()")
     for _ in range(12):  # once round the page, to the first knot
         browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key="Tab", windowsVirtualKeyCode=9)
@@ -211,7 +211,7 @@ def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: 
             break
     label = "document.activeElement.getAttribute('aria-label')"
     assert browser.ask(label).startswith("fibre 1, knot 1 of 3")
-    y_mm = "view.fibres[chosen.fibre].knots[chosen.knot][1]"
+    y_mm = "view.fibres[selected.fibre].knots[selected.knot][1]"
     before = browser.ask(y_mm)
     step = 0.5 if before < 14 else -0.5
     key = "ArrowUp" if step > 0 else "ArrowDown"
@@ -234,13 +234,13 @@ def test_the_keyboard_alone_does_it_and_a_finger_too(program: Program, browser: 
         browser.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=touched)
         time.sleep(0.02)
     browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-    browser.wait_for("!busy && !waiting.length")
+    browser.wait_for("!busy && !queue.length")
     lowered = browser.ask(CENTRE.format(".knot .dot", 5))[1] - y
     assert lowered == pytest.approx(20, abs=6)  # the first bit may count as a tap
 
 
 @pytest.mark.slow
-def test_another_page_follows_and_one_that_was_away_comes_back(program: Program, browser: Chromium) -> None:
+def test_second_page_follows_and_reconnects(program: Program, browser: Chromium) -> None:
     moved = program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
     shown = "view.fibres[0].knots[1][1]"
     browser.wait_for(f"{shown} == 3.25")

@@ -245,7 +245,7 @@ def test_the_bench_has_every_way_budget_and_seed_and_judges_what_a_plain_search_
     result = trials[1].work()
     assert result.morphology == search(PadSettings(grid=1), settings=settings, rules=FREE).morphology
     errors = [level.mean for level in localisation_error(result.morphology, subsets=2)]
-    judged = trials[1].judge(result)
-    assert [judged["lost_0"], judged["lost_1"]] == errors
+    judged = trials[1].evaluate(result)
+    assert [judged["failed_0"], judged["failed_1"]] == errors
     assert judged["error"] == np.mean(errors)
     assert judged["violations"] == len(check_rules(result.morphology, RulesSettings()))

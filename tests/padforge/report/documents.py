@@ -30,6 +30,7 @@ def design_document() -> dict:
             "ambiguity_mm_1": 2.25,
             "information": 9.5,
         },
+        "descriptions": {"information": "mutual information, bits"},
         "straight": {
             "expected_error_mm_0": 1.35,
             "expected_error_mm_1": 2.7,

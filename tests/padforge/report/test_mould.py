@@ -26,7 +26,7 @@ def unpacked(text: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(data["low"]) + steps / 65535 * np.array(data["size"]), triangles
 
 
-def test_the_mesh_in_the_page_is_the_mould(made: Path, page: Path) -> None:
+def test_mesh_in_report_is_the_mould(made: Path, page: Path) -> None:
     vertices, triangles = unpacked(page.read_text())
     mould = trimesh.load_mesh(made / "mould.stl", process=False)
     half_step = np.ptp(mould.vertices, axis=0) / 65535 / 2
@@ -34,7 +34,7 @@ def test_the_mesh_in_the_page_is_the_mould(made: Path, page: Path) -> None:
     assert len(vertices) < len(mould.vertices) / 4
 
 
-def test_a_mesh_of_many_vertices_has_wide_numbers(tmp_path: Path) -> None:
+def test_large_mesh_uses_wide_indices(tmp_path: Path) -> None:
     sphere = trimesh.creation.uv_sphere(radius=30, count=[257, 257])
     sphere.export(tmp_path / "mould.stl")
     mesh = packed(tmp_path / "mould.stl", most_bytes=10**8)
@@ -43,7 +43,7 @@ def test_a_mesh_of_many_vertices_has_wide_numbers(tmp_path: Path) -> None:
     assert volume(mesh) == pytest.approx(sphere.volume, rel=1e-4)
 
 
-def test_a_mesh_that_is_too_large_is_made_coarser_or_left_out(made: Path, pad: Path, monkeypatch) -> None:
+def test_oversized_mesh_is_simplified_or_omitted(made: Path, pad: Path, monkeypatch) -> None:
     whole = packed(made / "mould.stl")
     assert whole
     assert whole.tolerance_mm == 0
@@ -76,7 +76,7 @@ def changed(one: np.ndarray, other: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) -> None:
+def test_browser_draws_and_rotates_mould(chromium: Chromium, page: Path) -> None:
     chromium.open(page.as_uri())
     assert chromium.ask("document.getElementById('mould-view').hidden") is False
     first = chromium.picture("canvas")
@@ -134,7 +134,7 @@ def test_a_browser_draws_the_mould_and_turns_it(chromium: Chromium, page: Path) 
 
 
 @pytest.mark.slow
-def test_without_webgl_the_picture_stands_there(tmp_path: Path, page: Path) -> None:
+def test_report_without_webgl_shows_picture(tmp_path: Path, page: Path) -> None:
     with Chromium(tmp_path / "profile", "--disable-gpu", "--disable-3d-apis") as chromium:
         chromium.open(page.as_uri())
         assert chromium.ask("document.getElementById('mould-view').hidden") is True

@@ -14,7 +14,7 @@ PLAN = Morphology.random(2, knots=3, seed=5)
 @pytest.fixture(scope="session")
 def printed() -> Twin:
     """A pad of four fibres, one of them dead, laid off by 0.4 mm."""
-    return printed_pad(PLAN, np.random.default_rng(3), laid_mm=0.4)
+    return printed_pad(PLAN, np.random.default_rng(3), lateral_offset_mm=0.4)
 
 
 @pytest.fixture(scope="session")

@@ -81,7 +81,7 @@ def test_wiring_frame_and_reach_are_found_among_all_that_are_tried(printed: Twin
 @few_tries()
 def test_what_a_symmetric_pad_cannot_tell_is_a_doubt_and_always_the_same() -> None:
     pad = Morphology.straight(2)
-    printed = printed_pad(pad, np.random.default_rng(0), laid_mm=0.2, dead=0)
+    printed = printed_pad(pad, np.random.default_rng(0), lateral_offset_mm=0.2, n_dead=0)
     recording = simulate(printed, RigSettings(presses=150, seed=1))  # of seed 0 it is just not as good
     found, again = (identify(recording, pad, seed=1) for _ in range(2))
     assert np.array_equal(again.fit.pad.values, found.fit.pad.values)
@@ -146,7 +146,7 @@ def test_how_the_pad_lay_counts_what_rig_had_said_of_it() -> None:
 def test_a_rectangle_is_identified_whichever_way_it_lay() -> None:
     """Turned by a quarter, presses span its height where its width was planned."""
     plan = Morphology.random((1, 2), 3, 3, (8.0, 12.0))
-    printed = printed_pad(plan, np.random.default_rng(1), laid_mm=0.2, dead=0)
+    printed = printed_pad(plan, np.random.default_rng(1), lateral_offset_mm=0.2, n_dead=0)
     lying = replace(printed, frame=replace(printed.frame, turn_deg=93.0))
     found = identify(simulate(lying, RigSettings(presses=150, seed=3)), plan, seed=1).twin()
     assert [channel.fibre for channel in found.channels] == [channel.fibre for channel in lying.channels]

@@ -1,25 +1,23 @@
-"""Taking benchmarks: rounds, files, the summary, and the comparison with an earlier run. No times are asserted."""
+"""Measuring benchmarks: rounds, files, the summary, and the comparison with an earlier run. No times are asserted."""
 
 import csv
 import json
 
 import pytest
 
-from padforge.benchmarks import harness, suite, table
-from padforge.benchmarks.comparison import read_earlier, worsenings
-from padforge.benchmarks.harness import Bench, BenchRounds, BenchTrial, measure_round
-from padforge.benchmarks.suite import run_benches
-from padforge.benchmarks.table import bench_lines
+from padforge.benchmarks import harness, results
+from padforge.benchmarks.harness import Bench, BenchRounds, BenchTrial, measure_round, run_benches
+from padforge.benchmarks.results import bench_lines, comparison_lines, find_worsenings, read_earlier
 from padforge.design.common.validation import InputError
 
 
 def bench(error=0.1, work=lambda: None, name="x"):
     def trials():
         for case in ("a", "b"):
-            yield BenchTrial(case, "plain", 7, lambda: None, lambda found: {"error": 0.5, "visited": 1.0})
-            yield BenchTrial(case, "ours", 0, work, lambda found: {"error": error, "visited": 0.25})
+            yield BenchTrial(case, "plain", 7, lambda: None, lambda result: {"error": 0.5, "visited": 1.0})
+            yield BenchTrial(case, "ours", 0, work, lambda result: {"error": error, "visited": 0.25})
 
-    return Bench(name, trials, "error (mm)", ("plain", 7), ("ours", 0), plain=("plain",))
+    return Bench(name, trials, "error (mm)", ("plain", 7), ("ours", 0), baselines=("plain",))
 
 
 def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
@@ -31,43 +29,46 @@ def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
     monkeypatch.setattr(harness, "BUDGET_S", 0)
-    monkeypatch.setattr(suite.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(harness.time, "sleep", lambda seconds: None)
 
 
-def test_a_later_round_times_what_it_is_asked_to_an_item_and_judges_once(monkeypatch):
-    judged, so_far = [], BenchRounds()
-    trial = BenchTrial("a", "ours", 3, lambda: 42, lambda found: judged.append(found) or {"error": 1.0}, items=2)
-    one = Bench("x", lambda: iter([trial]), "error", ("ours", 3), ("ours", 3), plain=())
+def test_later_round_repeats_requested_trials_and_evaluates_once(monkeypatch):
+    evaluated, rounds = [], BenchRounds()
+    trial = BenchTrial("a", "ours", 3, lambda: 42, lambda result: evaluated.append(result) or {"error": 1.0}, items=2)
+    one = Bench("x", lambda: iter([trial]), "error", ("ours", 3), ("ours", 3))
     now = iter([0.0, 0.01] * 1000)
     monkeypatch.setattr(harness.time, "perf_counter", lambda: next(now))
     monkeypatch.setattr(harness, "_waited_s", lambda: 0.0)
-    for again, taken in ((False, 1), (False, 0), (True, 1)):
-        assert measure_round(one, so_far, lambda step: None, lambda key, again=again: again) == taken
-    assert judged == [42]
-    assert so_far.times[trial.key] == pytest.approx([0.005] * 2)
+    for repeat, n_measured in ((False, 1), (False, 0), (True, 1)):
+        assert measure_round(one, rounds, lambda step: None, lambda key, repeat=repeat: repeat) == n_measured
+    assert evaluated == [42]
+    assert rounds.seconds[trial.key] == pytest.approx([0.005] * 2)
 
 
-def test_files_hold_what_was_measured_which_nothing_is_where_none_can_be_written(tmp_path):
-    heard = []
-    summary, changes = run_benches([bench()], tmp_path, heard.append, {})
-    assert heard
+def test_files_hold_the_measurements(tmp_path):
+    steps = []
+    summary, changes = run_benches([bench()], tmp_path, steps.append, {})
+    assert steps
     assert not changes
     assert {path.name for path in tmp_path.iterdir()} == {"x.json", "x.csv", "x.png", "bench.json", "bench.csv"}
     assert json.loads((tmp_path / "bench.json").read_text()) == summary
-    made = summary["benches"]["x"]
-    assert json.loads((tmp_path / "x.json").read_text()) == made
-    assert [(row["case"], row["way"]) for row in made["rows"]] == [
+    written = summary["benches"]["x"]
+    assert json.loads((tmp_path / "x.json").read_text()) == written
+    assert [(row["case"], row["way"]) for row in written["rows"]] == [
         *(("a", "plain"), ("a", "ours"), ("b", "plain"), ("b", "ours"))
     ]
-    assert [row["speed"] for row in made["rows"][::2]] == [1, 1]
+    assert [row["speed"] for row in written["rows"][::2]] == [1, 1]
     assert b"\r" not in (tmp_path / "x.csv").read_bytes()
     with (tmp_path / "x.csv").open() as file:
         assert [row["error"] for row in csv.DictReader(file)] == ["0.5", "0.1"] * 2
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
-    assert len(bench_lines(made)) == len(made["rows"]) + 3
+    assert len(bench_lines(written)) == len(written["rows"]) + 3
     assert [(row["case"], row["reference_error"], row["error"]) for row in summary["summary"]] == [
         *(("a", 0.5, 0.1), ("b", 0.5, 0.1))
     ]
+
+
+def test_unwritable_folder_is_refused_before_measuring(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file/out: cannot be written"):
         run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
@@ -84,22 +85,21 @@ def test_files_hold_what_was_measured_which_nothing_is_where_none_can_be_written
         ({}, {"error": 1.0}, ["less accurate"]),
         ({}, {"error": 0.11}, []),
         ({}, {"error": float("nan")}, ["less accurate"]),
-        ({}, {"visited": 0.5}, ["looks at more"]),
+        ({}, {"visited": 0.5}, ["visits more"]),
         ({}, {"seconds": 2.0, "error": 1.0}, ["less accurate", "slower"]),
         ({}, {"seconds": 3.0, "way": "new"}, []),
         ({"way": "plain"}, {"seconds": 3.0, "way": "plain"}, []),
-        ({"seconds": 0.01}, {"seconds": 0.0121}, ["slower"]),  # quick work is from a smaller ratio on
-        ({"seconds": 0.01}, {"seconds": 0.0119}, []),
-        ({"error": 1e-17}, {"error": 9e-16}, []),  # of rounding
+        ({"seconds": 1e-4}, {"seconds": 3e-4}, []),  # no other trial of this way is slower
+        ({"error": 1e-17}, {"error": 9e-16}, []),  # rounding
         ({"error": 0.0}, {"error": 1e-14}, ["less accurate"]),
     ],
 )
-def test_what_has_become_worse_is_found(before, now, what):
-    assert [change.what for change in worsenings(document(**before), document(**now))] == what
+def test_worse_trials_are_reported(before, now, what):
+    assert [change.what for change in find_worsenings({"x": document(**before)}, {"x": document(**now)})] == what
 
 
-def test_work_that_has_become_slower_and_worse_is_found(tmp_path, monkeypatch):
-    monkeypatch.setattr(table, "save_figure", lambda figure, path: None)
+def test_slower_and_less_accurate_work_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "save_figure", lambda figure, path: None)
 
     def work(times):
         return lambda: sum(i * i for i in range(times * 5000))
@@ -107,9 +107,12 @@ def test_work_that_has_become_slower_and_worse_is_found(tmp_path, monkeypatch):
     before, _ = run_benches([bench(work=work(1))], tmp_path / "a", lambda step: None, {})
     earlier = read_earlier(tmp_path / "a" / "bench.json")
     assert earlier == before["benches"] == read_earlier(tmp_path / "a" / "x.json")
-    _, changes = run_benches([bench(1.0, work(4))], tmp_path / "b", lambda step: None, earlier)
-    found = {(change.what, change.key[0]) for change in changes}
-    assert found == {(what, case) for what in ("slower", "less accurate") for case in "ab"}
+    summary, changes = run_benches([bench(1.0, work(4))], tmp_path / "b", lambda step: None, earlier)
+    assert {(change.what, change.key[0]) for change in changes} == {
+        (what, case) for what in ("slower", "less accurate") for case in "ab"
+    }
+    lines = comparison_lines(changes, earlier, summary["benches"])
+    assert (lines[0], len(lines)) == ("2 trials compared; worse than before:", 5)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +122,7 @@ def test_work_that_has_become_slower_and_worse_is_found(tmp_path, monkeypatch):
         *('{"format": "padforge-bench/1"}', '{"format": "padforge-benches/1", "benches": {"contact": {"rows": [1]}}}'),
     ],
 )
-def test_a_file_that_is_no_earlier_run_is_refused(tmp_path, text):
+def test_file_that_is_no_earlier_run_is_refused(tmp_path, text):
     (tmp_path / "bench.json").write_text(text)
     with pytest.raises(InputError, match=r"bench\.json"):
         read_earlier(tmp_path / "bench.json")

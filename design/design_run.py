@@ -1,0 +1,223 @@
+"""Run a search on the settings of a `pad.toml`, and write morphology.json, design.json and the plan of the pad."""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.files import (
+    atomic_files,
+    check_replaceable,
+    provenance,
+    read_json,
+    reraise_as_input_error,
+    sha256,
+    write_json,
+)
+from padforge.design.common.plotting import save_figure
+from padforge.design.common.profiling import stage
+from padforge.design.contact_comparison import design_contact
+from padforge.design.morphology import Morphology
+from padforge.design.objectives.rules import Violation
+from padforge.design.objectives.score import describe_terms
+from padforge.design.optimize.search import SearchOptions, SearchResult, search
+from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
+from padforge.design.plan_drawing import draw_plan
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+
+if TYPE_CHECKING:
+    from padforge.design.common.settings import Spec
+
+FORMAT = "padforge-design/2"
+SIGNIFICANT = 0.05
+"""Relative difference of expected errors from which trained networks agree which pad is better."""
+MAX_VIOLATIONS = 10
+"""Violations that the summary lists."""
+
+
+def run_design(
+    spec: "Spec",
+    out: Path,
+    overrides: Mapping[str, Any],
+    start_from: str | None = None,
+    options: SearchOptions | None = None,
+    twin: Path | None = None,
+    on_written: Callable[[SearchResult], None] = lambda result: None,
+    regenerated: Collection[str] = (),
+    force: bool = False,
+) -> tuple[dict[str, Any], SearchResult]:
+    """Search for the best pad and write its files.
+
+    Args:
+        spec: settings of the pad, the contact, the search and the rules.
+        out: folder of the pad; the states of the search are checkpointed in it.
+        overrides: settings of the search that win over those of `spec` unless None.
+        start_from: "random", "straight" or the file of a morphology, which also sets the number of knots unless
+            `overrides` does; random if None.
+        options: how the search is run.
+        twin: a `twin.json`, for whose contact, scatter and sensed rectangle the pad is designed (`search_for_twin`).
+        on_written: called when the files are written, before the checkpoints of a finished search are deleted.
+        regenerated: names of other files in `out` that the caller makes anew with the pad.
+        force: whether to replace a pad from which other files in `out` were made.
+
+    Returns:
+        The content of `design.json`, and the result.
+
+    Raises:
+        InputError: invalid settings, or the pad in `out` is in use; the checkpoints stay.
+    """
+    request, regenerated = _read_request(spec, overrides, start_from, twin), {"design.json", *regenerated}
+    path, checkpoints = out / "morphology.json", out / "search"
+    check_replaceable(path, request.provenance, regenerated, force)
+    options = replace(options or SearchOptions(), keep_in=checkpoints)
+    settings = request.pad, request.contact, request.search, request.rules
+    if twin is None:
+        result = search(*settings, origin=request.start, run=options)
+    else:
+        nominal = spec.section(SearchSettings, **overrides)
+        result = search_for_twin(*settings, nominal, origin=request.start, run=options)
+    document = {
+        "format": FORMAT,
+        "terms": result.terms,
+        "descriptions": describe_terms(result.terms),
+        "candidate": result.candidate,
+        "straight": result.straight,
+        "violations": [asdict(violation) for violation in result.violations],
+        "history": result.history,
+        "seconds": round(result.seconds, 3),
+        "stopped": result.stopped,
+        "provenance": request.provenance,
+    }
+    with stage("figures"), atomic_files(out) as folder:
+        Morphology.from_layout(result.morphology.knots, request.pad.layout, request.provenance).save(folder / path.name)
+        # checked again: an interrupted search with the same settings may end with another pad
+        check_replaceable(path, folder / path.name, regenerated, force)
+        document["morphology_sha256"] = sha256(folder / path.name)
+        figure = draw_plan(result.morphology, request.contact, result.violations, request.pad.keep_out_mm)
+        save_figure(figure, folder / "design.svg")
+        save_figure(figure, folder / "design.png")
+        write_json(folder / "design.json", document)
+    on_written(result)
+    if not result.stopped:
+        for states in (checkpoints, *(state_folders(checkpoints).values() if twin else ())):
+            Checkpoints(states, {}).clear()
+    return document, result
+
+
+def check_design(
+    spec: "Spec", out: Path, overrides: Mapping[str, Any], regenerated: Collection[str] = (), force: bool = False
+) -> None:
+    """Check the arguments of `run_design` without searching.
+
+    Raises:
+        InputError: invalid settings, or the pad in `out` is in use.
+    """
+    request = _read_request(spec, overrides)
+    check_replaceable(out / "morphology.json", request.provenance, {"design.json", *regenerated}, force)
+
+
+@dataclass(frozen=True)
+class _DesignRequest:
+    """The settings of a search, the pad it starts from, and the provenance of its result."""
+
+    pad: PadSettings
+    contact: Contact
+    search: SearchSettings
+    rules: RulesSettings
+    start: Morphology | None
+    provenance: dict[str, Any]
+
+
+def _read_request(
+    spec: "Spec", overrides: Mapping[str, Any], start_from: str | None = None, twin: Path | None = None
+) -> _DesignRequest:
+    """Read the settings and files that `run_design` takes."""
+    inputs: list[Path] = []
+    if twin is not None:
+        spec, inputs = settings_for_twin(spec, twin), [twin]
+    pad, rules, start = spec.section(PadSettings), spec.section(RulesSettings), None
+    if start_from == "straight":
+        start = Morphology.straight(pad.layout)
+    elif start_from not in (None, "random"):
+        start = Morphology.load(start_from)
+        inputs.append(Path(start_from))
+        overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}
+    settings = spec.section(SearchSettings, **overrides)
+    contact = design_contact(spec, settings)
+    sections = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
+    origin = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
+    origin["settings"] = {name: section.model_dump(mode="json") for name, section in sections.items()}
+    return _DesignRequest(pad, contact, settings, rules, start, origin)
+
+
+def load_result(out: Path) -> SearchResult | None:
+    """Load the result of a search from the folder of a pad.
+
+    Returns:
+        The result, or None where there is none or the morphology there is another one.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    path, morphology = out / "design.json", out / "morphology.json"
+    if not (path.exists() and morphology.exists()):
+        return None
+    document = read_json(path, FORMAT)
+    with reraise_as_input_error(path):
+        if document["morphology_sha256"] != sha256(morphology):
+            return None
+        violations = [Violation(**violation) for violation in document["violations"]]
+        list(map(str, violations))  # fails on values of the wrong type
+        return SearchResult(
+            Morphology.load(morphology),
+            {name: float(value) for name, value in document["terms"].items()},
+            violations,
+            str(document["candidate"]),
+            {name: float(value) for name, value in document["straight"].items()},
+            bool(document["provenance"]["settings"]["rules"]["enforce"]),
+            document["history"],
+            float(document["seconds"]),
+            document["stopped"],
+        )
+
+
+def summary_lines(result: SearchResult, out: Path) -> list[str]:
+    """Summarise a search in a few lines of text: expected errors beside those of straight fibres, and broken rules.
+
+    Args:
+        result: the result.
+        out: folder it was written to.
+    """
+    violations = [f"  broken: {violation}" for violation in result.violations[:MAX_VIOLATIONS]]
+    remaining = len(result.violations) - len(violations)
+    stopped = f" ({result.stopped}: the best so far)" if result.stopped else ""
+    return [
+        f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s{stopped}"
+        f" -> {out / 'morphology.json'}",
+        *_error_lines(result),
+        *(violations or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
+        *([f"  ... and {remaining} more"] if remaining > 0 else []),
+    ]
+
+
+def _error_lines(result: SearchResult) -> list[str]:
+    designed, straight = (
+        [value for term, value in terms.items() if term.startswith("expected_error")]
+        for terms in (result.terms, result.straight)
+    )
+    lines = [
+        f"  expected error {format_errors(designed)} mm with {format_errors(range(len(designed)))} failed fibres",
+        f"  straight fibres {format_errors(straight)} mm",
+    ]
+    if result.candidate == "straight fibres":
+        return [*lines, "  the search found no better pad than straight fibres; try more steps or time"]
+    similar = [n for n, (a, b) in enumerate(zip(designed, straight, strict=True)) if a > (1 - SIGNIFICANT) * b]
+    if similar:
+        lines.append(f"  not significantly better than straight fibres with {format_errors(similar)} failed fibres")
+    return lines
+
+
+def format_errors(errors: Collection[float]) -> str:
+    """Join errors by slashes, to the hundredth, or counts: "0.21 / 0.24"."""
+    return " / ".join(f"{error:.2f}" if isinstance(error, float) else str(error) for error in errors)
