@@ -78,7 +78,7 @@ class Plan:
         check_type("pad", self.pad, Morphology)
         check_type("settings", self.settings, FabricationSettings).require_consistent(self.pad.layout)
         if self.settings.pad.keep_out_mm and self.used is None:
-            keep_outs(self.settings.pad.of(self.pad.layout))
+            keep_outs(self.settings.pad.for_layout(self.pad.layout))
 
     @cached_property
     def enlarged(self) -> "Plan":
