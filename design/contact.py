@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
-_NONE = np.empty(0, np.int64)
+_DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 """Chains, extents and weight law of a press."""
 
@@ -87,7 +87,7 @@ def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Cont
     fibres = along.shape[1]
     check_memory(len(along) * len(centres) * fibres)
     out = np.zeros(len(along) * len(centres) * fibres)
-    visited = _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _NONE, _NONE, out)
+    visited = _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _DENSE, out)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres)), visited
 
 
@@ -111,7 +111,7 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
     check_memory(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
-    _run_exact(along, across, ends, centres, shape, starts, fibre, signal)
+    _run_exact(along, across, ends, centres, shape, (starts, fibre), signal)
     matrix = csr_array((signal, fibre, starts), shape=(len(centres), len(pad.knots)))
     matrix.eliminate_zeros()
     return matrix
@@ -123,15 +123,14 @@ def _run_exact(
     ends: geometry.Ends,
     presses: Array,
     shape: PressShape,
-    starts: Ints,
-    fibre: Ints,
+    sparse: tuple[Ints, Ints],
     out: Array,
 ) -> int:
     """Run `exact_signals` on all cores; return the number of spans visited."""
-    slope, max_offsets = population_slopes(along, across), geometry.max_offsets(across, ends)
+    max_offsets, curves = geometry.max_offsets(across, ends), (along, across, population_slopes(along, across))
 
     def compute(begin: int, end: int) -> int:
-        return exact_signals(along, across, slope, max_offsets, ends, presses, *shape, begin, end, starts, fibre, out)
+        return exact_signals(curves, max_offsets, ends, presses, shape, begin, end, sparse, out)
 
     visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
     if profiling.is_profiling():

@@ -166,14 +166,12 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
     }[indenter.shape]
     along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
     check_memory(len(centres) * along.shape[1])
-    slope = population_slopes(along, across)[0]
+    curves = along[0], across[0], population_slopes(along, across)[0]
+    indentation = a, steepness, NEGLIGIBLE * deep * np.minimum(1, steepness), _SHAPES[indenter.shape]
     out = np.zeros((len(centres), along.shape[1]))
-    max_error = NEGLIGIBLE * deep * np.minimum(1, steepness)
-    shape = _SHAPES[indenter.shape]
 
     def compute(begin: int, end: int) -> None:
-        knots = along[0], across[0], slope, ends.horizontals
-        integrate_elongations(*knots, centres, a, steepness, max_error, shape, begin, end, out)
+        integrate_elongations(curves, ends.horizontals, centres, indentation, begin, end, out)
 
     map_chunks(compute, len(centres), min_chunk=50)
     return out

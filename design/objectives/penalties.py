@@ -272,7 +272,7 @@ def _common_tracks(fibres: FibreSamples) -> Tensor | None:
         long = stretches.length > limit
         middle = (stretches.begin[long] + stretches.end[long]) / 2
         pairs = one.start + stretches.line[long], other.start + stretches.other[long]
-        total += sum_overlaps(points, slope, arc, *pairs, middle, limit / 2, width, gradient)
+        total += sum_overlaps(points, slope, arc, pairs, middle, limit / 2, width, gradient)
     weight = COMMON_WEIGHT * limit / 4 / len(arc) / fibres.mean_run.item()  # the mean of two points, along either fibre
     value = weight * (total - (gradient * points).sum())
     return (torch.from_numpy(weight * gradient) * fibres.points).sum() + value
