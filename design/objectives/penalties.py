@@ -17,8 +17,7 @@ from torch import Tensor
 
 from padforge.design.common.validation import InputError
 from padforge.design.kernels.geometry import sum_overlaps
-from padforge.design.paths.bends import FOLD
-from padforge.design.paths.curves import common_stretches
+from padforge.design.paths.curves import FOLD, common_stretches
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 from padforge.design.torch_signals import pchip_sample, span_samples
