@@ -267,11 +267,11 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
     arcs = _cumulate_lengths(points, first)
     intervals, count = np.empty((64, 4)), 0
     for box in range(len(sides)):
-        left, low, right, high = sides[box]
+        x_min, y_min, x_max, y_max = sides[box]
         for beside in range(len(other_sides)):
-            if other_sides[beside, 0] > right or other_sides[beside, 2] < left:
+            if other_sides[beside, 0] > x_max or other_sides[beside, 2] < x_min:
                 continue
-            if other_sides[beside, 1] > high or other_sides[beside, 3] < low:
+            if other_sides[beside, 1] > y_max or other_sides[beside, 3] < y_min:
                 continue
             for i in range(segments[box, 0], segments[box, 1]):
                 x, y, length = points[i, 0], points[i, 1], arcs[i + 1] - arcs[i]
@@ -374,15 +374,15 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
             top -= 1
         elif top >= _DEPTH:
             top -= 1
-        else:  # de Casteljau at the middle; the left half goes on top of the stack, so roots come in order
-            left = work[top + 1]
+        else:  # de Casteljau at the middle; the lower half goes on top of the stack, so roots come in order
+            lower = work[top + 1]
             for j in range(degree + 1):
-                left[j] = b[0]
+                lower[j] = b[0]
                 for i in range(degree - j):
                     b[i] = 0.5 * (b[i] + b[i + 1])
-            # after the sweep b holds the last diagonal reversed: the right half
+            # after the sweep b holds the last diagonal reversed: the upper half
             middle = 0.5 * (b[lo] + b[hi])
-            left[lo], left[hi] = b[lo], middle
+            lower[lo], lower[hi] = b[lo], middle
             b[lo] = middle
             top += 1
     return count

@@ -80,28 +80,6 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_curves(knots: Any, horizontals: int, samples: int) -> Any:
-    """Sample fibres uniformly along their axis.
-
-    Args:
-        knots: shape (P, F, N + 2, 2).
-        horizontals: number of fibres, the first ones, that run along x.
-        samples: samples per fibre.
-
-    Returns:
-        Coordinates across the axis; shape (P, F, samples).
-    """
-    population, fibres = knots.shape[:2]
-    out = np.empty((population, fibres, samples))
-    for index in range(population * fibres):
-        p, f = index // fibres, index % fibres
-        along = 0 if f < horizontals else 1
-        t = knots[p, f, :, along].copy()
-        pchip_sample(t, knots[p, f, :, 1 - along].copy(), t[-1] / (samples - 1), out[p, f])
-    return out
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def population_slopes(along: Any, across: Any) -> Any:
     """Compute the slopes (P, F, n) of the PCHIP curves of a population."""
     out = np.empty_like(across)
