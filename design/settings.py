@@ -42,9 +42,6 @@ class Layout:
         verticals: V, 0 to MAX_FIBRES.
         pitch_x_mm: distance of the ends of neighbouring verticals, 0.1 to 1000 mm.
         pitch_y_mm: distance of the ends of neighbouring horizontals, 0.1 to 1000 mm.
-
-    Raises:
-        InputError: no fibre, too many, or a pitch out of range.
     """
 
     horizontals: int
@@ -67,9 +64,6 @@ class Layout:
         Args:
             fibres: M, (H, V), or a layout, which is returned as it is.
             pitch_mm: one pitch, or (along x, along y), mm.
-
-        Raises:
-            InputError: anything else, or what the class refuses.
         """
         if isinstance(fibres, Layout):
             return fibres
@@ -270,7 +264,6 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
 
 PUBLISHED_CONTACT = Contact(radius=0.6)
 """Contact of the paper: a polygon of 30 sides, Manhattan lengths. Default of functions that reproduce the paper."""
-
 TRACK_WIDTH_MM = 0.4
 """Default width of a track."""
 MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
@@ -371,10 +364,7 @@ class SearchSettings(Settings):
         default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
     )
     noise: float = Field(
-        default=0.02,
-        ge=1e-9,
-        le=10,
-        description="standard deviation of noise, share of straight fibres' full scale",
+        default=0.02, ge=1e-9, le=10, description="standard deviation of noise, share of straight fibres' full scale"
     )
     scatter: float = Field(default=0.18, ge=0, le=1, description="scatter of a response between presses, share of it")
     scatter_common: float = Field(default=0.36, ge=0, le=0.99, description="share of its variance common to all fibres")
@@ -457,9 +447,8 @@ class PadSettings(Settings):
     """`[pad]`: the pad, and the part of it that is pressed.
 
     Attributes:
-        horizontals: number of horizontals; `grid` if None. With 0 the pad is a strip one pitch wide, and the fibres of
-            the other family run across it, one pitch long.
-        verticals: number of verticals, in the same way.
+        horizontals: `grid` if None; with 0 the pad is a strip one pitch wide, and the verticals run across it.
+        verticals: in the same way.
         leads: "one side" is the lower edge, for a connector; leads come down beside the pad, nested.
         sensed_mm: as of `sensed_rectangle`, at most the pad's size. Designs are for presses there.
         keep_out_mm: holes, screws, a connector. Each polygon has 3 corners or more and an area, does not cross itself,
