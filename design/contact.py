@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
-Sparse = tuple[Ints, Ints]
+_Sparse = tuple[Ints, Ints]
 _DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 """Chains, extents and weight law of a press."""
@@ -113,7 +113,7 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
 
 def _run_exact(
-    along: Array, across: Array, ends: geometry.Ends, presses: Array, shape: PressShape, sparse: Sparse, out: Array
+    along: Array, across: Array, ends: geometry.Ends, presses: Array, shape: PressShape, sparse: _Sparse, out: Array
 ) -> int:
     """Run `exact_signals` on all cores; return the number of spans visited."""
     max_offsets, curves = geometry.max_offsets(across, ends), (along, across, population_slopes(along, across))

@@ -346,7 +346,7 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
 
     Bernstein subdivision: coefficients without a change of sign exclude a root, with one change they isolate one
     (Descartes' rule); else the interval is halved by de Casteljau's algorithm. A polynomial whose coefficients are all
-    within `tolerance` of 0 only touches zero. The degree, at most MAX_DEGREE, is an int64: kernels are compiled anew
+    within `tolerance` of 0 only touches zero. The degree, at most `_MAX_DEGREE`, is an int64: kernels are compiled anew
     for each literal. `work` is a stack of [coefficients ..., low, high] of the shape SCRATCH.
     """
     lo, hi = _MAX_DEGREE + 1, _MAX_DEGREE + 2

@@ -156,9 +156,9 @@ def integrate_elongations(
 ) -> None:
     """Compute the elongation of every fibre of one pad for presses `begin` to `end`, into `out` (Q, F), zeros before.
 
-    `curves` are along, across and slope. `indentation` is, for each press, (Q,), the contact radius a, 0 for no press;
-    the scale of dw/dr, `steepness`, which is the slope at the edge a / R of a sphere, the slope of the flank of a cone,
-    and 2 d / (pi a) of a flat punch; and the error of a piece that is negligible; and SPHERE, CONE or FLAT.
+    `curves` are along, across and slope. `indentation` is the contact radius a of each press, 0 for no press; the scale
+    of dw/dr, `steepness`: slope at the edge a / R of a sphere, slope of the flank of a cone, 2 d / (pi a) of a flat
+    punch; the negligible error of a piece; all (Q,); and SPHERE, CONE or FLAT.
     """
     (along, across, slope), (radii, steepness, max_error, shape) = curves, indentation
     fibres, knots = along.shape
