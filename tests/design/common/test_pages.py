@@ -101,7 +101,7 @@ def test_token_is_required_under_any_host_name() -> None:
         assert asked("/", Authorization="Bearer another") == 403
     for host, token in (("0.0.0.0", ""), ("::", ""), ("", ""), ("0.0.0.0", "short")):
         with pytest.raises(InputError, match="token"):
-            LocalPage(0, PAGE, host=host, token=token)
+            LocalPage(0, PAGE, {}, host=host, token=token)
 
 
 def test_incomplete_posts_and_malformed_addresses_are_refused_silently(
