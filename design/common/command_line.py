@@ -57,8 +57,7 @@ def pad_folder(source: Path | None = None) -> Path:
     """Return the folder for results without `--out`: that of the pad they belong to.
 
     Args:
-        source: input of the command. A morphology.json or the folder of a recording is in the folder of its pad; any
-            other file NAME.mat gets a folder out/NAME; without an input it is out/pad.
+        source: a morphology.json or the folder of a recording, both in the folder of their pad; NAME.mat for out/NAME.
     """
     if source is None:
         return Path("out/pad")
@@ -87,10 +86,7 @@ def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def load_spec(path: Path | None) -> "Spec":
-    """Load the settings file `path`, else pad.toml in the current folder if it exists, else the defaults.
-
-    Allowed are the sections that the root command has put into its context; any without a context.
-    """
+    """Load `path`, else pad.toml of the current folder, else the defaults; the context of the root lists sections."""
     from .settings import Spec
 
     default, context = Path("pad.toml"), click.get_current_context(silent=True)
@@ -114,20 +110,16 @@ def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> No
     click.echo(json.dumps(document, indent=1) if as_json else "\n".join(lines))
 
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as of shells."""
+INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line on the arguments of this process, errors as one line on stderr.
+    """Run a command line on the arguments of this process, errors as one line on stderr; return the exit code.
 
     Args:
         command: the root command.
         name: of the program.
         extras: optional dependencies that its commands need, by their first word; for others all of these.
-
-    Returns:
-        The exit code, with which the process has to end; it ends at once if tasks are running by then.
     """
     _prepare_process()
     code = _run(command, name, extras)
@@ -160,10 +152,8 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
         return _fail(name, f"interrupted; {message or 'what was finished is kept'}", INTERRUPTED)
     except click.ClickException as error:
         return _fail(name, error.format_message())
-    except InputError as error:
-        return _fail(name, str(error))
-    except Fault as fault:
-        return _fail(name, str(fault), fault.exit_code)
+    except (InputError, Fault) as error:
+        return _fail(name, str(error), error.exit_code)
     except OSError as error:
         return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except ModuleNotFoundError as error:
@@ -189,12 +179,10 @@ def _prepare_process() -> None:
 def _check_words(words: list[str]) -> None:
     """Refuse arguments that no shell can pass but a Python caller can, on which functions of the system fail."""
     for word in words:
-        try:
-            is_valid = b"\0" not in os.fsencode(word)
-        except UnicodeEncodeError:
-            is_valid = False
-        if not is_valid:
-            raise InputError(f"{word!r}: holds characters that no argument can have")
+        with suppress(UnicodeEncodeError):
+            if b"\0" not in os.fsencode(word):
+                continue
+        raise InputError(f"{word!r}: holds characters that no argument can have")
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:

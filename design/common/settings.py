@@ -12,14 +12,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError, check_mapping, check_path, check_type, short_repr
 
-MAX_BYTES = 2**18
-"""Size limit of a settings file."""
-MAX_DOTS = 200
-"""In a line: the time to parse a dotted key grows with the square of its parts."""
-MAX_DEPTH = 6
-"""Of nested lists and tables; more than any setting has, while a list may contain itself."""
-MAX_ITEMS = 2**17
-"""Size limit of an array: a broadcast one may not fit into memory as a list."""
+MAX_BYTES = 2**18  # of a settings file
+MAX_DOTS = 200  # in a line: the time to parse a dotted key grows with the square of its parts
+MAX_DEPTH = 6  # of nested lists and tables; more than any setting has, while a list may contain itself
+MAX_ITEMS = 2**17  # of an array: a broadcast one may not fit into memory as a list
 
 
 class Settings(BaseModel):
@@ -54,14 +50,11 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
-    """Replace NumPy scalars and arrays by Python numbers and lists.
+    """Replace NumPy scalars and arrays by Python numbers and lists, but no array that is too large for a model.
 
     Args:
         value: of a key, or a table.
         depth: levels of lists and tables within which they are replaced.
-
-    Returns:
-        The value; an array of more than MAX_ITEMS items unchanged, which no model accepts.
     """
     numpy = sys.modules.get("numpy")  # without importing it: a caller who has such values has done so
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
@@ -177,16 +170,13 @@ class Spec:
 def or_default(
     name: str, value: AnySettings | None, model: type[AnySettings], default: AnySettings | None = None
 ) -> AnySettings:
-    """Return an argument that is a section of the settings.
+    """Return an argument that is a section of the settings, after a check of its type.
 
     Args:
         name: of the argument.
         value: the section; None for its default.
         model: of the section.
-        default: in place of the model's own default.
-
-    Raises:
-        InputError: `value` is of another type.
+        default: in place of that of the model.
     """
     return (default or model()) if value is None else check_type(name, value, model)
 

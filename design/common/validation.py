@@ -14,10 +14,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-MAX_VALUES = 2**28
-"""Size limit of an array that a public function takes or makes: 2 GiB of float64."""
-MAX_PATH = 4096
-"""Length limit of a path, characters, as of the system."""
+MAX_VALUES = 2**28  # size limit of an array that a public function takes or makes: 2 GiB of float64
+MAX_PATH = 4096  # characters, as of the system
 
 Kind = TypeVar("Kind")
 
@@ -25,9 +23,13 @@ Kind = TypeVar("Kind")
 class InputError(ValueError):
     """An error of the user: a file, setting or argument that cannot be used.
 
-    The message is one line that names the thing, the value and what is allowed. The command line prints it without a
-    traceback and exits with 2.
+    The message is one line that names the thing, the value and what is allowed.
+
+    Attributes:
+        exit_code: of the command line, which prints the message without a traceback.
     """
+
+    exit_code = 2
 
     def __init__(self, message: object = "") -> None:
         super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may hold line ends
@@ -43,22 +45,17 @@ class Fault(Exception):  # noqa: N818  of things outside the program, not an err
     exit_code = 1
 
 
-_DISTRIBUTIONS = {
-    **{"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"},
-    **dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde"),
-}
-"""Distributions by the module they bring, where the names differ."""
+# distributions by the module they bring, where the names differ
+_DISTRIBUTIONS = {"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"}
+_DISTRIBUTIONS |= dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde")
 
 
 def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
-    """Say how to install a missing library, from the metadata of the installed padforge.
+    """Say in one line how to install a missing library; None if no extra of padforge brings it.
 
     Args:
         error: of its import.
         wanted: extras, separated by commas, that the command needs in any case.
-
-    Returns:
-        One line; None if no extra of padforge brings the library.
     """
     from importlib.metadata import PackageNotFoundError, requires
 
