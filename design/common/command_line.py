@@ -121,17 +121,20 @@ def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> 
         name: of the program.
         extras: optional dependencies that its commands need, by their first word; for others all of these.
     """
-    _prepare_process()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # file names may be no valid text
+    for name_of_signal in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
+        number = getattr(signal, name_of_signal)
+        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
+            signal.signal(number, signal.default_int_handler)  # cleans up as Ctrl-C does
     code = _run(command, name, extras)
     atexit.register(_end_with_tasks, code)
     return code
 
 
 def _end_with_tasks(code: int) -> None:
-    """End this process if tasks are running, which can be neither stopped nor waited for.
-
-    Those in torch would crash where the interpreter ends before them.
-    """
+    """End this process if tasks are running: none can be stopped, and those in torch would crash as it ends."""
     parallel = sys.modules.get(f"{__package__}.parallel")
     if parallel is not None and parallel.active_threads:
         for stream in (sys.stdout, sys.stderr):
@@ -163,17 +166,6 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
         return _fail(name, message)
     except MemoryError as error:
         return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})")
-
-
-def _prepare_process() -> None:
-    """Print file names that are not valid text escaped, and let SIGTERM and SIGHUP clean up as Ctrl-C does."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-    for name in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
-        number = getattr(signal, name)
-        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
-            signal.signal(number, signal.default_int_handler)
 
 
 def _check_words(words: list[str]) -> None:

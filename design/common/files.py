@@ -126,12 +126,9 @@ def lock(file: IO[Any] | int, busy: str) -> None:
 def locked(path: Path, busy: str) -> Iterator[None]:
     """Lock a file or folder in the body; do nothing on Windows, where nothing open can be renamed.
 
-    Args:
-        path: the file or folder.
-        busy: message of the BusyError if another process has locked it, or has removed it meanwhile.
-
     Raises:
-        InputError: it cannot be opened, or is locked.
+        BusyError: with the message `busy`: another process has locked it, or has removed it meanwhile.
+        InputError: it cannot be opened.
     """
     if fcntl is None:
         yield
@@ -221,11 +218,7 @@ def temporary_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> 
 def _temporary(
     folder: Path, prefix: str, suffix: str, create: Callable[[Path], object], remove: Callable[[Path], object]
 ) -> Iterator[Path]:
-    """Create a temporary file or folder, locked so that other runs do not take it for a leftover.
-
-    Raises:
-        OSError: it cannot be created.
-    """
+    """Create a temporary file or folder, locked so that other runs do not take it for a leftover."""
     remove_leftovers(folder, prefix)
     while True:
         path = folder / f"{prefix}{secrets.token_hex(8)}{suffix}"
@@ -247,10 +240,9 @@ def _temporary(
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path beside it, which replaces it on success.
+    """Write a file atomically: yield a temporary path beside it, with its suffix, which replaces it on success.
 
-    The temporary file exists, is empty and locked; write into it rather than replace it. Its name has the suffix of
-    `path`, by which many writers choose their format.
+    The temporary file exists, is empty and locked; write into it rather than replace it.
 
     Args:
         path: the destination; a path that is temporary itself is yielded as it is.
@@ -295,12 +287,10 @@ def sync(path: Path) -> None:
 
 def to_disk(handle: int) -> None:
     """Synchronise an open file to the disk; on macOS out of the drive's own cache too, where `os.fsync` leaves it."""
-    full_sync = getattr(fcntl, "F_FULLFSYNC", None)
-    if fcntl is not None and full_sync is not None:
-        with suppress(OSError):  # a disk without that operation
-            fcntl.fcntl(handle, full_sync)
-            return
-    os.fsync(handle)
+    try:
+        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    except (AttributeError, OSError):  # another system, or a disk without that operation
+        os.fsync(handle)
 
 
 class _Note(NamedTuple):
@@ -402,10 +392,7 @@ def recover(folder: Path) -> None:
 def resolve_exchange(path: Path) -> Path:
     """Return where the valid content of a file is: in an exchange that has not moved it yet, or at `path`.
 
-    Nothing is changed. For a file that the exchange removes, it is a path where nothing is.
-
-    Raises:
-        InputError: the exchange beside it was begun in another folder, so that files may be of two runs.
+    For a file that the exchange removes, it is a path where nothing is.
     """
     note, pending = _read_note(path.parent), path.parent / EXCHANGE / path.name
     if note is not None and (path.name in note.removed or (path.name in note.names and pending.exists())):
@@ -442,15 +429,8 @@ def _read_note(folder: Path) -> _Note | None:
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
     """Check that `path` is a file of limited size, rather than a pipe or device that may never end.
 
-    Args:
-        path: the file.
-        max_bytes: size limit, bytes.
-
     Returns:
         Where to read it, see `resolve_exchange`.
-
-    Raises:
-        InputError: it does not exist, is not a regular file, or is larger.
     """
     try:
         valid = resolve_exchange(path)
@@ -496,11 +476,7 @@ def read_json(path: Path, *formats: str) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal.
-
-    Raises:
-        InputError: it does not exist, or is neither a regular file nor a folder.
-    """
+    """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal."""
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
         return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
@@ -509,12 +485,7 @@ def sha256(path: Path) -> str:
 
 
 def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
-    """Return the names of the files directly in a folder whose content still has the digest of that name.
-
-    Args:
-        folder: the folder.
-        digests: expected digests by file name; may come from a file and hold anything.
-    """
+    """Return the names of the files directly in a folder that still have their digest; `digests` may hold anything."""
     unchanged = set[str]()
     for name, digest in digests.items():
         with suppress(InputError, OSError):
@@ -544,12 +515,7 @@ def provenance(
 
 
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
-    """Return the names of the documents and recordings beside a file that were made from it, directly or not.
-
-    Args:
-        path: the file.
-        remade: names of those that are replaced together with the file.
-    """
+    """Return the names of what was made from a file beside it, directly or not, but for what is `remade` with it."""
     documents = {file.name: _read_dict(file) for file in path.parent.glob("[!.]*.json") if file != path}
     documents |= {file.parent.name: _read_dict(file) for file in path.parent.glob("[!.]*/start.json") if file != path}
     sources, dependents = [path], set[str]()

@@ -22,12 +22,10 @@ from padforge.design.common.files import check_file, read_bytes
 from padforge.design.common.validation import MAX_VALUES, InputError, short_repr
 
 MAX_FILE_BYTES = 2**33
-MAX_OBJECTS, MAX_DEPTH = 10_000, 64
-"""Groups and datasets, or variables, of a file; groups within groups, which the HDF5 library visits by recursion."""
-MAX_UNPACKED_BYTES = 2**29
-"""Size of the variables of a file, unpacked and as float64; the longest published recording is far smaller."""
-FREE_BYTES, MAX_COMPRESSION = 2**26, 64
-"""Size that a dataset may always have, and the compression ratio beyond which a larger one is refused."""
+MAX_OBJECTS = 10_000  # groups and datasets of a file, or fields of a structure
+MAX_DEPTH = 64  # groups within groups: the HDF5 library visits them by recursion
+MAX_UNPACKED_BYTES = 2**29  # of the variables, unpacked and as float64; the longest published recording is far smaller
+FREE_BYTES, MAX_COMPRESSION = 2**26, 64  # size that is always allowed, and compression ratio that a larger one may have
 
 _MATRIX, _COMPRESSED = 14, 15
 _NUMERIC_ELEMENTS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
@@ -77,11 +75,7 @@ class Hdf5Reader:
         return self._datasets[name].dtype.kind in "fiub"
 
     def read(self, name: str) -> NDArray[Any]:
-        """Read the values of a dataset of real numbers or truth values.
-
-        Raises:
-            InputError: it is none of `names`, holds no numbers, or claims more than is allowed.
-        """
+        """Read the values of a dataset; raise InputError if they are no real numbers or more than is allowed."""
         if (dataset := self._datasets.get(name)) is None:
             raise InputError(f"{name} is no dataset, expected one with all of its values in this file")
         if dataset.size is None or dataset.size > self._remaining:
@@ -101,7 +95,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
     """Open an HDF5 file for reading; errors of the body name the file.
 
     Raises:
-        InputError: it cannot be read, is larger than MAX_FILE_BYTES, torn, or of another kind.
+        InputError: it cannot be read, is torn, or of another kind.
     """
     import h5py
 
@@ -138,7 +132,7 @@ def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     except Exception as error:  # SciPy raises many kinds on torn files
         raise InputError(f"{path}: not a readable MATLAB file, torn or of another kind ({error})") from error
     if missing := [name for name in required if name not in content]:
-        present = ", ".join(sorted(name for name in content if not name.startswith("__"))) or "nothing"
+        present = ", ".join(sorted(content)) or "nothing"
         raise InputError(f"{path}: has no variable {', '.join(missing)} (found {present})")
     return content
 
@@ -175,7 +169,7 @@ def _to_plain(value: NDArray[Any]) -> Any:
 
 
 def _check_version_4(stored: bytes) -> tuple[dict[str, Any], bytes]:
-    """Check a file of version 4; see `_check_version_5`."""
+    """Describe the variables of version 4 by name, as `_check_version_5`."""
     descriptions, position = dict[str, Any](), 0
     order = "<" if 0 <= struct.unpack_from("<i", stored)[0] < 5000 else ">"
     while position < len(stored):
@@ -190,16 +184,10 @@ def _check_version_4(stored: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _check_version_5(stored: memoryview) -> tuple[dict[str, Any], bytes]:
-    """Check the variables of a file of version 5 to 7.2.
-
-    Returns:
-        What the variables are, by name, with "" for full real matrices and structures of such; and a file of these.
-    """
+    """Describe the variables of version 5 to 7.2 by name, those safe to read as ""; return also a file of these."""
     order, safe, descriptions, n_unpacked, n_values = "<>"[stored[126:128] == b"MI"], [stored[:128]], {}, 0, 0
     max_bytes = min(MAX_UNPACKED_BYTES, max(FREE_BYTES, MAX_COMPRESSION * len(stored)))
-    for number, (kind, payload, element) in enumerate(_elements(stored[128:], order)):
-        if number == MAX_OBJECTS:
-            raise ValueError(f"it holds more than {MAX_OBJECTS} variables")
+    for kind, payload, element in _elements(stored[128:], order):
         if kind == _COMPRESSED:
             unpacker = zlib.decompressobj()
             content = memoryview(unpacker.decompress(payload, max(max_bytes - n_unpacked, 1)))
@@ -210,7 +198,7 @@ def _check_version_5(stored: memoryview) -> tuple[dict[str, Any], bytes]:
         if kind != _MATRIX:
             raise ValueError(f"it has an element of kind {kind}, expected a variable")
         name, description, size = _check_matrix(payload, order)
-        n_values += size
+        n_values += size + 1000  # what a variable takes in memory besides its values
         if 8 * n_values > max_bytes:
             raise ValueError(f"it holds more than {max_bytes // 8} values")
         if name:  # functions keep their own variables without a name

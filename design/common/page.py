@@ -58,14 +58,9 @@ class PageSection:
 
 
 def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
-    """Return an HTML document: title, contents, key figures, sections.
+    """Return an HTML document: title, first paragraph, contents, key figures, sections.
 
     Its content security policy forbids content from elsewhere, and scripts other than its own.
-
-    Args:
-        title: of the page.
-        lead: first paragraph.
-        sections: in their order.
     """
     scripts = [read_resource(TEMPLATES, "page.js"), *(section.script for section in sections if section.script)]
     return (
@@ -106,12 +101,7 @@ def paragraph(text: str) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table; cells of the words pass, warn and fail are coloured, columns of numbers right-aligned.
-
-    Args:
-        header: titles of the columns.
-        rows: values of the cells.
-    """
+    """Return a table; cells of the words pass, warn and fail are coloured, columns of numbers right-aligned."""
     cells = [[_text(value) for value in row] for row in rows]
     kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
@@ -131,14 +121,7 @@ def collapsible(summary: str, body: Sequence[str]) -> str:
 
 
 def figures(pictures: Sequence[tuple[Path, str]]) -> str:
-    """Return pictures side by side with their captions.
-
-    Args:
-        pictures: paths of .png and .svg files, and captions; missing files are skipped.
-
-    Raises:
-        InputError: a file is no such picture, or torn.
-    """
+    """Return .png and .svg pictures side by side with their captions; skip missing files."""
     embedded = [_embed_picture(path, caption) for path, caption in pictures if path.is_file()]
     return _element("figures", embedded) if embedded else ""
 

@@ -31,7 +31,7 @@ FORMAT = "padforge-search/1"
 SCHEDULER_S = 10.0  # time limit for a cluster's scheduler to answer
 POLL_S = 0.1  # interval at which Ctrl-C is noticed on systems where it does not wake a waiting thread
 
-_SETTINGS_FILE, _STATE_FILE = "search.json", re.compile(r"start_([0-9]{4,})\.npz")
+_STATE_FILE = re.compile(r"start_([0-9]{4,})\.npz")
 _DIGEST = "seal"  # name of the array that holds the digest of the others
 
 active_threads: set[Thread] = set()
@@ -129,13 +129,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
 
 
 def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -> list[Result]:
-    """Apply work(begin, end) to chunks that partition range(count), one thread a core; return the results in order.
-
-    Args:
-        work: function of the bounds of a chunk.
-        count: number of items.
-        min_chunk: items below which a chunk is not worth a thread.
-    """
+    """Return work(begin, end) for chunks of at least `min_chunk` that partition range(count), one thread a core."""
     n_chunks = max(1, min(os.cpu_count() or 1, count // min_chunk))
     if n_chunks == 1:
         return [work(0, count)]
@@ -151,8 +145,7 @@ _threads_before, _torch_lock = list[int](), Lock()  # torch has one number of th
 def one_torch_thread() -> Iterator[None]:
     """Limit torch to one thread in the body; from any thread, in parallel or nested, until the last body ends.
 
-    Small matrices gain little from more threads, these slow each other down where another program uses the cores, and
-    sums in another order would give another result.
+    More threads gain little on small matrices, slow down where another program runs, and sum in another order.
     """
     import torch
 
@@ -171,11 +164,10 @@ def one_torch_thread() -> Iterator[None]:
 def clear_stale_kernels(package: Path) -> None:
     """Delete the compiled kernels of a package if any of its sources has changed since the last call.
 
-    Numba compares the source of a kernel alone, not of those that it inlines. A folder that cannot be written is left
-    as it is: no kernels are cached there.
+    Numba compares the source of a kernel alone, not of those that it inlines.
     """
     cache = package / "__pycache__"
-    with suppress(OSError):
+    with suppress(OSError):  # a folder that cannot be written: no kernels are cached there
         cache.mkdir(exist_ok=True)
         digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
         stamp = cache / "kernels.sha256"
@@ -187,35 +179,30 @@ def clear_stale_kernels(package: Path) -> None:
 
 
 class Checkpoints:
-    """The folder of the states of a search."""
+    """The states of the tasks of a search, each in a small file of arrays, from which they resume after a kill.
+
+    Attributes:
+        folder: created with the first state.
+        settings: what the search depends on, JSON by section and key; states of other settings are refused.
+    """
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
-        """Use a folder.
-
-        Args:
-            folder: created with the first state.
-            settings: what the search depends on, JSON by section and key; states of other settings are refused.
-        """
-        self.folder = folder
-        self.settings = json.loads(json.dumps(settings))
+        self.folder, self.settings = folder, json.loads(json.dumps(settings))
+        self._file = folder / "search.json"
 
     def begin(self, resume: bool) -> dict[int, State]:
-        """Read the states of an earlier run by number, or remove them.
-
-        Args:
-            resume: whether to go on from them.
+        """Return the states of an earlier run by number to resume from, or remove them.
 
         Raises:
             InputError: the states belong to other settings, or cannot be read.
         """
-        path = self.folder / _SETTINGS_FILE
-        if not (resume and path.exists()):
+        if not (resume and self._file.exists()):
             self.clear()
             return {}
-        stored = files.read_json(path, FORMAT).get("settings")
+        stored: Any = files.read_json(self._file, FORMAT).get("settings")
         for section, values in self.settings.items():
             for key, value in values.items():
-                with files.reraise_as_input_error(path):
+                with files.reraise_as_input_error(self._file):
                     before = stored.get(section, {}).get(key)
                 if before != value:
                     change = f"begun with {section} {key} {short_repr(before)}, now {short_repr(value)}"
@@ -225,8 +212,8 @@ class Checkpoints:
 
     def save(self, number: int, state: State) -> None:
         """Write a state atomically in place of the last one of that number."""
-        if not (self.folder / _SETTINGS_FILE).exists():
-            files.write_json(self.folder / _SETTINGS_FILE, {"format": FORMAT, "settings": self.settings})
+        if not self._file.exists():
+            files.write_json(self._file, {"format": FORMAT, "settings": self.settings})
         with files.atomic_file(self.folder / f"start_{number:04d}.npz") as temporary:
             np.savez(temporary, allow_pickle=False, **state, **{_DIGEST: np.array(self._digest(number, state))})
 
@@ -236,16 +223,15 @@ class Checkpoints:
         Raises:
             InputError: its search.json is not that of a search.
         """
-        path = self.folder / _SETTINGS_FILE
-        if path.exists():
+        if self._file.exists():
             try:
-                files.read_json(path, FORMAT)
+                files.read_json(self._file, FORMAT)
             except InputError as error:
                 raise InputError(f"{error}; remove it, or choose another folder") from error
             for file in list(self.folder.iterdir()):
                 if _STATE_FILE.fullmatch(file.name) and file.is_file() and not file.is_symlink():
                     file.unlink()
-            path.unlink()
+            self._file.unlink()
         files.remove_leftovers(self.folder)
         with suppress(OSError):  # it does not exist, or is not empty
             self.folder.rmdir()

@@ -64,33 +64,29 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         Args:
             address: host and port to listen on; port 0 for any that is free.
             handler: of a connection.
-            token: what a client must know, if other machines can connect; "" for none.
+            token: required from clients, see above.
             option: of the command line, by which another port is chosen.
 
         Raises:
-            InputError: the port is in use or not allowed, the host is no address of this machine, or other machines
-                can connect without a token that cannot be guessed.
+            InputError: the address cannot be used, or other machines can connect without a token of some length.
         """
         host, port = address
         if token and not (MIN_TOKEN <= len(token) <= MAX_TOKEN and token.isascii() and token.isprintable()):
-            raise InputError(
-                f"token has {len(token)} characters, allowed are {MIN_TOKEN} to {MAX_TOKEN}, those of plain text"
-            )
+            limits = f"{MIN_TOKEN} to {MAX_TOKEN}, those of plain text"
+            raise InputError(f"token has {len(token)} characters, allowed are {limits}")
         if host not in (HOST, "localhost") and not token:
-            raise InputError(
-                f"host is {host!r}, which other machines reach: whoever knows a token may listen, and nobody else; "
-                f"give one, such as --token {secrets.token_urlsafe(MIN_TOKEN)}"
-            )
+            example = f"--token {secrets.token_urlsafe(MIN_TOKEN)}"
+            raise InputError(f"host is {host!r}, which other machines reach: state a token, such as {example}")
         self.token = token
-        self._connections: dict[socket.socket, float] = {}  # when they are cut off unless admitted
+        self._connections = dict[Any, float]()  # when they are cut off unless admitted
         reasons = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "this user may not use it"}
         try:
             super().__init__(address, handler)
         except (OSError, UnicodeError) as error:
             number = getattr(error, "errno", None)
-            if number in reasons:
-                line = f"port {port} of {host}: {reasons[number]}; choose another with {option}, or 0 for any"
-                raise InputError(line) from error
+            if reason := reasons.get(number):
+                choice = f"choose another with {option}, or 0 for any"
+                raise InputError(f"port {port} of {host}: {reason}; {choice}") from error
             if number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
                 raise InputError(f"host is {host!r}, expected an address of this machine ({error})") from error
             raise
@@ -173,10 +169,7 @@ class LocalPage(ConnectionServer):
             handlers: what takes the posts of the page, by address; called from several threads at once.
             max_post_bytes: size limit of a post.
             host: address to listen on.
-            token: what a client must know, see `ConnectionServer`.
-
-        Raises:
-            InputError: the port is in use or not allowed, or other machines could connect without a token.
+            token: required from clients, see `ConnectionServer`.
         """
         self.handlers, self.max_post_bytes = handlers, max_post_bytes
         self.page, self.policy = page.encode(), _content_security_policy(page)
@@ -239,17 +232,6 @@ class _PageHandler(BaseHTTPRequestHandler):
     server: LocalPage  # pyright: ignore[reportIncompatibleVariableOverride]
     timeout = 10  # of a browser that neither sends nor receives
 
-    def parse_request(self) -> bool:
-        """Refuse a malformed address, too."""
-        if not super().parse_request():
-            return False
-        try:
-            self._url = urlsplit(self.path)
-        except ValueError:
-            self.send_error(HTTPStatus.BAD_REQUEST)
-            return False
-        return True
-
     def do_GET(self) -> None:
         if not self._is_authorised():
             self.send_error(HTTPStatus.FORBIDDEN)
@@ -292,6 +274,10 @@ class _PageHandler(BaseHTTPRequestHandler):
 
         Otherwise a page from elsewhere could reach the server by a host name that resolves to it (DNS rebinding).
         """
+        try:
+            self._url = urlsplit(self.path)
+        except ValueError:  # a malformed address
+            return False
         if self.server.token:
             token = parse_qs(self._url.query).get("token", [""])[0]
             token = token or self.headers.get("Authorization", "").removeprefix("Bearer ")
@@ -306,11 +292,11 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def _send(self, status: HTTPStatus, content_type: str = "", body: bytes = b"", **headers: str) -> None:
         self.send_response(status)
-        headers |= {"Content_Type": content_type} if content_type else {}
-        headers |= {"Content_Length": str(len(body))} if body else {}  # else of a stream
         headers |= {"Cache_Control": "no-store", "X_Content_Type_Options": "nosniff", "Referrer_Policy": "no-referrer"}
+        headers |= {"Content_Type": content_type, "Content_Length": str(len(body) or "")}  # "" of a stream
         for name, value in headers.items():
-            self.send_header(name.replace("_", "-"), value)
+            if value:
+                self.send_header(name.replace("_", "-"), value)
         self.end_headers()
         self.wfile.write(body)
 

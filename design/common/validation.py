@@ -107,16 +107,7 @@ def check_float(name: str, value: object, minimum: float, maximum: float) -> flo
 
 
 def check_array(name: str, values: "ArrayLike", max_abs: float = math.inf) -> "NDArray[np.float64]":
-    """Return finite real numbers of any shape as an array of float64.
-
-    Args:
-        name: of the argument.
-        values: the numbers.
-        max_abs: limit of their absolute value.
-
-    Raises:
-        InputError: rows of different length, anything but finite real numbers, or more than MAX_VALUES of them.
-    """
+    """Return finite real numbers of any shape, at most `max_abs`, as an array of float64, else raise InputError."""
     import numpy as np
 
     try:
