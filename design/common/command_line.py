@@ -145,7 +145,11 @@ def _end_with_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        _check_words(sys.argv[1:])
+        for word in sys.argv[1:]:  # a Python caller can pass what no shell can, and functions of the system fail on it
+            with suppress(UnicodeEncodeError):
+                if b"\0" not in os.fsencode(word):
+                    continue
+            raise InputError(f"{word!r}: holds characters that no argument can have")
         return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
@@ -166,15 +170,6 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
         return _fail(name, message)
     except MemoryError as error:
         return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})")
-
-
-def _check_words(words: list[str]) -> None:
-    """Refuse arguments that no shell can pass but a Python caller can, on which functions of the system fail."""
-    for word in words:
-        with suppress(UnicodeEncodeError):
-            if b"\0" not in os.fsencode(word):
-                continue
-        raise InputError(f"{word!r}: holds characters that no argument can have")
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:

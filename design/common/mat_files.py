@@ -92,11 +92,7 @@ class Hdf5Reader:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
-    """Open an HDF5 file for reading; errors of the body name the file.
-
-    Raises:
-        InputError: it cannot be read, is torn, or of another kind.
-    """
+    """Open an HDF5 file for reading; report errors of the body, too, as an InputError that names the file."""
     import h5py
 
     valid = check_file(path, MAX_FILE_BYTES)
@@ -119,9 +115,6 @@ def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     Returns:
         By name: an array of a full real matrix, in its stored type; a dictionary of the fields of a structure; of
         anything else what it is, as text ("a cell array").
-
-    Raises:
-        InputError: the file cannot be read, is torn, of another kind, lacks a variable, or claims more than it holds.
     """
     try:
         with check_file(path, MAX_FILE_BYTES).open("rb") as file:
@@ -214,9 +207,8 @@ def _check_matrix(payload: memoryview, order: str, is_field: bool = False) -> tu
     parts = list(islice(_elements(payload, order), MAX_OBJECTS))
     (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
     kind = flags & 0xFF
-    if kind == _OPAQUE:
-        return _decode(parts[1][1]), _CLASSES[kind], 0
-    shape, name = np.frombuffer(parts[1][1], f"{order}i4").tolist(), _decode(parts[2][1])
+    name = _decode(parts[1 if kind == _OPAQUE else 2][1])
+    shape = [0] if kind == _OPAQUE else np.frombuffer(parts[1][1], f"{order}i4").tolist()
     if len(shape) > 32 or min(shape, default=-1) < 0:
         raise ValueError(f"{name} has shape {short_repr(shape)}")
     if flags & _COMPLEX:

@@ -171,8 +171,12 @@ class LocalPage(ConnectionServer):
             host: address to listen on.
             token: required from clients, see `ConnectionServer`.
         """
-        self.handlers, self.max_post_bytes = handlers, max_post_bytes
-        self.page, self.policy = page.encode(), _content_security_policy(page)
+        self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
+        self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"
+        for tag in ("script", "style"):  # the page's own only
+            digest = hashlib.sha256(page.split(f"<{tag}>")[1].split(f"</{tag}>")[0].encode()).digest()
+            self.policy += f"; {tag}-src 'sha256-{base64.b64encode(digest).decode()}'"
+        self.policy += "; frame-ancestors 'none'"
         self._changed = threading.Condition()
         self._message, self._number, self._n_readers, self._has_ended = "", 0, 0, False
         super().__init__((host, port), _PageHandler, token, "--port")
@@ -302,12 +306,3 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log nothing: the terminal shows the progress of the command."""
-
-
-def _content_security_policy(page: str) -> str:
-    """Allow the page's own script and style only, and requests to this server only."""
-    policy = "default-src 'none'; connect-src 'self'; img-src data:; "
-    for tag in ("script", "style"):
-        digest = hashlib.sha256(page.split(f"<{tag}>")[1].split(f"</{tag}>")[0].encode()).digest()
-        policy += f"{tag}-src 'sha256-{base64.b64encode(digest).decode()}'; "
-    return f"{policy}base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

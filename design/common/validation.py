@@ -61,12 +61,11 @@ def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
 
     module = (error.name or "").partition(".")[0]
     library = _DISTRIBUTIONS.get(module, module)
+    requirement = re.compile(rf"""{library}\b(?![-\w]).*extra == ['"](?!(?:all|test|figures)\b)([\w-]+)""")
     try:
-        requirements = [line for line in requires("padforge") or () if re.match(rf"{library}\b(?![-\w])", line)]
+        extras = [match[1] for line in requires("padforge") or () if (match := requirement.match(line))]
     except PackageNotFoundError:
         return None
-    extras = [match[1] for line in requirements if (match := re.search(r"""extra == ['"]([\w-]+)""", line))]
-    extras = [extra for extra in extras if extra not in ("all", "test", "figures")]
     if not extras:
         return None
     extra = wanted if {*wanted.split(",")} & {*extras} else extras[0]
