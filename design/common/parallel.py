@@ -34,8 +34,7 @@ POLL_S = 0.1  # interval at which Ctrl-C is noticed on systems where it does not
 _STATE_FILE = re.compile(r"start_([0-9]{4,})\.npz")
 _DIGEST = "seal"  # name of the array that holds the digest of the others
 
-active_threads: set[Thread] = set()
-"""Those of `_DaemonThreads` that have not ended."""
+active_threads = set[Thread]()  # those of `_DaemonThreads` that have not ended
 
 
 def run_tasks(
@@ -104,7 +103,6 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
     """Connect to the Dask cluster at `address` as an executor; None stands for this machine.
 
     Raises:
-        InputError: Dask is not installed, or no scheduler answers there.
         Fault: in the body, when the scheduler is lost, or a task has ended one worker after another.
     """
     if address is None:
@@ -171,11 +169,10 @@ def clear_stale_kernels(package: Path) -> None:
         cache.mkdir(exist_ok=True)
         digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
         stamp = cache / "kernels.sha256"
-        if stamp.exists() and stamp.read_bytes() == digest:
-            return
-        for compiled in package.rglob("__pycache__/*.nb[ic]"):
-            compiled.unlink(missing_ok=True)
-        stamp.write_bytes(digest)
+        if not stamp.exists() or stamp.read_bytes() != digest:
+            for compiled in package.rglob("__pycache__/*.nb[ic]"):
+                compiled.unlink(missing_ok=True)
+            stamp.write_bytes(digest)
 
 
 class Checkpoints:
@@ -200,13 +197,12 @@ class Checkpoints:
             self.clear()
             return {}
         stored: Any = files.read_json(self._file, FORMAT).get("settings")
-        for section, values in self.settings.items():
-            for key, value in values.items():
-                with files.reraise_as_input_error(self._file):
-                    before = stored.get(section, {}).get(key)
-                if before != value:
-                    change = f"begun with {section} {key} {short_repr(before)}, now {short_repr(value)}"
-                    raise InputError(f"{self.folder}: {change}; allowed to resume are the same settings")
+        with files.reraise_as_input_error(self._file):
+            for section, values in self.settings.items():
+                for key, value in values.items():
+                    if (before := stored.get(section, {}).get(key)) != value:
+                        change = f"begun with {section} {key} {short_repr(before)}, now {short_repr(value)}"
+                        raise InputError(f"{self.folder}: {change}; allowed to resume are the same settings")
         paths = {int(name[1]): path for path in self.folder.iterdir() if (name := _STATE_FILE.fullmatch(path.name))}
         return {number: self._read(paths[number], number) for number in sorted(paths)}
 

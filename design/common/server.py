@@ -109,13 +109,10 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         self._connections[request] = math.inf
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Refuse connections beyond MAX_CONNECTIONS."""
-        return len(self._connections) < MAX_CONNECTIONS
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Register a connection, and start its thread."""
-        self._connections[request] = time.monotonic() + ADMIT_S
-        super().process_request(request, client_address)
+        """Register a connection, or refuse it beyond MAX_CONNECTIONS."""
+        if is_accepted := len(self._connections) < MAX_CONNECTIONS:
+            self._connections[request] = time.monotonic() + ADMIT_S
+        return is_accepted
 
     def close_request(self, request: Any) -> None:
         """Unregister and close a connection."""
