@@ -36,8 +36,7 @@ _CLASSES = {1: "a cell array", 2: "a structure", 3: "an object", 4: "text", 5: "
 class Hdf5Reader:
     """The datasets of an open HDF5 file, of which at most MAX_VALUES values together are read.
 
-    Attributes:
-        names: paths, without the first slash, of the datasets reached without a link that have all values in the file.
+    Its `names` are the paths of the datasets that are reached without a link and have all values in the file.
     """
 
     def __init__(self, file: Any) -> None:

@@ -20,16 +20,11 @@ _OTHER = "elsewhere"
 
 
 class Profile:
-    """Times and counts.
-
-    Attributes:
-        seconds: wall time of the main thread by stage, without the stages within it.
-        counts: by name, [evaluated, total].
-        stages: names of the stages that run, the innermost last.
-    """
+    """Wall time of the main thread by stage, without the stages within it, and counts."""
 
     def __init__(self) -> None:
-        self.seconds, self.counts = defaultdict[str, float](float), defaultdict[str, list[int]](lambda: [0, 0])
+        self.seconds = defaultdict[str, float](float)
+        self.counts = defaultdict[str, list[int]](lambda: [0, 0])  # [evaluated, total]
         self.lock, self.stages, self._since = threading.Lock(), [_OTHER], time.perf_counter()
 
     def attribute_time(self) -> None:

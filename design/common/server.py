@@ -46,11 +46,7 @@ Handler = Callable[[bytes], Mapping[str, Any] | None]
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):
-    """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate.
-
-    Attributes:
-        token: what a client must know; "" for none.
-    """
+    """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate."""
 
     daemon_threads = True
     # On Windows the flag would let two programs share a port; elsewhere it frees a port that was used a minute ago.
@@ -64,7 +60,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         Args:
             address: host and port to listen on; port 0 for any that is free.
             handler: of a connection.
-            token: required from clients, see above.
+            token: what a client must know; "" for none.
             option: of the command line, by which another port is chosen.
 
         Raises:
@@ -142,11 +138,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
 
 
 class LocalPage(ConnectionServer):
-    """A page that is served in the `with` block, and its latest message to every browser that waits for it.
-
-    Attributes:
-        url: address of the page, with the token.
-    """
+    """A page that is served in the `with` block, and its latest message to every browser that waits for it."""
 
     def __init__(
         self,
@@ -178,6 +170,7 @@ class LocalPage(ConnectionServer):
         self._message, self._number, self._n_readers, self._has_ended = "", 0, 0, False
         super().__init__((host, port), _PageHandler, token, "--port")
         query = f"?{urlencode({'token': token})}" if token else ""
+        # The address of the page, with the token.
         self.url = f"http://{host}:{self.server_address[1]}/{query}"
 
     def show(self, view: Mapping[str, Any]) -> None:

@@ -147,13 +147,21 @@ class Spec:
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]")
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
-        """Return these settings with the values of `tables`, by section, in place of their own."""
+        """Return these settings with other values in place of theirs.
+
+        Args:
+            tables: the values, by section and key.
+        """
         Spec(tables, self.source)
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
 
     def stated(self, model: type[Settings]) -> Mapping[str, Any]:
-        """Return what the file states of the section of `model`, without defaults and not validated."""
+        """Return what the file states of a section, without defaults and not validated.
+
+        Args:
+            model: of the section.
+        """
         if not (isinstance(model, type) and issubclass(model, Settings)):
             raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
         return self._tables.get(model.section(), {})

@@ -23,13 +23,11 @@ Kind = TypeVar("Kind")
 class InputError(ValueError):
     """An error of the user: a file, setting or argument that cannot be used.
 
-    The message is one line that names the thing, the value and what is allowed.
-
-    Attributes:
-        exit_code: of the command line, which prints the message without a traceback.
+    Args:
+        message: one line that names the thing, the value and what is allowed.
     """
 
-    exit_code = 2
+    exit_code = 2  # of the command line, which prints the message without a traceback
 
     def __init__(self, message: object = "") -> None:
         super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may hold line ends
