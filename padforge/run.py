@@ -316,7 +316,7 @@ def _design(
     run: Run, cache: StageCache, search_progress: "Callable[[], AbstractContextManager[OnProgress]]"
 ) -> "SearchResult":
     """Optimise the fibres, or load them; a search that is interrupted is not cached."""
-    from padforge.design.common.checkpoints import Checkpoints
+    from padforge.design.common.parallel import Checkpoints
     from padforge.design.design_run import load_result, run_design
     from padforge.design.optimize.search import SearchOptions
 
