@@ -71,8 +71,6 @@ def errors_by_contact(
 ) -> list[ContactErrors]:
     """Compute mean errors of a small network for pads of one layout under every contact, contact by contact.
 
-    The network is trained on one response of each fibre to a press.
-
     Args:
         pads: by name.
         contacts: by name.
@@ -119,16 +117,13 @@ def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
-    """Write the errors of a pad and of straight fibres under the contact of `spec` and others.
+    """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others.
 
     Args:
         spec: settings of the pad, the contact and the scatter.
         pad: the design.
         out: folder of `contacts.json`.
         seed: that of `[search]` if None.
-
-    Returns:
-        The document: rows of contact, pad and mean errors in mm with 0, 1, ... fibres failed.
     """
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)

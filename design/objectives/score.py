@@ -63,13 +63,10 @@ class ScoredPad:
         """
         values: dict[str, float] = {}
         for term in TERMS:
-            if names and term.name not in names:
-                continue
-            value = term.compute(self)
-            if isinstance(value, Mapping):
-                values |= {f"{term.name}_{key}": part for key, part in value.items()}
-            else:
-                values[term.name] = value
+            if not names or term.name in names:
+                value = term.compute(self)
+                parts = value if isinstance(value, Mapping) else {"": value}
+                values |= {f"{term.name}_{key}".rstrip("_"): part for key, part in parts.items()}
         return values
 
     @property
@@ -77,9 +74,7 @@ class ScoredPad:
         """What a search minimises: the geometric mean of the expected errors over failures, and the weighted terms."""
         shares = failure_shares(self.search.max_failures)[: len(self.expected_errors)]
         total = float(np.exp(np.log(self.expected_errors) @ shares / sum(shares)))
-        for weight, term in weighted_terms(self.search):
-            total += weight * self.terms([term.name])[term.name]
-        return total
+        return sum((weight * self.terms([t.name])[t.name] for weight, t in weighted_terms(self.search)), start=total)
 
     @cached_property
     def expected_errors(self) -> list[float]:
@@ -126,10 +121,7 @@ class Term:
 
 
 def sharpness(signals: Tensor) -> Tensor:
-    """Return the mean |second difference| of signals (F, Q) along presses in an order of neighbours, grid units.
-
-    The published term Z without the quantisation, which has no gradient.
-    """
+    """Return Z of signals (F, Q), grid units, as published but for the quantisation, which has no gradient."""
     return signals.diff(n=2, dim=1).abs().mean()
 
 
@@ -137,13 +129,12 @@ def _sharpness_loss(compute_signals: ComputeSignals, size: PadSettings) -> Tenso
     return sharpness(compute_signals(serpentine_presses(size.sensed, SEARCH_SIDE)))
 
 
-def _expected_errors_mm(scored: ScoredPad) -> dict[object, float]:
-    return {n_failed: scored.pad.unit_mm * error for n_failed, error in enumerate(scored.expected_errors)}
-
-
-def _ambiguities_mm(scored: ScoredPad) -> dict[object, float]:
-    values = ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.size)
+def _in_mm(scored: ScoredPad, values: list[float]) -> dict[object, float]:
     return {n_failed: scored.pad.unit_mm * value for n_failed, value in enumerate(values)}
+
+
+def _ambiguities(scored: ScoredPad) -> list[float]:
+    return ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.size)
 
 
 def _penalties(scored: ScoredPad) -> dict[object, float]:
@@ -157,8 +148,8 @@ def _joint_entropy(scored: ScoredPad) -> float:
 
 
 TERMS = (
-    Term("expected_error_mm", "expected error with {} fibres failed, mm", _expected_errors_mm),
-    Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", _ambiguities_mm),
+    Term("expected_error_mm", "expected error with {} fibres failed, mm", lambda s: _in_mm(s, s.expected_errors)),
+    Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", lambda s: _in_mm(s, _ambiguities(s))),
     Term("information", "mutual information of positions and signals, bits", lambda s: information(s.pad, s.contact)),
     Term("idle_share", "share of presses in which a fibre is idle", lambda s: idle_share(s.serpentine_signals)),
     Term(
@@ -230,10 +221,9 @@ def score(
     """
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
     size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
-    noise = SearchSettings(noise=noise).noise
-    search = SearchSettings(max_failures=max_failures)
+    noise, stated = SearchSettings(noise=noise).noise, {"max_failures": max_failures}
     if scatter is not None:
-        stated = {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
-        search = SearchSettings(max_failures=max_failures, **stated)
+        stated |= {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
+    search = SearchSettings(**stated)
     check_comparisons(len(pad.knots), PER_SPAN * (pad.knots.shape[1] - 1) + 1)
     return ScoredPad(pad, contact, search, rules, size, noise).terms()
