@@ -15,10 +15,9 @@ from padforge.design.common.profiling import stage
 from padforge.design.common.validation import check_int
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import SimulatedPresses, fresh_presses, training_presses
+from padforge.design.networks import SimulatedPresses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
@@ -36,17 +35,11 @@ MAX_FAILURES, SUBSETS = 3, 4
 
 @dataclass(frozen=True)
 class ContactErrors:
-    """Mean errors of a small network for one pad under one contact.
+    """Mean errors of a small network for one pad under one contact."""
 
-    Attributes:
-        contact: name of the contact.
-        pad: name of the pad.
-        errors_mm: mean error with 0, 1, ... fibres failed.
-    """
-
-    contact: str
-    pad: str
-    errors_mm: tuple[float, ...]
+    contact: str  # name of the contact
+    pad: str  # name of the pad
+    errors_mm: tuple[float, ...]  # mean error with 0, 1, ... fibres failed
 
 
 def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
@@ -104,11 +97,7 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
         stretch = relative_stretch(pad, positions, contact) / scale
         return stretch * scatter.sample_gains(stretch.shape, rng) + scatter.floor * rng.standard_normal(stretch.shape)
 
-    training, fresh = (
-        positions[is_outside(positions, size)]
-        for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, N_TEST, seed))
-    )
-    return SimulatedPresses(training, respond(training), fresh, respond(fresh), seed)
+    return SimulatedPresses.simulate(pad, SIDE, N_TEST, seed, respond, size)
 
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:

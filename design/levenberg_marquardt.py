@@ -149,11 +149,7 @@ class _Batch(_Rows):
         return cls(index, zero, fit, x, targets, checked_x, checked, loss, zero, unset, two)
 
     def step(self) -> tuple[Tensor, Tensor]:
-        """Try a step of every network; where it is rejected, the next one is damped more.
-
-        Returns:
-            (L,) whether it is the best on validation so far, and whether it was the last one to try.
-        """
+        """Try a step; return (L,) whether it is the best on validation so far, and whether it was the last to try."""
         gradient = jacobian_product(self.x, self.fit, self.fit.error)
         change = self._solve(gradient)
         candidate = ProjectedFit.solve(self.fit.hidden - change.view_as(self.fit.hidden), self.x, self.fit.targets)
@@ -163,7 +159,7 @@ class _Batch(_Rows):
         self.fit.replace_rows(candidate.reassign(self.x, self.targets), accepted)
         factor = (1 - (2 * ratio - 1) ** 3).clamp(min=MIN_DAMPING_FACTOR)
         self.damping = (self.damping * torch.where(accepted, factor, self.growth)).clamp(min=MIN_DAMPING)
-        self.growth = torch.where(accepted, 2.0, 2 * self.growth)
+        self.growth = torch.where(accepted, 2.0, 2 * self.growth)  # where it is rejected, the next one is damped more
         self.steps = self.steps + accepted
         loss = self.fit.validate(self.validation_x, self.validation_targets)
         improved = accepted & (loss < self.best_loss)

@@ -16,7 +16,8 @@ from padforge.design.contact import serpentine_presses, signals
 from padforge.design.levenberg_marquardt import train_batch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from padforge.design.paths.keep_outs import is_outside
+from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, PadSettings, Rectangle, between_fibres
 
 EPOCHS = 1000
 TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
@@ -33,15 +34,10 @@ FailureSet = tuple[int, ...]
 
 @dataclass(frozen=True)
 class RangeScaler:
-    """Scale columns to [-1, 1] and back; a column that never varied becomes 0, which no weight can act on.
+    """Scale columns to [-1, 1] and back; a column that never varied becomes 0, which no weight can act on."""
 
-    Attributes:
-        middle: middle of each column's range; shape (D,).
-        half: half width of each column's range; shape (D,).
-    """
-
-    middle: Array
-    half: Array
+    middle: Array  # middle of each column's range; shape (D,)
+    half: Array  # half width of each column's range; shape (D,)
 
     @classmethod
     def fit(cls, values: Array) -> "RangeScaler":
@@ -60,21 +56,13 @@ class RangeScaler:
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network of one hidden layer of tanh neurons: `network(inputs)` (Q, D) gives outputs (Q, O).
+    """A trained network of one hidden layer of tanh neurons: `network(inputs)` (Q, D) gives outputs (Q, O)."""
 
-    Attributes:
-        hidden: weights of the neurons on scaled inputs, the last column their biases; shape (H, D + 1).
-        output: weights of the scaled outputs on the neurons, the last column their biases; shape (O, H + 1).
-        inputs: scaler of the inputs.
-        targets: scaler of the outputs.
-        epochs: steps of its training.
-    """
-
-    hidden: Array
-    output: Array
-    inputs: RangeScaler
-    targets: RangeScaler
-    epochs: int
+    hidden: Array  # weights of the neurons on scaled inputs, the last column their biases; shape (H, D + 1)
+    output: Array  # weights of the scaled outputs on the neurons, the last column their biases; shape (O, H + 1)
+    inputs: RangeScaler  # scaler of the inputs
+    targets: RangeScaler  # scaler of the outputs
+    epochs: int  # steps of its training
 
     def __call__(self, inputs: ArrayLike) -> Array:
         scaled = self.inputs.transform(np.asarray(inputs, dtype=np.float64))
@@ -213,9 +201,6 @@ def localisation_error(
         test: presses to test on, drawn uniformly over the same square.
         subsets: most sets of a number of failed fibres, always the same; all if None.
 
-    Returns:
-        Errors for each number of failed fibres.
-
     Raises:
         InputError: `presses` is no square of a number from 2, there is nothing to test on, or too much to do.
     """
@@ -246,21 +231,13 @@ def split_batches(failures: Sequence[FailureSet]) -> list[list[FailureSet]]:
 
 @dataclass(frozen=True)
 class SimulatedPresses:
-    """Presses to train on and others to test on, with the signals of a pad.
+    """Presses to train on and others to test on, with the signals of a pad."""
 
-    Attributes:
-        train_positions: shape (Q, 2), grid units.
-        train_signals: shape (Q, F).
-        test_positions: shape (T, 2), grid units.
-        test_signals: shape (T, F).
-        seed: of the networks, beside the failed fibres.
-    """
-
-    train_positions: Array
-    train_signals: Array
-    test_positions: Array
-    test_signals: Array
-    seed: int
+    train_positions: Array  # shape (Q, 2), grid units
+    train_signals: Array  # shape (Q, F)
+    test_positions: Array  # shape (T, 2), grid units
+    test_signals: Array  # shape (T, F)
+    seed: int  # of the networks, beside the failed fibres
 
     @classmethod
     def simulate(
@@ -270,20 +247,22 @@ class SimulatedPresses:
         test: int,
         seed: int,
         respond: Callable[[Array], Array],
-        sensed_mm: Sensed = "fibres",
+        size: PadSettings | None = None,
     ) -> "SimulatedPresses":
         """Simulate a serpentine of training presses and uniformly drawn test presses.
 
         Args:
-            pad: says where its fibres end.
+            pad: the fibres.
             side: square root of the number of training presses.
             test: test presses.
             seed: of the presses and the networks.
             respond: gives the signals (Q, F) for positions (Q, 2) in grid units.
-            sensed_mm: what is pressed, as in `PadSettings`.
+            size: says what is pressed, without keep-outs; if None, what lies between the outermost fibres.
         """
-        rectangle = sensed_rectangle(pad.layout, sensed_mm)
+        rectangle = between_fibres(pad.layout) if size is None else size.sensed
         training, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
+        if size is not None:
+            training, fresh = (positions[is_outside(positions, size)] for positions in (training, fresh))
         return cls(training, respond(training), fresh, respond(fresh), seed)
 
     def failure_errors(self, failures: Sequence[Sequence[FailureSet]], hidden: int) -> list[FailureError]:
@@ -340,5 +319,4 @@ def training_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
 
 def fresh_presses(rectangle: Rectangle, count: int, seed: int) -> Array:
     """Return (count, 2) presses drawn uniformly over a rectangle, grid units."""
-    low, high = rectangle
-    return np.random.default_rng([1, seed]).uniform(low, high, (count, 2))
+    return np.random.default_rng([1, seed]).uniform(*rectangle, (count, 2))

@@ -39,11 +39,7 @@ MAX_EXPONENT = 300.0
 
 
 def free_presses(size: PadSettings) -> Array:
-    """Return (Q, 2) up to SIDE x SIDE positions over what is pressed, grid units, that lie in no keep-out.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return (Q, 2) up to SIDE x SIDE positions over what is pressed, grid units, in no keep-out; refuse if none is."""
     presses = grid_positions(size.sensed, SIDE)
     presses = presses[is_outside(presses, size)]
     if not len(presses):

@@ -74,19 +74,12 @@ FULL_SCALE_SIDE = 24
 
 
 class PressWindow(NamedTuple):
-    """Presses of a window of the pad.
+    """Presses of a window of the pad."""
 
-    Attributes:
-        positions: of a square grid, row by row; shape (Q, 2), grid units.
-        step: between its neighbours; shape (2,), grid units.
-        free: which lie in no keep-out; shape (Q,).
-        far: presses over the remaining pad, none where the window is all that is pressed; shape (P, 2).
-    """
-
-    positions: Array
-    step: Array
-    free: NDArray[np.bool_]
-    far: Array
+    positions: Array  # of a square grid, row by row; shape (Q, 2), grid units
+    step: Array  # between its neighbours; shape (2,), grid units
+    free: NDArray[np.bool_]  # which lie in no keep-out; shape (Q,)
+    far: Array  # presses over the remaining pad, none where the window is all that is pressed; shape (P, 2)
 
     def with_partners(self, partners: Tensor) -> Tensor:
         """Return (Q + P, 2) positions of the window and of far presses by their indices."""

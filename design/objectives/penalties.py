@@ -109,11 +109,7 @@ def penalties(
 
 
 def check_comparisons(fibres: int, samples: int) -> None:
-    """Check that all samples of some fibres, or pairs of fibres, can be compared in memory.
-
-    Raises:
-        InputError: they cannot.
-    """
+    """Refuse so many fibres, or pairs of fibres, that their samples cannot be compared in memory."""
     if fibres * samples**2 > MAX_COMPARISONS:
         raise InputError(
             f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are "

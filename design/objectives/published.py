@@ -20,7 +20,6 @@ from padforge.design.contact import (
 )
 from padforge.design.kernels import published as kernels
 from padforge.design.kernels.pchip import population_slopes
-from padforge.design.kernels.published import published_terms as terms_kernel
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import (
     LEVELS,
@@ -130,19 +129,12 @@ def _mean_exponential(mean: Array, jacobian: Array, log_det: Array, rows: NDArra
 
 @dataclass(frozen=True)
 class PublishedTerms:
-    """The published objective and its terms.
+    """The published objective and its terms."""
 
-    Attributes:
-        entropy: joint entropy of the horizontals' signals plus that of the verticals', bits.
-        sharpness: Z, sum of |second difference| of the converter levels along the press order.
-        disorder: C, sum over samples and over pairs i < j of a family of the negative parts of curve_j - curve_i.
-        objective: alpha / (1 + entropy) + beta Z + gamma C, to be minimised.
-    """
-
-    entropy: float
-    sharpness: float
-    disorder: float
-    objective: float
+    entropy: float  # joint entropy of the horizontals' signals plus that of the verticals', bits
+    sharpness: float  # Z, sum of |second difference| of the converter levels along the press order
+    disorder: float  # C, sum over samples and over pairs i < j of a family of the negative parts of curve_j - curve_i
+    objective: float  # alpha / (1 + entropy) + beta Z + gamma C, to be minimised
 
 
 @lru_cache(maxsize=16)
@@ -187,7 +179,7 @@ def published_terms(
     terms = np.zeros((len(along), 3))
 
     def work(begin: int, end: int) -> None:
-        terms_kernel(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
+        kernels.published_terms(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
 
     map_chunks(work, len(along), min_chunk=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in terms.tolist()]

@@ -14,16 +14,8 @@ import shapely
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.morphology import Array, Morphology
+from padforge.design.paths import curves
 from padforge.design.paths.bends import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, trace_curve
-from padforge.design.paths.curves import (
-    beziers,
-    common_stretches,
-    crossing_angles,
-    crossings,
-    flatten,
-    lengths,
-    slope_beziers,
-)
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
@@ -95,7 +87,7 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
         size: keep-outs and the radius the pad is worn on; its layout is the pad's.
     """
     pad, rules = check_type("pad", pad, Morphology), check_type("rules", rules, RulesSettings)
-    lines = [pad.to_mm(points) for points in flatten(pad, TOLERANCE_MM / pad.unit_mm)]
+    lines = [pad.to_mm(points) for points in curves.flatten(pad, TOLERANCE_MM / pad.unit_mm)]
     size = or_default("size", size, PadSettings).for_layout(pad.layout)
     return [
         *_check_bends(pad, rules.min_bend_radius_mm, size.bent_radius_mm),
@@ -114,7 +106,7 @@ def _check_bends(pad: Morphology, limit: float, bent_radius_mm: float | None) ->
     if limit == 0:
         return
     window = min(limit / 2, *pad.layout.size_mm)  # no fibre is shorter than the pad
-    spans, slopes = beziers(pad), slope_beziers(pad)
+    spans, slopes = curves.beziers(pad), curves.slope_beziers(pad)
     turned = np.abs(np.diff(extreme_headings(slopes), prepend=0, append=0)).sum(axis=1)  # leads have heading 0
     max_rolled = 0.0 if bent_radius_mm is None else window / bent_radius_mm
     for fibre in map(int, np.flatnonzero(turned + max_rolled > window / limit)):
@@ -159,8 +151,8 @@ def _check_folds(pad: Morphology, lines: list[Array], limit: float) -> Iterator[
     if limit == 0:
         return
     if FOLD_TOLERANCE * limit > TOLERANCE_MM:
-        lines = [pad.to_mm(points) for points in flatten(pad, FOLD_TOLERANCE * limit / pad.unit_mm)]
-    for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
+        lines = [pad.to_mm(points) for points in curves.flatten(pad, FOLD_TOLERANCE * limit / pad.unit_mm)]
+    for fibre in np.flatnonzero(np.ptp(extreme_headings(curves.slope_beziers(pad)), axis=1) > UNFOLDED):
         if fold := _min_fold(lines[fibre].tobytes(), limit):
             yield _violation("min_gap_mm", [fibre], fold[0], limit, fold[1])
 
@@ -172,7 +164,7 @@ def _min_fold(line: bytes, limit: float) -> tuple[float, Array] | None:
 
 def _check_crossings(pad: Morphology, rules: RulesSettings) -> Iterator[Violation]:
     limit, min_angle = rules.max_crossings, rules.min_crossing_angle_deg
-    points = crossings(pad, CROSSING_TOLERANCE, across=limit is not None or min_angle > 0)
+    points = curves.crossings(pad, CROSSING_TOLERANCE, across=limit is not None or min_angle > 0)
     horizontals = pad.layout.horizontals
     across = [c for c in points if c.first < horizontals <= c.second]
     same = [c for c in points if (c.first < horizontals) == (c.second < horizontals)]
@@ -183,7 +175,7 @@ def _check_crossings(pad: Morphology, rules: RulesSettings) -> Iterator[Violatio
     if limit is not None and len(across) > limit:
         yield Violation("max_crossings", (), len(across), limit)
     if min_angle > 0:
-        angles = crossing_angles(pad, across)
+        angles = curves.crossing_angles(pad, across)
         worst: dict[tuple[int, int], Violation] = {}
         # a pair's least angle comes first
         for i in np.argsort(angles, kind="stable")[: np.count_nonzero(angles < min_angle)]:
@@ -198,7 +190,7 @@ def _check_common_tracks(lines: list[Array], layout: Layout, limit: float | None
         return
     longest: dict[tuple[int, int], Violation] = {}
     for one, other in (layout.families, layout.families[::-1]):
-        stretches = common_stretches(lines[one], lines[other], TRACK_WIDTH_MM)
+        stretches = curves.common_stretches(lines[one], lines[other], TRACK_WIDTH_MM)
         for i in np.flatnonzero(stretches.length > limit).tolist():
             fibre, length = one.start + int(stretches.line[i]), float(stretches.length[i])
             first, second = sorted((fibre, other.start + int(stretches.other[i])))
@@ -232,7 +224,7 @@ def _check_keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, lim
 
 
 def _check_lengths(pad: Morphology, limit: float) -> Iterator[Violation]:
-    long = lengths(pad) * pad.unit_mm
+    long = curves.lengths(pad) * pad.unit_mm
     return (_violation("max_length_mm", [f], float(long[f]), limit) for f in np.flatnonzero(long > limit))
 
 

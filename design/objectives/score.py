@@ -19,48 +19,27 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.contact import fibre_axes, serpentine_presses, signals, signals_quantized
 from padforge.design.morphology import Array, Morphology
+from padforge.design.objectives import published as formula
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import SEARCH_SIDE, expected_errors
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
-from padforge.design.objectives.published import (
-    PublishedTerms,
-    idle_share,
-    information,
-    joint_entropy,
-    published_presses,
-    published_terms,
-    quantize,
-)
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
 
 
 @dataclass(frozen=True)
 class ScoredPad:
-    """A pad and what its terms depend on.
+    """A pad and what its terms depend on."""
 
-    Attributes:
-        pad: the fibres.
-        contact: what a press does to them.
-        search: says how many fibres may fail, and how responses scatter.
-        rules: limits of the penalties.
-        size: says what is pressed.
-        noise: of a signal in the ambiguity, share of full scale.
-    """
-
-    pad: Morphology
-    contact: Contact
-    search: SearchSettings
-    rules: RulesSettings
-    size: PadSettings
-    noise: float = AMBIGUITY_NOISE
+    pad: Morphology  # the fibres
+    contact: Contact  # what a press does to them
+    search: SearchSettings  # says how many fibres may fail, and how responses scatter
+    rules: RulesSettings  # limits of the penalties
+    size: PadSettings  # says what is pressed
+    noise: float = AMBIGUITY_NOISE  # of a signal in the ambiguity, share of full scale
 
     def terms(self, names: Collection[str] = ()) -> dict[str, float]:
-        """Compute terms by name.
-
-        Args:
-            names: of rows of TERMS; all if empty.
-        """
+        """Compute the terms by name: those of the rows of TERMS that are named, or all."""
         values: dict[str, float] = {}
         for term in TERMS:
             if not names or term.name in names:
@@ -92,9 +71,9 @@ class ScoredPad:
         return PUBLISHED_CONTACT if self.contact.sensitivity_profile else self.contact
 
     @cached_property
-    def published(self) -> PublishedTerms:
+    def published(self) -> formula.PublishedTerms:
         """The published objective and its parts."""
-        return published_terms(self.pad, self.published_contact)[0]
+        return formula.published_terms(self.pad, self.published_contact)[0]
 
 
 ComputeSignals = Callable[[Array], Tensor]
@@ -103,21 +82,13 @@ ComputeSignals = Callable[[Array], Tensor]
 
 @dataclass(frozen=True)
 class Term:
-    """A row of the table of terms.
+    """A row of the table of terms."""
 
-    Attributes:
-        name: of the value, or the beginning of the names of several.
-        description: for people; `{}` stands for the end of the name.
-        compute: its value, or several by the end of their name.
-        weight: key of `[search]` by which a search weighs it; None if it does not.
-        loss: its differentiable form.
-    """
-
-    name: str
-    description: str
-    compute: Callable[[ScoredPad], float | Mapping[object, float]]
-    weight: str | None = None
-    loss: Callable[[ComputeSignals, PadSettings], Tensor] | None = None
+    name: str  # of the value, or the beginning of the names of several
+    description: str  # for people; `{}` stands for the end of the name
+    compute: Callable[[ScoredPad], float | Mapping[object, float]]  # its value, or several by the end of their name
+    weight: str | None = None  # key of `[search]` by which a search weighs it; None if it does not
+    loss: Callable[[ComputeSignals, PadSettings], Tensor] | None = None  # its differentiable form
 
 
 def sharpness(signals: Tensor) -> Tensor:
@@ -144,14 +115,19 @@ def _penalties(scored: ScoredPad) -> dict[object, float]:
 
 def _joint_entropy(scored: ScoredPad) -> float:
     pad = scored.pad
-    return joint_entropy(quantize(signals_quantized(pad, published_presses(pad.layout), scored.published_contact)))
+    responses = signals_quantized(pad, formula.published_presses(pad.layout), scored.published_contact)
+    return formula.joint_entropy(formula.quantize(responses))
 
 
 TERMS = (
     Term("expected_error_mm", "expected error with {} fibres failed, mm", lambda s: _in_mm(s, s.expected_errors)),
     Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", lambda s: _in_mm(s, _ambiguities(s))),
-    Term("information", "mutual information of positions and signals, bits", lambda s: information(s.pad, s.contact)),
-    Term("idle_share", "share of presses in which a fibre is idle", lambda s: idle_share(s.serpentine_signals)),
+    Term(
+        "information",
+        "mutual information of positions and signals, bits",
+        lambda s: formula.information(s.pad, s.contact),
+    ),
+    Term("idle_share", "share of presses in which a fibre is idle", lambda s: formula.idle_share(s.serpentine_signals)),
     Term(
         "sharpness",
         "mean second difference of the signals along a serpentine, grid units",

@@ -28,15 +28,11 @@ class GeneticSearch:
     The same problem gives the same pads, whether or not the search was interrupted and resumed from its state. An
     origin and mutated copies of it make up half of the first generation; knots of it within MARGIN of the pad's edge
     are moved to MARGIN, the bound of the search.
-
-    Attributes:
-        step: generations done.
-        objective: the best so far.
     """
 
     def __init__(self, problem: SearchProblem, state: State | None = None) -> None:
         search, origin = problem.search, problem.origin
-        self.step, self.objective = 0, math.inf
+        self.step, self.objective = 0, math.inf  # generations done, and the best objective so far
         self._history: list[tuple[int, float]] = []
         self._generations = search.generations
         self._problem = _PublishedProblem(problem)

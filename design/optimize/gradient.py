@@ -15,16 +15,7 @@ from torch import Tensor
 
 from padforge.design.common.checkpoints import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
-from padforge.design.objectives.expected_error import (
-    SEARCH_SIDE,
-    aggregate_failures,
-    confusable,
-    expected_error,
-    kernel_weights,
-    sample_window,
-    straight_full_scale,
-    window_presses,
-)
+from padforge.design.objectives import expected_error as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.score import weighted_terms
@@ -63,20 +54,13 @@ class Parametrization:
     """Free variables of a pad's fibres, mapped so that knots stay ascending, separate and off the border.
 
     Coordinates along a fibre are running sums of a softmax with a floor under every span, those across it a sigmoid.
-
-    Attributes:
-        layout: where the fibres end.
-        spans: logits of the spans, with gradient; shape (F, N + 1).
-        across: logits of the coordinates across the fibres, with gradient; shape (F, N).
-        floor: least span, grid units.
-        border: least distance of a knot to the border, grid units.
-        ends: of the fibres, for kernels.
     """
 
     def __init__(self, layout: Layout, spans: Tensor, across: Tensor, floor: float, border: float) -> None:
-        self.layout, self.floor, self.border = layout, floor, border
+        self.layout, self.ends = layout, fibre_ends(layout)
+        self.floor, self.border = floor, border  # least span, and least distance of a knot to the border, grid units
+        # logits of the spans (F, N + 1), and of the coordinates across the fibres (F, N)
         self.spans, self.across = (x.detach().clone().requires_grad_() for x in (spans, across))
-        self.ends = fibre_ends(layout)
         self._length, self._width, self._level = (torch.tensor(x)[:, None] for x in (*_sides(layout), layout.levels))
 
     @classmethod
@@ -181,24 +165,18 @@ class GradientSearch:
     """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of broken rules.
 
     The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
-
-    Attributes:
-        step: steps done.
-        objective: what is minimised, without penalties, at the last step.
-        done: whether it is finished.
-        scales: full scale of straight fibres under each contact.
     """
 
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
-        self.problem = problem
-        self.rng = np.random.default_rng([problem.search.seed, start])
-        self.step, self.objective, self.done = 0, math.inf, False
+        self.problem, self.rng = problem, np.random.default_rng([problem.search.seed, start])
+        self.step, self.objective, self.done = 0, math.inf, False  # objective of the last step, without penalties
         self._history: list[tuple[int, float]] = []
         if state is not None:
             self._restore(state)
             return
         pad, rules = problem.pad, problem.rules
-        self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
+        # full scale of straight fibres under each contact
+        self.scales = [objective.straight_full_scale(pad.layout, c, pad.sensed_mm) for c in problem.contacts]
         gentle = bool(problem.contacts[0].sensitivity_profile)
         paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng, gentle)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
@@ -312,12 +290,13 @@ class GradientSearch:
         # 1. a random window, another one if it lies in a keep-out, and random failures
         presses = None
         while presses is None or not presses.free.any():
-            presses = window_presses(pad, sample_window(pad.sensed, self.rng), SEARCH_SIDE, self.rng)
+            window = objective.sample_window(pad.sensed, self.rng)
+            presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
         shares = failure_shares(search.max_failures)
         failures = sample_failures(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, failures))
         masks, scatter = masks.float(), search.response_scatter.scaled(noise_factor)
-        weights = kernel_weights(pad.layout).float().to(search.device)
+        weights = objective.kernel_weights(pad.layout).float().to(search.device)
         total = torch.zeros((), device=search.device)
         for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
             model = {"contact": contact, "ends": self.fibres.ends, "unit_mm": pad.layout.unit_mm}
@@ -331,11 +310,11 @@ class GradientSearch:
             if len(presses.far):
                 with torch.no_grad():
                     near, far = (weights[:, None] * respond(x) for x in (presses.positions, presses.far))
-                    positions = presses.with_partners(confusable(near, far, masks))
+                    positions = presses.with_partners(objective.confusable(near, far, masks))
             # 3. expected error, and the terms that `[search]` weighs
-            responses = respond(positions.numpy())
-            errors = expected_error(responses, positions.to(search.device), step, free, masks, scatter, weights)
-            total = total + aggregate_failures(errors, masks, shares)
+            responses, positions = respond(positions.numpy()), positions.to(search.device)
+            errors = objective.expected_error(responses, positions, step, free, masks, scatter, weights)
+            total = total + objective.aggregate_failures(errors, masks, shares)
             for weight, term in weighted_terms(search):
                 if term.loss is not None:
                     on_device = lambda x, compute=compute_signals: compute(x).float().to(search.device)  # noqa: E731

@@ -14,21 +14,13 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """A pad to be found that serves all contacts within the rules.
+    """A pad to be found that serves all contacts within the rules."""
 
-    Attributes:
-        pad: settings of the pad.
-        contacts: what presses do to a fibre, the main one first.
-        search: how to search.
-        rules: the limits.
-        origin: morphology to start from; None for random starts.
-    """
-
-    pad: PadSettings
-    contacts: tuple[Contact, ...]
-    search: SearchSettings
-    rules: RulesSettings
-    origin: Morphology | None = None
+    pad: PadSettings  # settings of the pad
+    contacts: tuple[Contact, ...]  # what presses do to a fibre, the main one first
+    search: SearchSettings  # how to search
+    rules: RulesSettings  # the limits
+    origin: Morphology | None = None  # morphology to start from; None for random starts
 
     @property
     def starts(self) -> range:

@@ -9,7 +9,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -29,6 +29,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import ScoredPad
+from padforge.design.optimize.gradient import GradientSearch
 from padforge.design.optimize.problem import SearchProblem, build_problem
 from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
@@ -37,7 +38,6 @@ from padforge.design.twin import Twin
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
     from padforge.design.optimize.genetic import GeneticSearch
-    from padforge.design.optimize.gradient import GradientSearch
 
 SLICE = {"descent": 20, "genetic": 2}
 """Steps or generations of a slice: about a third of a second."""
@@ -269,13 +269,10 @@ def _finish_start(problem: SearchProblem, start: int, state: State | None, until
 
 
 def _open_start(problem: SearchProblem, start: int, state: State | None) -> "GradientSearch | GeneticSearch":
-    # each method needs a library that takes a while to import
     if problem.search.method == "genetic":
-        from .genetic import GeneticSearch
+        from .genetic import GeneticSearch  # pymoo takes a while to import
 
         return GeneticSearch(problem, state)
-    from .gradient import GradientSearch
-
     return GradientSearch(problem, start, state)
 
 
@@ -361,16 +358,10 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
 
 def _scatter_settings(twin: Twin, layout: Layout) -> dict[str, float]:
     """Return how the responses of a held press scatter, in `[search]`'s shares of the full scale of straight fibres."""
-    gains_v, noises_v = np.array(
-        [(abs(channel.gain_v), channel.noise_v) for channel in twin.channels if channel.gain_v]
-    ).T
+    gains_v, noises_v = np.array([(abs(fibre.gain_v), fibre.noise_v) for fibre in twin.channels if fibre.gain_v]).T
     scale = straight_full_scale(layout, twin.contact(), "beyond")
-    noise = twin.scatter.floor * np.median(noises_v) / (np.median(gains_v) * scale)
-    return {
-        "noise": float(np.clip(noise, 1e-3, 10)),
-        "scatter": twin.scatter.share,
-        "scatter_common": twin.scatter.common,
-    }
+    noise = float(np.clip(twin.scatter.floor * np.median(noises_v) / (np.median(gains_v) * scale), 1e-3, 10))
+    return {"noise": noise, "scatter": twin.scatter.share, "scatter_common": twin.scatter.common}
 
 
 def search_for_twin(
@@ -425,17 +416,16 @@ def search_for_twin(
     )
 
 
-def choose(errors: Mapping[str, Array], plain: Sequence[str] = ("default", "straight fibres")) -> str:
+def choose(errors: Mapping[str, Array]) -> str:
     """Return the pad of least mean error, among those that are worse than the plain ones with no number of failures.
 
     Args:
-        errors: with 0, 1, ... fibres failed, by pad.
-        plain: pads that the others are compared to; missing ones are ignored.
+        errors: with 0, 1, ... fibres failed, by pad; "default" and "straight fibres" are the plain ones, if present.
     """
-    best = np.min([errors[name] for name in plain if name in errors] or list(errors.values()), axis=0)
-    ratios = {name: error / best for name, error in errors.items()}
-    least = min(float(ratio.max()) for ratio in ratios.values())
-    fair = [name for name, ratio in ratios.items() if ratio.max() <= max(least, TOLERANCE)]
+    plain = [errors[name] for name in ("default", "straight fibres") if name in errors]
+    ratios = {name: error / np.min(plain or list(errors.values()), axis=0) for name, error in errors.items()}
+    limit = max(TOLERANCE, min(float(ratio.max()) for ratio in ratios.values()))
+    fair = [name for name, ratio in ratios.items() if ratio.max() <= limit]
     return min(fair, key=lambda name: float(np.log(ratios[name]).mean()))
 
 
