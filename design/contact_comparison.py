@@ -5,6 +5,7 @@ A small network is trained afresh under every contact, as a calibration is. The 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,10 +77,9 @@ def errors_by_contact(
     fibres = size.layout.fibres
     failures = [failure_subsets(fibres, number, subsets) for number in range(min(MAX_FAILURES, fibres - 1) + 1)]
     rows = []
-    for contact_name, contact in contacts.items():
-        for pad_name, pad in pads.items():
-            errors = _simulate(pad, contact, size, scatter, seed).failure_errors(failures, HIDDEN)
-            rows.append(ContactErrors(contact_name, pad_name, tuple(pad.unit_mm * error.mean for error in errors)))
+    for (contact_name, contact), (pad_name, pad) in product(contacts.items(), pads.items()):
+        errors = _simulate(pad, contact, size, scatter, seed).failure_errors(failures, HIDDEN)
+        rows.append(ContactErrors(contact_name, pad_name, tuple(pad.unit_mm * error.mean for error in errors)))
     return rows
 
 

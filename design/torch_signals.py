@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from padforge.design.common import profiling
@@ -15,9 +14,8 @@ from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.geometry import Ends
 from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
 from padforge.design.kernels.measured_signals import element_signals, element_spacing, elements_gradient, fibre_elements
+from padforge.design.morphology import Array
 from padforge.design.settings import Contact
-
-Array = NDArray[np.float64]
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:

@@ -96,10 +96,6 @@ def sharpness(signals: Tensor) -> Tensor:
     return signals.diff(n=2, dim=1).abs().mean()
 
 
-def _sharpness_loss(compute_signals: ComputeSignals, size: PadSettings) -> Tensor:
-    return sharpness(compute_signals(serpentine_presses(size.sensed, SEARCH_SIDE)))
-
-
 def _in_mm(scored: ScoredPad, values: list[float]) -> dict[object, float]:
     return {n_failed: scored.pad.unit_mm * value for n_failed, value in enumerate(values)}
 
@@ -133,7 +129,7 @@ TERMS = (
         "mean second difference of the signals along a serpentine, grid units",
         lambda s: sharpness(torch.tensor(s.serpentine_signals.T)).item(),
         weight="sharpness",
-        loss=_sharpness_loss,
+        loss=lambda compute, size: sharpness(compute(serpentine_presses(size.sensed, SEARCH_SIDE))),
     ),
     Term("penalty", "penalty of {} in the gradient search", _penalties),
     Term(

@@ -168,7 +168,9 @@ def search(
             candidates.append(Candidate("origin", origin, problem))
         if problem.search.method != "genetic":  # the published method is left as it was published
             candidates.append(straight)
-        result = min(candidates, key=lambda candidate: candidate.rank).to_result(straight)
+        # fewest broken rules first, then the least objective, summed over the contacts
+        best = min(candidates, key=lambda c: (len(c.violations), sum(scored.objective for scored in c.scored)))
+        result = best.to_result(straight)
     history = [
         {"run": _name(problem, start), "step": int(step), "objective": value}
         for start, state in sorted(states.items())
@@ -195,11 +197,6 @@ class Candidate:
         """Its scores under each contact."""
         p = self.problem
         return [ScoredPad(self.pad, contact, p.search, p.rules, p.pad) for contact in p.contacts]
-
-    @property
-    def rank(self) -> tuple[int, float]:
-        """Least for the best pad: fewest broken rules first, then the least objective, summed over the contacts."""
-        return len(self.violations), sum(scored.objective for scored in self.scored)
 
     def to_result(self, straight: "Candidate") -> SearchResult:
         """Return the result of a search that ends with it."""
