@@ -118,11 +118,11 @@ class _PublishedNetwork:
 
 
 def _train_marquardt(x: Array, y: Array, epochs: int) -> Predict:
-    from padforge.design.networks import fit
+    from padforge.design.networks import fit_batch
 
     held_out = np.arange(len(x)) % 12 == 0
-    train, validation = (x[~held_out], y[~held_out]), (x[held_out], y[held_out])
-    return fit(*train, np.random.default_rng(0), HIDDEN, epochs, validation=validation)
+    validation = x[held_out][None], y[held_out]
+    return fit_batch(x[~held_out], y[~held_out], [np.random.default_rng(0)], HIDDEN, epochs, validation)[0]
 
 
 def _train_lbfgs(x: Array, y: Array, iterations: int) -> Predict:

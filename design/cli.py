@@ -210,7 +210,7 @@ def _load_and_check(
 
     pad, settings = Morphology.load(morphology), load_spec(spec)
     if twin is not None:
-        from padforge.design.optimize.twin_search import settings_for_twin
+        from padforge.design.optimize.search import settings_for_twin
 
         settings = settings_for_twin(settings, twin, pad)
     pad_settings = settings.section(PadSettings, **pad.layout.settings)

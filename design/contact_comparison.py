@@ -5,6 +5,7 @@ A small network is trained afresh under every contact, as a calibration is. The 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +16,9 @@ from padforge.design.common.profiling import stage
 from padforge.design.common.validation import check_int
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import SimulatedPresses, fresh_presses, training_presses
+from padforge.design.networks import SimulatedPresses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
 
 if TYPE_CHECKING:
@@ -36,17 +36,11 @@ MAX_FAILURES, SUBSETS = 3, 4
 
 @dataclass(frozen=True)
 class ContactErrors:
-    """Mean errors of a small network for one pad under one contact.
+    """Mean errors of a small network for one pad under one contact."""
 
-    Attributes:
-        contact: name of the contact.
-        pad: name of the pad.
-        errors_mm: mean error with 0, 1, ... fibres failed.
-    """
-
-    contact: str
-    pad: str
-    errors_mm: tuple[float, ...]
+    contact: str  # name of the contact
+    pad: str  # name of the pad
+    errors_mm: tuple[float, ...]  # mean error with 0, 1, ... fibres failed
 
 
 def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
@@ -71,8 +65,6 @@ def errors_by_contact(
 ) -> list[ContactErrors]:
     """Compute mean errors of a small network for pads of one layout under every contact, contact by contact.
 
-    The network is trained on one response of each fibre to a press.
-
     Args:
         pads: by name.
         contacts: by name.
@@ -85,10 +77,9 @@ def errors_by_contact(
     fibres = size.layout.fibres
     failures = [failure_subsets(fibres, number, subsets) for number in range(min(MAX_FAILURES, fibres - 1) + 1)]
     rows = []
-    for contact_name, contact in contacts.items():
-        for pad_name, pad in pads.items():
-            errors = _simulate(pad, contact, size, scatter, seed).failure_errors(failures, HIDDEN)
-            rows.append(ContactErrors(contact_name, pad_name, tuple(pad.unit_mm * error.mean for error in errors)))
+    for (contact_name, contact), (pad_name, pad) in product(contacts.items(), pads.items()):
+        errors = _simulate(pad, contact, size, scatter, seed).failure_errors(failures, HIDDEN)
+        rows.append(ContactErrors(contact_name, pad_name, tuple(pad.unit_mm * error.mean for error in errors)))
     return rows
 
 
@@ -106,11 +97,7 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
         stretch = relative_stretch(pad, positions, contact) / scale
         return stretch * scatter.sample_gains(stretch.shape, rng) + scatter.floor * rng.standard_normal(stretch.shape)
 
-    training, fresh = (
-        positions[is_outside(positions, size)]
-        for positions in (training_presses(size.sensed, SIDE, seed), fresh_presses(size.sensed, N_TEST, seed))
-    )
-    return SimulatedPresses(training, respond(training), fresh, respond(fresh), seed)
+    return SimulatedPresses.simulate(pad, SIDE, N_TEST, seed, respond, size)
 
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
@@ -119,16 +106,13 @@ def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
-    """Write the errors of a pad and of straight fibres under the contact of `spec` and others.
+    """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others.
 
     Args:
         spec: settings of the pad, the contact and the scatter.
         pad: the design.
         out: folder of `contacts.json`.
         seed: that of `[search]` if None.
-
-    Returns:
-        The document: rows of contact, pad and mean errors in mm with 0, 1, ... fibres failed.
     """
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)

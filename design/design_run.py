@@ -21,8 +21,14 @@ from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import describe_terms
-from padforge.design.optimize.search import SearchOptions, SearchResult, search
-from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
+from padforge.design.optimize.search import (
+    SearchOptions,
+    SearchResult,
+    search,
+    search_for_twin,
+    settings_for_twin,
+    state_folders,
+)
 from padforge.design.plan_drawing import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 

@@ -71,44 +71,26 @@ class _Rows:
 
     def replace_rows(self, other: Self, mask: Tensor) -> None:
         """Take over the rows of `other` where `mask` (S,) is set."""
-        is_whole = bool(mask.all())
         for field in fields(self):
             current, new = getattr(self, field.name), getattr(other, field.name)
-            rows = mask.view(-1, *[1] * (current.dim() - 1))
-            setattr(self, field.name, new if is_whole else torch.where(rows, new, current))
+            setattr(self, field.name, torch.where(mask.view(-1, *[1] * (current.dim() - 1)), new, current))
 
 
 @dataclass
 class ProjectedFit(_Rows):
-    """Networks with the output weights that are best for their hidden ones.
+    """Networks with the output weights that are best for their hidden ones."""
 
-    Attributes:
-        hidden: hidden weights; shape (S, D + 1, H).
-        targets: of equally valid targets the ones nearest to the outputs; shape (S, Q, O).
-        neurons: activations, the last column 1; shape (S, Q, H + 1).
-        root: inverse Cholesky factor of the ridged Gram matrix, with Z = neurons root'; shape (S, H + 1, H + 1).
-        output: output weights; shape (S, H + 1, O).
-        error: residual; shape (S, Q, O).
-        loss: squared error with the ridge's penalty; shape (S,).
-    """
-
-    hidden: Tensor
-    targets: Tensor
-    neurons: Tensor
-    root: Tensor
-    output: Tensor
-    error: Tensor
-    loss: Tensor
+    hidden: Tensor  # hidden weights; shape (S, D + 1, H)
+    targets: Tensor  # of equally valid targets the ones nearest to the outputs; shape (S, Q, O)
+    neurons: Tensor  # activations, the last column 1; shape (S, Q, H + 1)
+    root: Tensor  # inverse Cholesky factor of the ridged Gram matrix, Z = neurons root'; shape (S, H + 1, H + 1)
+    output: Tensor  # output weights; shape (S, H + 1, O)
+    error: Tensor  # residual; shape (S, Q, O)
+    loss: Tensor  # squared error with the ridge's penalty; shape (S,)
 
     @classmethod
     def solve(cls, hidden: Tensor, x: Tensor, targets: Tensor) -> Self:
-        """Solve for the output weights.
-
-        Args:
-            hidden: hidden weights; shape (S, D + 1, H).
-            x: inputs with a last column of 1; shape (S, Q, D + 1).
-            targets: shape (S, Q, O).
-        """
+        """Solve for the output weights, for x (S, Q, D + 1) with a last column of 1, and targets (S, Q, O)."""
         neurons = activations(hidden, x)
         ridge = RIDGE * x.shape[1]
         gram = neurons.mT @ neurons
@@ -126,6 +108,10 @@ class ProjectedFit(_Rows):
             return self
         return ProjectedFit.solve(self.hidden, x, _nearest_targets(self.neurons @ self.output, targets)[0])
 
+    def validate(self, x: Tensor, targets: Tensor) -> Tensor:
+        """Return (S,) squared errors to the nearest of the targets (S, A, Q, O) of other samples."""
+        return _sum_squares(_nearest_targets(activations(self.hidden, x) @ self.output, targets)[1])
+
     def basis(self, like: Tensor) -> Tensor:
         """Return Z (S, Q, H + 1) in the precision of `like`."""
         return self.neurons.to(like) @ self.root.mT.to(like)
@@ -138,50 +124,32 @@ class ProjectedFit(_Rows):
 
 @dataclass
 class _Batch(_Rows):
-    """The networks still in training.
+    """The networks still in training."""
 
-    Attributes:
-        index: which of all networks they are; shape (L,).
-        steps: accepted steps of each; shape (L,).
-        fit: their weights and residuals.
-        x: training inputs; shape (L, Q, D + 1).
-        targets: training targets; shape (L, A, Q, O).
-        validation_x: validation inputs.
-        validation_targets: validation targets.
-        best_loss: least squared error on validation so far; shape (L,).
-        stalled: accepted steps since; shape (L,).
-        damping: shape (L,).
-        growth: factor on the damping if the next step fails; shape (L,).
-    """
-
-    index: Tensor
-    steps: Tensor
-    fit: ProjectedFit
-    x: Tensor
-    targets: Tensor
+    index: Tensor  # which of all networks they are; shape (L,)
+    steps: Tensor  # accepted steps of each; shape (L,)
+    fit: ProjectedFit  # their weights and residuals
+    x: Tensor  # training inputs; shape (L, Q, D + 1)
+    targets: Tensor  # training targets; shape (L, A, Q, O)
     validation_x: Tensor
     validation_targets: Tensor
-    best_loss: Tensor
-    stalled: Tensor
-    damping: Tensor
-    growth: Tensor
+    best_loss: Tensor  # least squared error on validation so far; shape (L,)
+    stalled: Tensor  # accepted steps since; shape (L,)
+    damping: Tensor  # shape (L,)
+    growth: Tensor  # factor on the damping if the next step fails; shape (L,)
 
     @classmethod
     def start(cls, hidden: Tensor, training: Samples, validation: Samples) -> Self:
         """Return the batch before the first step."""
         (x, targets), (checked_x, checked) = ((append_ones(inputs), goal) for inputs, goal in (training, validation))
         fit = ProjectedFit.solve(hidden, x, targets[:, 0]).reassign(x, targets)
-        loss = _sum_squares(_nearest_targets(activations(hidden, checked_x) @ fit.output, checked)[1])
+        loss = fit.validate(checked_x, checked)
         index = torch.arange(len(hidden), device=hidden.device)
         zero, unset, two = torch.zeros_like(index), torch.full_like(loss, torch.nan), torch.full_like(loss, 2.0)
         return cls(index, zero, fit, x, targets, checked_x, checked, loss, zero, unset, two)
 
     def step(self) -> tuple[Tensor, Tensor]:
-        """Try a step of every network; where it is rejected, the next one is damped more.
-
-        Returns:
-            (L,) whether it is the best on validation so far, and whether it was the last one to try.
-        """
+        """Try a step; return (L,) whether it is the best on validation so far, and whether it was the last to try."""
         gradient = jacobian_product(self.x, self.fit, self.fit.error)
         change = self._solve(gradient)
         candidate = ProjectedFit.solve(self.fit.hidden - change.view_as(self.fit.hidden), self.x, self.fit.targets)
@@ -191,10 +159,9 @@ class _Batch(_Rows):
         self.fit.replace_rows(candidate.reassign(self.x, self.targets), accepted)
         factor = (1 - (2 * ratio - 1) ** 3).clamp(min=MIN_DAMPING_FACTOR)
         self.damping = (self.damping * torch.where(accepted, factor, self.growth)).clamp(min=MIN_DAMPING)
-        self.growth = torch.where(accepted, 2.0, 2 * self.growth)
+        self.growth = torch.where(accepted, 2.0, 2 * self.growth)  # where it is rejected, the next one is damped more
         self.steps = self.steps + accepted
-        outputs = activations(self.fit.hidden, self.validation_x) @ self.fit.output
-        loss = _sum_squares(_nearest_targets(outputs, self.validation_targets)[1])
+        loss = self.fit.validate(self.validation_x, self.validation_targets)
         improved = accepted & (loss < self.best_loss)
         self.best_loss = torch.where(improved, loss, self.best_loss)
         self.stalled = torch.where(improved, 0, self.stalled + accepted)

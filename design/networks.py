@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
@@ -17,7 +16,8 @@ from padforge.design.contact import serpentine_presses, signals
 from padforge.design.levenberg_marquardt import train_batch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, Sensed, sensed_rectangle
+from padforge.design.paths.keep_outs import is_outside
+from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, PadSettings, Rectangle, between_fibres
 
 EPOCHS = 1000
 TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
@@ -34,15 +34,10 @@ FailureSet = tuple[int, ...]
 
 @dataclass(frozen=True)
 class RangeScaler:
-    """Scale columns to [-1, 1] and back; a column that never varied becomes 0, which no weight can act on.
+    """Scale columns to [-1, 1] and back; a column that never varied becomes 0, which no weight can act on."""
 
-    Attributes:
-        middle: middle of each column's range; shape (D,).
-        half: half width of each column's range; shape (D,).
-    """
-
-    middle: Array
-    half: Array
+    middle: Array  # middle of each column's range; shape (D,)
+    half: Array  # half width of each column's range; shape (D,)
 
     @classmethod
     def fit(cls, values: Array) -> "RangeScaler":
@@ -61,48 +56,18 @@ class RangeScaler:
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network of one hidden layer of tanh neurons: `network(inputs)` (Q, D) gives outputs (Q, O).
+    """A trained network of one hidden layer of tanh neurons: `network(inputs)` (Q, D) gives outputs (Q, O)."""
 
-    Attributes:
-        hidden: weights of the neurons on scaled inputs, the last column their biases; shape (H, D + 1).
-        output: weights of the scaled outputs on the neurons, the last column their biases; shape (O, H + 1).
-        inputs: scaler of the inputs.
-        targets: scaler of the outputs.
-        epochs: steps of its training.
-    """
-
-    hidden: Array
-    output: Array
-    inputs: RangeScaler
-    targets: RangeScaler
-    epochs: int
+    hidden: Array  # weights of the neurons on scaled inputs, the last column their biases; shape (H, D + 1)
+    output: Array  # weights of the scaled outputs on the neurons, the last column their biases; shape (O, H + 1)
+    inputs: RangeScaler  # scaler of the inputs
+    targets: RangeScaler  # scaler of the outputs
+    epochs: int  # steps of its training
 
     def __call__(self, inputs: ArrayLike) -> Array:
         scaled = self.inputs.transform(np.asarray(inputs, dtype=np.float64))
         neurons = np.tanh(scaled @ self.hidden[:, :-1].T + self.hidden[:, -1])
         return self.targets.inverse_transform(neurons @ self.output[:, :-1].T + self.output[:, -1])
-
-
-def fit(
-    inputs: Array,
-    targets: Array,
-    rng: np.random.Generator,
-    hidden: int = 50,
-    epochs: int = EPOCHS,
-    validation: tuple[Array, Array] | None = None,
-) -> Network:
-    """Train one network: `fit_batch` with a batch of one.
-
-    Args:
-        inputs: shape (Q, D).
-        targets: shape (Q, O).
-        rng: source of the split and of the first weights.
-        hidden: neurons.
-        epochs: most steps.
-        validation: inputs (C, D) and targets (C, O); if given, all samples are for training.
-    """
-    checked = None if validation is None else (validation[0][None], validation[1])
-    return fit_batch(inputs[None], targets, [rng], hidden, epochs, checked)[0]
 
 
 def fit_batch(
@@ -113,12 +78,11 @@ def fit_batch(
     epochs: int = EPOCHS,
     validation: tuple[Array, Array] | None = None,
     alternatives: Array | None = None,
-    device: str | None = None,
 ) -> list[Network]:
-    """Train networks of one shape at once by Levenberg-Marquardt with early stopping.
+    """Train S networks of one shape at once by Levenberg-Marquardt with early stopping.
 
     Of the samples 70 % are for training, 15 % for validation, 15 % are left out. A network depends on its `rng` and its
-    samples, beyond rounding on no other one of the batch.
+    samples, beyond rounding on no other one of the batch, and is that of the step that did best on validation.
 
     Args:
         inputs: finite samples of S networks (S, Q, D), or (Q, D) that all of them share.
@@ -128,10 +92,6 @@ def fit_batch(
         epochs: most steps of a network.
         validation: inputs (S, C, D) and targets (C, O); if given, all samples are for training.
         alternatives: targets (A, Q, O) as valid as `targets`: a sample counts by the nearest one.
-        device: where torch computes; None for the GPU if there is one.
-
-    Returns:
-        S networks, each of the step that did best on validation.
 
     Raises:
         InputError: fewer than 3 samples, not as many targets as inputs, nothing to learn from or with, or numbers that
@@ -141,33 +101,23 @@ def fit_batch(
     options = targets[None] if alternatives is None else np.concatenate([targets[None], alternatives])
     scalers = [RangeScaler.fit(samples) for samples in inputs]
     target_scaler = RangeScaler.fit(options.reshape(-1, targets.shape[1]))
-    count = inputs.shape[1]
+    goals, count = target_scaler.transform(options), inputs.shape[1]
     n_training = round(TRAINING_SHARE * count) if validation is None else count
     n_validation = max(1, round(VALIDATION_SHARE * count))
-    training, checked, weights = [], [], []
+    parts = []
     for i, (scaler, rng) in enumerate(zip(scalers, rngs, strict=True)):
-        order = rng.permutation(count)
-        rows, held_out = order[:n_training], order[n_training : n_training + n_validation]
-        training.append((scaler.transform(inputs[i, rows]), target_scaler.transform(options[:, rows])))
-        if validation is None:
-            checked.append((scaler.transform(inputs[i, held_out]), target_scaler.transform(options[:, held_out])))
-        else:
-            goal = target_scaler.transform(validation[1][None])
-            checked.append((scaler.transform(validation[0][i]), goal))
-        weights.append(initial_weights(scaler.half > 0, hidden, rng).T)
-
-    def stack(parts: Sequence[Array]) -> Tensor:
-        return torch.from_numpy(np.stack(parts)).to(device or best_device())
-
-    def stack_samples(samples: Sequence[tuple[Array, Array]]) -> tuple[Tensor, Tensor]:
-        return stack([x for x, _ in samples]), stack([y for _, y in samples])
-
-    trained = train_batch(stack(weights), stack_samples(training), stack_samples(checked), epochs)
+        rows, held_out, _ = np.split(rng.permutation(count), [n_training, n_training + n_validation])
+        x = scaler.transform(inputs[i])
+        checked = x[held_out], goals[:, held_out]
+        if validation is not None:
+            checked = scaler.transform(validation[0][i]), target_scaler.transform(validation[1][None])
+        parts.append((initial_weights(scaler.half > 0, hidden, rng).T, x[rows], goals[:, rows], *checked))
+    weights, *samples = (torch.from_numpy(np.stack(part)).to(best_device()) for part in zip(*parts, strict=True))
+    trained = train_batch(weights, (samples[0], samples[1]), (samples[2], samples[3]), epochs)
+    trained = (part.cpu().numpy() for part in trained)
     return [
         Network(hidden_weights.T, output_weights.T, scaler, target_scaler, int(steps))
-        for scaler, hidden_weights, output_weights, steps in zip(
-            scalers, *(part.cpu().numpy() for part in trained), strict=True
-        )
+        for scaler, hidden_weights, output_weights, steps in zip(scalers, *trained, strict=True)
     ]
 
 
@@ -192,15 +142,12 @@ def best_device() -> str:
 
 
 def initial_weights(varies: NDArray[np.bool_], hidden: int, rng: np.random.Generator) -> Array:
-    """Draw hidden weights by the rule of Nguyen and Widrow (IJCNN 1990): active regions spread over [-1, 1]^D.
+    """Draw hidden weights (H, D + 1), biases last, by Nguyen and Widrow (IJCNN 1990): regions spread over [-1, 1]^D.
 
     Args:
         varies: which inputs vary; the others get weight 0, as if they were absent; shape (D,).
         hidden: neurons H.
         rng: source of the weights.
-
-    Returns:
-        Weights and biases (H, D + 1).
     """
     weights = rng.uniform(-1, 1, (hidden, len(varies))) * varies
     length = 0.7 * hidden ** (1 / max(1, varies.sum()))
@@ -254,9 +201,6 @@ def localisation_error(
         test: presses to test on, drawn uniformly over the same square.
         subsets: most sets of a number of failed fibres, always the same; all if None.
 
-    Returns:
-        Errors for each number of failed fibres.
-
     Raises:
         InputError: `presses` is no square of a number from 2, there is nothing to test on, or too much to do.
     """
@@ -287,21 +231,13 @@ def split_batches(failures: Sequence[FailureSet]) -> list[list[FailureSet]]:
 
 @dataclass(frozen=True)
 class SimulatedPresses:
-    """Presses to train on and others to test on, with the signals of a pad.
+    """Presses to train on and others to test on, with the signals of a pad."""
 
-    Attributes:
-        train_positions: shape (Q, 2), grid units.
-        train_signals: shape (Q, F).
-        test_positions: shape (T, 2), grid units.
-        test_signals: shape (T, F).
-        seed: of the networks, beside the failed fibres.
-    """
-
-    train_positions: Array
-    train_signals: Array
-    test_positions: Array
-    test_signals: Array
-    seed: int
+    train_positions: Array  # shape (Q, 2), grid units
+    train_signals: Array  # shape (Q, F)
+    test_positions: Array  # shape (T, 2), grid units
+    test_signals: Array  # shape (T, F)
+    seed: int  # of the networks, beside the failed fibres
 
     @classmethod
     def simulate(
@@ -311,20 +247,22 @@ class SimulatedPresses:
         test: int,
         seed: int,
         respond: Callable[[Array], Array],
-        sensed_mm: Sensed = "fibres",
+        size: PadSettings | None = None,
     ) -> "SimulatedPresses":
         """Simulate a serpentine of training presses and uniformly drawn test presses.
 
         Args:
-            pad: says where its fibres end.
+            pad: the fibres.
             side: square root of the number of training presses.
             test: test presses.
             seed: of the presses and the networks.
             respond: gives the signals (Q, F) for positions (Q, 2) in grid units.
-            sensed_mm: what is pressed, as in `PadSettings`.
+            size: says what is pressed, without keep-outs; if None, what lies between the outermost fibres.
         """
-        rectangle = sensed_rectangle(pad.layout, sensed_mm)
+        rectangle = between_fibres(pad.layout) if size is None else size.sensed
         training, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
+        if size is not None:
+            training, fresh = (positions[is_outside(positions, size)] for positions in (training, fresh))
         return cls(training, respond(training), fresh, respond(fresh), seed)
 
     def failure_errors(self, failures: Sequence[Sequence[FailureSet]], hidden: int) -> list[FailureError]:
@@ -339,13 +277,14 @@ class SimulatedPresses:
             networks = self.fit(batch, hidden)
             return np.array([self.test_errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
 
-        batches = {(i, k): part for i, level in enumerate(failures) for k, part in enumerate(split_batches(level))}
+        batches = [batch for level in failures for batch in split_batches(level)]
         with one_torch_thread():
-            means = dict(run_tasks((key, partial(mean_errors, batch)) for key, batch in batches.items()))
-        by_level = [np.concatenate([means[key] for key in batches if key[0] == i]) for i in range(len(failures))]
+            means = dict(run_tasks((i, partial(mean_errors, batch)) for i, batch in enumerate(batches)))
+        errors = np.concatenate([np.empty(0), *(means[i] for i in range(len(batches)))])
+        levels = np.split(errors, np.cumsum([len(sets) for sets in failures[:-1]], dtype=int))
         return [
             FailureError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
-            for sets, level in zip(failures, by_level, strict=True)
+            for sets, level in zip(failures, levels, strict=False)
         ]
 
     def fit(self, failures: Sequence[FailureSet], hidden: int, repeat: int = 0) -> list[Network]:
@@ -380,5 +319,4 @@ def training_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
 
 def fresh_presses(rectangle: Rectangle, count: int, seed: int) -> Array:
     """Return (count, 2) presses drawn uniformly over a rectangle, grid units."""
-    low, high = rectangle
-    return np.random.default_rng([1, seed]).uniform(low, high, (count, 2))
+    return np.random.default_rng([1, seed]).uniform(*rectangle, (count, 2))

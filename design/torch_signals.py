@@ -5,32 +5,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from padforge.design.common import profiling
-from padforge.design.contact import PressShape, press_shape, record_visits
+from padforge.design.contact import press_shape, record_visits
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.geometry import Ends
 from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
 from padforge.design.kernels.measured_signals import element_signals, element_spacing, elements_gradient, fibre_elements
+from padforge.design.morphology import Array
 from padforge.design.settings import Contact
-
-Array = NDArray[np.float64]
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
-    """Compute the slopes of PCHIP interpolants; differentiable almost everywhere.
-
-    The same rule as `pchip_slopes` of the kernels, to rounding.
+    """Compute slopes (..., n) of PCHIP interpolants, as the kernels do to rounding; differentiable almost everywhere.
 
     Args:
         t: ascending coordinates; shape (..., n).
         v: values; shape (..., n).
-
-    Returns:
-        Slopes; shape (..., n).
     """
     h = t.diff(dim=-1)
     m = v.diff(dim=-1) / h
@@ -53,15 +46,12 @@ def _end_slope(h0: Tensor, h1: Tensor, m0: Tensor, m1: Tensor) -> Tensor:
 
 
 def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Evaluate PCHIP interpolants.
+    """Return values and slopes, both (..., F), of PCHIP interpolants.
 
     Args:
         t: ascending coordinates; shape (..., n).
         v: values; shape (..., n).
         at: coordinates to evaluate at; shape (F,).
-
-    Returns:
-        Values and slopes, both (..., F).
     """
     d = pchip_slopes(t, v)
     inner = t[..., 1:-1].detach().contiguous()
@@ -76,15 +66,12 @@ def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
-    """Sample PCHIP interpolants, denser towards the ends of each span, where steep spans bend.
+    """Return points (..., P, 2) and slopes (..., P) of PCHIP interpolants, denser towards the ends, where spans bend.
 
     Args:
         t: ascending coordinates; shape (..., n).
         v: values; shape (..., n).
-        per_span: samples per span.
-
-    Returns:
-        Points (..., P, 2) and slopes (..., P), P = (n - 1) per_span + 1.
+        per_span: samples per span; P = (n - 1) per_span + 1.
     """
     d = pchip_slopes(t, v)
     t0, v0, d0, d1 = (x[..., None] for x in (t[..., :-1], v[..., :-1], d[..., :-1], d[..., 1:]))
@@ -100,15 +87,12 @@ def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
 
 
 def arc_lengths(along: Tensor, across: Tensor, slope: Tensor) -> Tensor:
-    """Compute the arc lengths of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep.
+    """Compute the arc lengths (F,) of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep.
 
     Args:
         along: knots along the axis; shape (F, n).
         across: knots across it; shape (F, n).
         slope: slopes at the knots; shape (F, n).
-
-    Returns:
-        Arc lengths; shape (F,).
     """
     nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(8))
     s = (nodes + 1) / 2
@@ -121,7 +105,7 @@ def arc_lengths(along: Tensor, across: Tensor, slope: Tensor) -> Tensor:
 def press_signals(
     along: Tensor, across: Tensor, slope: Tensor, presses: Array, contact: Contact, ends: Ends, unit_mm: float
 ) -> Tensor:
-    """Compute the signals of one pad with their analytic gradient.
+    """Compute the signals (F, Q) of one pad, grid units for weights without unit, with their analytic gradient.
 
     They are exact for a shape, and within PRECISION of `measured_signals` for a sensitivity profile.
 
@@ -133,72 +117,37 @@ def press_signals(
         contact: contact model.
         ends: positions of the fibre ends.
         unit_mm: the pad's grid unit, mm.
-
-    Returns:
-        Signals; shape (F, Q), grid units for weights without unit.
     """
-    inputs, shape = (along, across, slope, presses, ends), press_shape(contact, unit_mm)
-    if contact.sensitivity_profile:
-        shape_and_spacing = shape, element_spacing(contact.profile_points(unit_mm))
-        return MeasuredSignals.apply(*inputs, shape_and_spacing)  # pyright: ignore[reportReturnType]
-    return ExactSignals.apply(*inputs, shape)  # pyright: ignore[reportReturnType]
+    return _PressSignals.apply(along, across, slope, presses, contact, ends, unit_mm)  # pyright: ignore[reportReturnType]
 
 
-class ExactSignals(torch.autograd.Function):
-    """Exact signals of one pad, as a torch function of its knots and slopes."""
+class _PressSignals(torch.autograd.Function):
+    """`press_signals` as a torch function of knots and slopes."""
 
     @staticmethod
-    def forward(
-        ctx: Any, along: Tensor, across: Tensor, slope: Tensor, presses: Array, ends: Ends, shape: PressShape
-    ) -> Tensor:
-        """Compute signals (F, Q)."""
-        t, v, d = (x.detach().numpy() for x in (along, across, slope))
-        max_offsets, none = compute_max_offsets(v[None], ends), np.empty(0, np.int64)
-        ctx.inputs = (t, v, d, max_offsets[0], ends, presses, shape)
-        out = np.zeros(len(presses) * len(t))
-        curves = t[None], v[None], d[None]
-        visited = exact_signals(curves, max_offsets, ends, presses, shape, 0, len(presses), (none, none), out)
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        t, v, d = (x.detach().numpy() for x in inputs[:3])
+        presses, contact, ends, unit_mm = inputs[3:]
+        shape, max_offsets, out = (
+            press_shape(contact, unit_mm),
+            compute_max_offsets(v[None], ends),
+            np.zeros((len(presses), len(t))),
+        )
+        if contact.sensitivity_profile:  # elements are cut once for both directions
+            law, spacing = shape[2], element_spacing(contact.profile_points(unit_mm))
+            elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacing)
+            visited = element_signals(t, v, elements, presses, law, out)
+            ctx.gradient = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law)
+        else:
+            curves, none = (t[None], v[None], d[None]), np.empty(0, np.int64)
+            where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)
+            visited = exact_signals(curves, *where, out.reshape(-1))
+            ctx.gradient = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)
         if profiling.is_profiling():
             record_visits(t[None], max_offsets, ends, presses, shape[1], visited)
-        return torch.from_numpy(out.reshape(-1, len(t)).T)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Compute the gradient with respect to along, across and slope."""
-        t, v, d, max_offsets, ends, presses, shape = ctx.inputs
-        up = np.ascontiguousarray(upstream[0].numpy().T)
-        gradient = signals_gradient(t, v, d, max_offsets, ends, presses, up, shape)
-        return (*torch.from_numpy(gradient), None, None, None)
-
-
-class MeasuredSignals(torch.autograd.Function):
-    """Signals of one pad under a sensitivity profile, from elements cut once a call."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        along: Tensor,
-        across: Tensor,
-        slope: Tensor,
-        presses: Array,
-        ends: Ends,
-        shape_and_spacing: tuple[PressShape, float],
-    ) -> Tensor:
-        """Compute signals (F, Q)."""
-        t, v, d = (x.detach().numpy() for x in (along, across, slope))
-        (_, extents, law), spacing = shape_and_spacing
-        elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacing)
-        ctx.inputs = (t, v, d, elements, presses, law)
-        out = np.empty((len(presses), len(t)))
-        visited = element_signals(t, v, elements, presses, law, out)
-        if profiling.is_profiling():
-            record_visits(t[None], compute_max_offsets(v[None], ends), ends, presses, extents, visited)
         return torch.from_numpy(out.T)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Compute the gradient with respect to along, across and slope."""
-        t, v, d, elements, presses, law = ctx.inputs
-        up = np.ascontiguousarray(upstream[0].numpy().T)
-        gradient = elements_gradient(t, v, d, elements, presses, up, law)
-        return (*torch.from_numpy(gradient), None, None, None)
+        gradient = ctx.gradient(np.ascontiguousarray(upstream[0].numpy().T))
+        return (*torch.from_numpy(gradient), None, None, None, None)

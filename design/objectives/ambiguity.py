@@ -39,11 +39,7 @@ MAX_EXPONENT = 300.0
 
 
 def free_presses(size: PadSettings) -> Array:
-    """Return (Q, 2) up to SIDE x SIDE positions over what is pressed, grid units, that lie in no keep-out.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return (Q, 2) up to SIDE x SIDE positions over what is pressed, grid units, in no keep-out; refuse if none is."""
     presses = grid_positions(size.sensed, SIDE)
     presses = presses[is_outside(presses, size)]
     if not len(presses):
@@ -75,7 +71,7 @@ def ambiguity(signals: "Tensor", presses: "Tensor", masks: "Tensor", weights: "T
 def ambiguities(
     pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
-    """Compute the ambiguity with 0, 1, ... fibres failed on a grid of presses.
+    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed on a grid of presses.
 
     Args:
         pad: the fibres.
@@ -83,9 +79,6 @@ def ambiguities(
         max_failures: most failed fibres, or weights of 0, 1, ... failed.
         noise: of a signal, share of full scale.
         size: says what is pressed.
-
-    Returns:
-        Means over sets of failed fibres, grid units.
     """
     import torch
 
@@ -113,7 +106,7 @@ def full_scale(signals: "Tensor") -> float:
 def ambiguity_map(
     pad: Morphology, presses: Array, contact: Contact, max_failures: int | tuple[float, ...], noise: float
 ) -> Array:
-    """Compute the ambiguity of every press, fast enough to follow a person who draws.
+    """Compute the ambiguity (K, Q), grid units, of every press with 0, 1, ... K - 1 fibres failed, fast enough to edit.
 
     Args:
         pad: the fibres.
@@ -121,9 +114,6 @@ def ambiguity_map(
         contact: exact, but for a sensitivity profile within the PRECISION of `measured_signals`.
         max_failures: most failed fibres, or weights of 0, 1, ... failed.
         noise: of a signal, share of full scale.
-
-    Returns:
-        Means over sets of 0, 1, ... K - 1 failed fibres; shape (K, Q), grid units.
     """
     stretch = _fast_signals(pad, presses, contact) / lengths(pad)
     largest = stretch.max(axis=0)
@@ -154,17 +144,9 @@ def _fast_signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
-    """Compute sum_b w_ab |p_a - p_b| for every press a and every set of failed fibres.
+    """Compute sum_b w_ab |p_a - p_b| (Q, L) exactly, without the pairs of presses that add nothing.
 
-    Exact, without the pairs of presses that add nothing.
-
-    Args:
-        signals: divided by twice their noise; shape (Q, F).
-        presses: shape (Q, 2).
-        failed: indices of failed fibres, F where there are fewer than K; shape (L, K).
-
-    Returns:
-        (Q, L).
+    `signals` (Q, F) are divided by twice their noise; `failed` (L, K) are indices of failed fibres, F where fewer fail.
     """
     count, fibres = signals.shape
     sets, most = failed.shape

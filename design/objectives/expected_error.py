@@ -74,19 +74,12 @@ FULL_SCALE_SIDE = 24
 
 
 class PressWindow(NamedTuple):
-    """Presses of a window of the pad.
+    """Presses of a window of the pad."""
 
-    Attributes:
-        positions: of a square grid, row by row; shape (Q, 2), grid units.
-        step: between its neighbours; shape (2,), grid units.
-        free: which lie in no keep-out; shape (Q,).
-        far: presses over the remaining pad, none where the window is all that is pressed; shape (P, 2).
-    """
-
-    positions: Array
-    step: Array
-    free: NDArray[np.bool_]
-    far: Array
+    positions: Array  # of a square grid, row by row; shape (Q, 2), grid units
+    step: Array  # between its neighbours; shape (2,), grid units
+    free: NDArray[np.bool_]  # which lie in no keep-out; shape (Q,)
+    far: Array  # presses over the remaining pad, none where the window is all that is pressed; shape (P, 2)
 
     def with_partners(self, partners: Tensor) -> Tensor:
         """Return (Q + P, 2) positions of the window and of far presses by their indices."""
@@ -95,23 +88,20 @@ class PressWindow(NamedTuple):
 
 @one_torch_thread()
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Compute the expected error with 0, 1, ... fibres failed, by this module's formula, always on the same presses.
+    """Compute the expected errors, grid units, with 0, 1, ... fibres failed, always on the same presses.
 
     Args:
         pad: the fibres.
         contact: what a press does to them.
         search: says how many fibres may fail, and how responses scatter.
         size: says what is pressed.
-
-    Returns:
-        Means over sets of failed fibres, grid units.
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     windows = evaluation_windows(size.sensed)
     masks = [failure_masks(fibres, k, max(MAX_SETS * GRIDS // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
-    errors: list[list[float]] = []
+    errors: list[list[float]] = []  # by window, means over the sets of each size
     for window in windows:
         presses = window_presses(size, window, EVALUATION_SIDE, rng)
         if not presses.free.any():
@@ -143,12 +133,10 @@ def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> 
         contact: what a press does to them.
         sensed_mm: what is pressed, as in `PadSettings`.
     """
-    low, high = np.array(sensed_rectangle(layout, sensed_mm))
-    size = np.minimum(high - low, WINDOW)
-    corner = low + (high - low - size) / 2
-    presses = grid_positions((tuple(corner.tolist()), tuple((corner + size).tolist())), FULL_SCALE_SIDE)
+    rectangle = sensed_rectangle(layout, sensed_mm)
+    presses = grid_positions(_place_window(rectangle, 0.5), FULL_SCALE_SIDE)
     largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
-    if (size < high - low).any():  # fibres beside the presses are as those of their family among them
+    if (np.ptp(rectangle, axis=0) > WINDOW).any():  # fibres beside the presses are as those of their family among them
         for rows in layout.families:
             largest[rows] = largest[rows].max(initial=0.0)
     return float(largest[largest > 0].mean()) if largest.any() else 1.0
@@ -177,9 +165,14 @@ def evaluation_windows(rectangle: Rectangle) -> list[Rectangle]:
 
 def sample_window(rectangle: Rectangle, rng: np.random.Generator) -> Rectangle:
     """Draw a window anywhere in what is pressed: all of it unless it is large."""
+    return _place_window(rectangle, rng.random(2))
+
+
+def _place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
+    """Return a window at a share of the way from the lower corner of a rectangle to the upper one."""
     low, high = np.array(rectangle)
     size = np.minimum(high - low, WINDOW)
-    corner = low + rng.random(2) * (high - low - size)
+    corner = low + share * (high - low - size)
     return tuple(corner.tolist()), tuple((corner + size).tolist())
 
 
@@ -192,15 +185,16 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
         side: presses along a side of the window.
         rng: source of the shifts, by up to a cell.
     """
+
+    def shifted_grid(low: Array, high: Array, counts: Array) -> Array:
+        cells = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
+        return low + (high - low) * (cells + rng.random(2)) / counts
+
     low, high = np.array(window)
-    cells = np.stack(np.meshgrid(*2 * [np.arange(side, dtype=float)]), axis=-1).reshape(-1, 2)
-    positions = low + (high - low) * (cells + rng.random(2)) / side
+    positions, far = shifted_grid(low, high, np.array([side, side])), np.empty((0, 2))
     pad_low, pad_high = np.array(size.sensed)
-    counts = np.ceil((pad_high - pad_low) / COARSE_STEP).astype(int)
-    far = np.empty((0, 2))
     if ((high - low) < (pad_high - pad_low) - 2 * WINDOW_MARGIN).any():
-        grid = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
-        far = pad_low + (pad_high - pad_low) * (grid + rng.random(2)) / counts
+        far = shifted_grid(pad_low, pad_high, np.ceil((pad_high - pad_low) / COARSE_STEP).astype(int))
         if len(far) > MAX_FAR:
             far = far[rng.choice(len(far), MAX_FAR, replace=False)]
         is_beside = ((far < low - WINDOW_MARGIN) | (far > high + WINDOW_MARGIN)).any(axis=1)
@@ -211,13 +205,12 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
 def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
     """Find the far presses whose responses are nearest to some press of a window, under any set of failed fibres.
 
+    They are at most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths of the kernel or more.
+
     Args:
         near: responses of the window, weighted as in the kernel; shape (F, Q).
         far: those over the remaining pad; shape (F, N).
         masks: 1 for a fibre that works; shape (L, F).
-
-    Returns:
-        At most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths of the kernel or more.
     """
     if not far.shape[1]:
         return torch.empty(0, dtype=torch.int64)
@@ -233,15 +226,9 @@ def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
 
 
 def expected_error(
-    responses: Tensor,
-    positions: Tensor,
-    step: Tensor,
-    free: Tensor,
-    masks: Tensor,
-    scatter: Scatter,
-    weights: Tensor | None = None,
+    responses: Tensor, positions: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter, weights: Tensor
 ) -> Tensor:
-    """Compute the expected error of the module's formula for each set of failed fibres; differentiable.
+    """Compute the expected error (L,), grid units, for each set of failed fibres; differentiable.
 
     Args:
         responses: in full scales of straight fibres, for the presses of a grid of Q = side^2, row by row, and P others
@@ -251,19 +238,16 @@ def expected_error(
         free: which presses of the grid count; the others lie in a keep-out; shape (Q,).
         masks: 1 for a fibre that works, 0 for a failed one; shape (L, F).
         scatter: of responses; its floor is above 0.
-        weights: of responses in the kernel; all 1 if None; shape (F,).
-
-    Returns:
-        (L,) grid units.
+        weights: of responses in the kernel; shape (F,).
     """
     positions, step, masks = (x.to(responses.dtype) for x in (positions, step, masks))
     count = len(free)
     bound = _bound(responses[:, :count], step, free, masks, scatter)
     rows = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(positions))])
     middle = positions[:count].mean(dim=0)
-    weighted = responses if weights is None else responses * weights[:, None].to(responses)
-    left_out = _LeaveOneOut.apply(weighted[:, rows] / WIDTH, positions[rows] - middle, masks, int(free.sum()))
-    return BOUND_WEIGHT * bound + REGRESSION_WEIGHT * left_out
+    weighted = (responses * weights[:, None].to(responses))[:, rows] / WIDTH
+    regression = _LeaveOneOut.apply(weighted, positions[rows] - middle, masks, int(free.sum()))
+    return BOUND_WEIGHT * bound + REGRESSION_WEIGHT * regression
 
 
 def aggregate_failures(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
@@ -281,27 +265,23 @@ def aggregate_failures(errors: Tensor, masks: Tensor, shares: tuple[float, ...])
     return (logs @ weights / weights.sum()).exp()
 
 
-def _corners(values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return values (Q, ...) of a grid at the four corners of each of its cells, row by row from below."""
+def _corners(values: Tensor) -> Tensor:
+    """Return values (Q, ...) of a grid at the corners (4, P, ...) of its cells, row by row from below."""
     side = math.isqrt(len(values))
     grid = values.reshape(side, side, *values.shape[1:])
-    return grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
-
-
-def _gradients(values: Tensor, step: Tensor) -> Tensor:
-    """Return the gradient (P, F, 2) of values (F, Q) on a grid, by differences over each of its cells."""
-    a, b, c, d = (corner.flatten(0, 1) for corner in _corners(values.T))
-    return torch.stack([(b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])], dim=-1)
+    return torch.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]]).flatten(1, 2)
 
 
 def _bound(responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
     """Return B (L,) for responses (F, Q) on a grid, over its free cells."""
-    cells = torch.stack([corner.flatten() for corner in _corners(free)]).all(dim=0)
+    cells = _corners(free).all(dim=0)
     if not cells.any():  # no more than slits between keep-outs
         return masks.new_zeros(len(masks))
-    middle = torch.stack([corner.flatten(0, 1) for corner in _corners(responses.T)]).mean(dim=0)[cells]
+    middle = _corners(responses.T).mean(dim=0)[cells]
     deviation = (scatter.floor**2 + scatter.share**2 * (1 - scatter.common) * middle**2).sqrt()
-    jacobian = _gradients(responses, step)[cells] / deviation[..., None]
+    a, b, c, d = _corners(responses.T)
+    slopes = torch.stack([(b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])], dim=-1)
+    jacobian = slopes[cells] / deviation[..., None]
     gain = math.sqrt(scatter.common) * scatter.share * middle / deviation
     information = torch.einsum("lk,qki,qkj->lqij", masks, jacobian, jacobian)
     shared = torch.einsum("lk,qk,qki->lqi", masks, gain, jacobian)
@@ -320,12 +300,9 @@ class _LeaveOneOut(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, responses: Tensor, positions: Tensor, masks: Tensor, count: int) -> Tensor:
         """Return L (L,) over the first `count` presses, for responses (F, Q) in widths of the kernel."""
-        (fibres, presses), sets = responses.shape, len(masks)
         # differences, unlike products, do not cancel: single precision serves
         difference = responses[:, :, None] - responses[:, None, :]
-        kernel = torch.exp(
-            torch.mm(masks / -2, difference.square().view(fibres, presses**2)).view(sets, presses, presses)
-        )
+        kernel = torch.exp(torch.mm(masks / -2, difference.square().flatten(1)).view(-1, *difference.shape[1:]))
         ridged = kernel.clone()
         ridged.diagonal(dim1=1, dim2=2).add_(RIDGE)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(ridged))

@@ -12,15 +12,12 @@ DRAWS = 2
 
 
 def failure_subsets(fibres: int, n_failed: int, max_subsets: int = 256) -> list[tuple[int, ...]]:
-    """Return all sets of failed fibres of one size; if there are too many, a sample that is always the same.
+    """Return all sets of failed fibres of one size, in order; if there are too many, always the same sample of them.
 
     Args:
         fibres: number of fibres.
         n_failed: size of a set.
         max_subsets: most sets.
-
-    Returns:
-        Tuples of ascending indices, in lexicographic order.
     """
     if math.comb(fibres, n_failed) <= max_subsets:
         return list(itertools.combinations(range(fibres), n_failed))
@@ -33,11 +30,8 @@ def failure_subsets(fibres: int, n_failed: int, max_subsets: int = 256) -> list[
 
 def failure_masks(fibres: int, n_failed: int, max_subsets: int) -> Array:
     """Return `failure_subsets` as masks (L, F): 1 for a fibre that works, 0 for a failed one."""
-    subsets = failure_subsets(fibres, n_failed, max_subsets)
-    masks = np.ones((len(subsets), fibres))
-    for row, failed in enumerate(subsets):
-        masks[row, list(failed)] = 0
-    return masks
+    subsets = np.array(failure_subsets(fibres, n_failed, max_subsets), dtype=np.int64)  # (L, n_failed)
+    return 1.0 - (subsets[:, :, None] == np.arange(fibres)).any(axis=1)
 
 
 def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
@@ -50,23 +44,16 @@ def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
     return tuple(weight / sum(weights) for weight in weights)
 
 
-def sample_failures(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draw DRAWS random sets of failed fibres of each size above 0, and the one of size 0.
+def sample_failures(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> Array:
+    """Draw masks (L, F), 1 for a fibre that works, of DRAWS sets of failed fibres of each size, and of one of size 0.
 
     Args:
         fibres: number of fibres.
         shares: P(k) of k = 0, 1, ... failed; sizes of probability 0, and those that leave no fibre, are left out.
         rng: source of the draws.
-
-    Returns:
-        Masks (L, F), 1 for a fibre that works, and their weights (L,), sum 1.
     """
-    masks, weights = [], []
-    for n_failed, share in enumerate(shares[:fibres]):
-        draws = DRAWS if n_failed else 1
-        for _ in range(draws if share > 0 else 0):
-            mask = np.ones(fibres)
-            mask[rng.choice(fibres, n_failed, replace=False)] = 0
-            masks.append(mask)
-            weights.append(share / draws)
-    return np.array(masks), np.array(weights) / sum(weights)
+    draws = [size for size, share in enumerate(shares[:fibres]) if share > 0 for _ in range(DRAWS if size else 1)]
+    masks = np.ones((len(draws), fibres))
+    for mask, n_failed in zip(masks, draws, strict=True):
+        mask[rng.choice(fibres, n_failed, replace=False)] = 0
+    return masks

@@ -5,7 +5,7 @@ over the pad, so that they add. The exact check on the finished curves decides; 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
@@ -42,32 +42,17 @@ MAX_COMPARISONS = 10**8
 
 @dataclass(frozen=True)
 class FibreSamples:
-    """Fibres sampled densely, with what their penalties depend on.
+    """Fibres sampled densely, with what their penalties depend on."""
 
-    Attributes:
-        along: coordinates of the knots along the fibres; shape (F, N + 2), grid units.
-        across: those at right angles to them.
-        points: samples along and across; shape (F, P, 2).
-        slope: shape (F, P).
-        arc: arc length from the start; shape (F, P).
-        pad: settings of the pad.
-        rules: the limits.
-        margin: factor on the limits, so that a curve with penalty 0 passes the exact check.
-    """
-
-    along: Tensor
-    across: Tensor
-    points: Tensor
-    slope: Tensor
-    arc: Tensor
+    along: Tensor  # coordinates of the knots along the fibres; shape (F, N + 2), grid units
+    across: Tensor  # those at right angles to them
+    points: Tensor  # samples along and across; shape (F, P, 2)
+    slope: Tensor  # shape (F, P)
+    arc: Tensor  # arc length from the start; shape (F, P)
     pad: PadSettings
+    layout: Layout
     rules: RulesSettings
-    margin: float
-
-    @property
-    def layout(self) -> Layout:
-        """Where the fibres end."""
-        return self.pad.layout
+    margin: float  # factor on the limits, so that a curve with penalty 0 passes the exact check
 
     def scale(self, limit_mm: float) -> float:
         """Return a lower limit with the margin, grid units."""
@@ -78,6 +63,17 @@ class FibreSamples:
         """Mean length of the fibres along their axes, without gradient."""
         return self.points[:, -1, 0].detach().mean()
 
+    @property
+    def lower(self) -> list[int]:
+        """Indices of the fibres with a neighbour of their family above them."""
+        return [fibre for rows in self.layout.families for fibre in range(rows.start, rows.stop - 1)]
+
+    @property
+    def plan(self) -> Tensor:
+        """Samples along x and y; shape (F, P, 2)."""
+        split = self.layout.horizontals
+        return torch.cat([self.points[:split], self.points[split:].flip(-1)])
+
     @cached_property
     def shares(self) -> Tensor:
         """(F, P) arc length that belongs to each sample, without gradient."""
@@ -86,10 +82,7 @@ class FibreSamples:
     @cached_property
     def crossings(self) -> tuple[Tensor, Tensor]:
         """`_crossing_density` of horizontals with verticals."""
-        pairs = list(product(*(range(rows.start, rows.stop) for rows in self.layout.families)))
-        check_comparisons(len(pairs), self.arc.shape[1])
-        horizontals, verticals = (self.points[list(side)] for side in zip(*pairs, strict=True))
-        return _crossing_density(horizontals, verticals.flip(-1))
+        return _crossing_density(self, product(*(range(rows.start, rows.stop) for rows in self.layout.families)))
 
 
 def penalties(
@@ -110,17 +103,12 @@ def penalties(
     points, slope = span_samples(along, across, PER_SPAN)
     step = torch.linalg.vector_norm(points.diff(dim=1), dim=-1)
     arc = torch.nn.functional.pad(step.cumsum(dim=1), (1, 0))
-    fibres = FibreSamples(along, across, points, slope, arc, pad, rules, margin)
-    values = {name: penalty(fibres) for name, penalty in PENALTIES.items()}
-    return {name: value for name, value in values.items() if value is not None}
+    fibres = FibreSamples(along, across, points, slope, arc, pad, pad.layout, rules, margin)
+    return {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres)) is not None}
 
 
 def check_comparisons(fibres: int, samples: int) -> None:
-    """Check that all samples of some fibres, or pairs of fibres, can be compared in memory.
-
-    Raises:
-        InputError: they cannot.
-    """
+    """Refuse so many fibres, or pairs of fibres, that their samples cannot be compared in memory."""
     if fibres * samples**2 > MAX_COMPARISONS:
         raise InputError(
             f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are "
@@ -155,18 +143,14 @@ def _bends(fibres: FibreSamples) -> Tensor | None:
 
 def _gaps(fibres: FibreSamples) -> Tensor | None:
     """Penalise neighbours in a family that come nearer than the gap, relative to it."""
-    layout, gap = fibres.layout, fibres.scale(fibres.rules.min_gap_mm)
-    if gap == 0 or max(layout.counts) < 2:
+    gap, lower = fibres.scale(fibres.rules.min_gap_mm), torch.tensor(fibres.lower)
+    if gap == 0 or not len(lower):
         return None
-    check_comparisons(layout.fibres, fibres.arc.shape[1])
-    lower = torch.tensor([f for rows in layout.families for f in range(rows.start, rows.stop - 1)])
+    check_comparisons(*fibres.arc.shape)
     below, above = fibres.points[lower], fibres.points[lower + 1]
     distances = torch.cdist(below.detach().float(), above.detach().float())
-    near = [
-        _near_distances(fibres, below, lower + 1, distances, gap),
-        _near_distances(fibres, above, lower, distances.mT, gap),
-    ]
-    return _sum_closeness(torch.cat(near), gap) / fibres.arc.numel()
+    pairs = (below, lower + 1, distances), (above, lower, distances.mT)
+    return _sum_closeness(torch.cat([_near_distances(fibres, *pair, gap) for pair in pairs]), gap) / fibres.arc.numel()
 
 
 def _folds(fibres: FibreSamples) -> Tensor | None:
@@ -183,16 +167,10 @@ def _folds(fibres: FibreSamples) -> Tensor | None:
 
 
 def _near_distances(fibres: FibreSamples, points: Tensor, others: Tensor, distances: Tensor, gap: float) -> Tensor:
-    """Return (K,) distances, with gradient, from those points that may lie nearer than `gap` to another fibre.
+    """Return (K,) distances, with gradient, of those points (B, P, 2) that may lie nearer than `gap` to `others` (B,).
 
-    They are measured to the piece of tangent that the nearest sample stands for, half a step to both sides.
-
-    Args:
-        fibres: all of them.
-        points: shape (B, P, 2).
-        others: index of the other fibre of each row; shape (B,).
-        distances: between samples, single precision; shape (B, P, P).
-        gap: grid units.
+    They are measured to the piece of tangent that the nearest sample stands for, half a step to both sides. `distances`
+    (B, P, P) are those between samples in single precision.
     """
     least, index = distances.min(dim=2)
     row, sample = (least < gap + fibres.shares[others].max().item()).nonzero(as_tuple=True)
@@ -206,32 +184,19 @@ def _near_distances(fibres: FibreSamples, points: Tensor, others: Tensor, distan
 
 
 def _family_crossings(fibres: FibreSamples) -> Tensor | None:
-    """Penalise fibres of a family in the wrong order, or, where some may cross, too many crossings."""
-    layout, limit = fibres.layout, fibres.rules.same_family_crossings
-    if max(layout.counts) < 2:
+    """Penalise fibres too little above their lower neighbour, or, where some may cross, too many crossings."""
+    layout, lower, limit = fibres.layout, fibres.lower, fibres.rules.same_family_crossings
+    if not lower:
         return None
-    if limit == 0:
-        return _disorder(fibres, max(fibres.scale(fibres.rules.min_gap_mm), MIN_ORDER_GAP))
-    pairs = [pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2)]
-    check_comparisons(len(pairs), fibres.arc.shape[1])
-    first, second = (fibres.points[list(side)] for side in zip(*pairs, strict=True))
-    return _excess(_crossing_density(first, second)[0].sum(), limit / fibres.margin)
-
-
-def _disorder(fibres: FibreSamples, gap: float) -> Tensor:
-    """Penalise fibres that lie less than `gap` above their lower neighbour in the family, relative to it."""
-    layout = fibres.layout
-    points = math.ceil(ORDER_SAMPLES * max(layout.extent)) + 1
-    stations = torch.cat(
-        [
-            torch.linspace(0, extent, points, dtype=torch.float64).expand(count, -1)
-            for extent, count in zip(layout.extent, layout.counts, strict=True)
-        ]
-    )
+    if limit > 0:
+        pairs = (pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2))
+        return _excess(_crossing_density(fibres, pairs)[0].sum(), limit / fibres.margin)
+    gap, samples = max(fibres.scale(fibres.rules.min_gap_mm), MIN_ORDER_GAP), ORDER_SAMPLES * max(layout.extent)
+    lines = [torch.linspace(0, extent, math.ceil(samples) + 1, dtype=torch.float64) for extent in layout.extent]
+    stations = torch.stack([lines[layout.family(fibre)] for fibre in range(layout.fibres)])
     parts = zip(*(x.split(ORDER_BATCH) for x in (fibres.along, fibres.across, stations)), strict=True)
-    above = torch.cat([pchip_sample(*part)[0] for part in parts]).diff(dim=0)
-    within = [row for rows in layout.families for row in range(rows.start, rows.stop - 1)]
-    return _sum_closeness(above[within], gap) / (len(within) * points)
+    above = torch.cat([pchip_sample(*part)[0] for part in parts]).diff(dim=0)[lower]
+    return _sum_closeness(above, gap) / above.numel()
 
 
 def _max_crossings(fibres: FibreSamples) -> Tensor | None:
@@ -263,8 +228,7 @@ def _common_tracks(fibres: FibreSamples) -> Tensor | None:
     if rules.max_common_track_mm is None or not min(layout.counts):
         return None
     width, limit = TRACK_WIDTH_MM / layout.unit_mm, rules.max_common_track_mm / fibres.margin / layout.unit_mm
-    points, slope, arc = (x.detach().numpy() for x in (fibres.points, fibres.slope, fibres.arc))
-    lines = np.concatenate([points[: layout.horizontals], points[layout.horizontals :, :, ::-1]])
+    points, slope, arc, lines = (x.detach().numpy() for x in (fibres.points, fibres.slope, fibres.arc, fibres.plan))
     total, gradient = 0.0, np.zeros_like(points)
     for one, other in (layout.families, layout.families[::-1]):
         stretches = common_stretches([*lines[one]], [*lines[other]], width)
@@ -291,19 +255,12 @@ def _keep_outs(fibres: FibreSamples) -> Tensor | None:
     """Penalise fibres nearer than the clearance to a keep-out, or inside, relative to it."""
     if not fibres.pad.keep_out_mm:
         return None
-    clearance, split = max(fibres.scale(fibres.rules.keep_out_mm), MIN_CLEARANCE), fibres.layout.horizontals
-    plan = torch.cat([fibres.points[:split], fibres.points[split:].flip(-1)]).flatten(0, 1)
-    positions, total = plan.detach().numpy(), fibres.points.new_zeros(())
+    clearance, plan = max(fibres.scale(fibres.rules.keep_out_mm), MIN_CLEARANCE), fibres.plan.flatten(0, 1)
+    samples, total = np.asarray(shapely.points(plan.detach().numpy())), plan.new_zeros(())
     for polygon in keep_outs(fibres.pad):
-        x0, y0, x1, y1 = polygon.bounds
-        is_beside = (positions < (x0 - clearance, y0 - clearance)) | (positions > (x1 + clearance, y1 + clearance))
-        near = np.flatnonzero(~is_beside.any(axis=1))
-        points = np.asarray(shapely.points(positions[near]))
-        is_close = shapely.distance(polygon, points) < clearance
-        near, points = near[is_close], points[is_close]
-        if not len(near):
-            continue
-        edge = polygon.exterior
+        shapely.prepare(polygon)
+        near = np.flatnonzero(shapely.dwithin(polygon, samples, clearance))
+        edge, points = polygon.exterior, samples[near]
         nearest = shapely.line_interpolate_point(edge, shapely.line_locate_point(edge, points))
         offset = plan[torch.from_numpy(near)] - torch.tensor(shapely.get_coordinates(nearest))
         outward = 1 - 2 * torch.from_numpy(shapely.contains(polygon, points).astype(float))
@@ -348,12 +305,15 @@ def _excess(count: Tensor, limit: float) -> Tensor:
     return torch.relu(count - limit) / max(1.0, limit)
 
 
-def _crossing_density(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the density of crossings of polylines p and q (B, P, 2) pair by pair, and the sines of their angles.
+def _crossing_density(fibres: FibreSamples, pairs: Iterable[tuple[int, int]]) -> tuple[Tensor, Tensor]:
+    """Return the density of crossings of fibres pair by pair, and the sines of their angles.
 
-    By the Kac-Rice formula the number of crossings is the sum of |dp x dq| delta(p - q), here with a narrow Gaussian
-    for delta, so that it has a gradient.
+    By the Kac-Rice formula the number of crossings of lines p and q is the sum of |dp x dq| delta(p - q), here with a
+    narrow Gaussian for delta, so that it has a gradient.
     """
+    sides = list(zip(*pairs, strict=True))
+    check_comparisons(len(sides[0]), fibres.arc.shape[1])
+    p, q = (fibres.plan[list(side)] for side in sides)
     dp, dq = p.diff(dim=1)[:, :, None], q.diff(dim=1)[:, None]
     offset = (p[:, 1:] + p[:, :-1])[:, :, None] / 2 - (q[:, 1:] + q[:, :-1])[:, None] / 2
     area = (dp[..., 0] * dq[..., 1] - dp[..., 1] * dq[..., 0]).abs()

@@ -20,7 +20,6 @@ from padforge.design.contact import (
 )
 from padforge.design.kernels import published as kernels
 from padforge.design.kernels.pchip import population_slopes
-from padforge.design.kernels.published import published_terms as terms_kernel
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import (
     LEVELS,
@@ -36,10 +35,7 @@ from padforge.design.settings import (
 
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:
-    """Return signals (Q, C) as converter levels 0..levels: each column scaled to its range, then rounded up.
-
-    A column without range, such as a fibre no press touches, is 0 throughout.
-    """
+    """Return signals (Q, C) as converter levels: columns scaled to their range, rounded up; 0 where they have none."""
     out = np.zeros(signals.shape)
     if len(signals):
         kernels.quantize(np.asarray(signals, dtype=np.float64), levels, out)
@@ -67,17 +63,9 @@ def disorder_area(pad: Morphology) -> float:
     return max(0.0, float(kernels.integrate_disorder(along[0], across[0], slopes, ends.horizontals)))
 
 
-def idle_share(signals: Array, threshold: float = 0.0) -> float:
-    """Return the share of presses in which a fibre is idle, over fibres and presses (paper, table III).
-
-    Args:
-        signals: changes from rest; shape (Q, C).
-        threshold: share of a fibre's range over all presses that its change must exceed to count as active: 0 in
-            simulation, 0.02 in the paper's experiment.
-    """
-    if signals.size == 0:
-        return 0.0
-    return float((np.abs(signals) <= threshold * np.ptp(signals, axis=0)).mean())
+def idle_share(signals: Array) -> float:
+    """Return the share of signals (Q, C), changes from rest, that are 0: of presses in which a fibre is idle."""
+    return float((signals == 0).mean()) if signals.size else 0.0
 
 
 def information(pad: Morphology, contact: Contact | None = None, noise: float = 1.0, side: int = 20) -> float:
@@ -101,7 +89,7 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
         noise: converter counts, > 0.
         side: cells a side, at least 2.
     """
-    low, high = (np.array(corner) for corner in between_fibres(pad.layout))
+    low, high = np.array(between_fibres(pad.layout))
     x, y = ((np.arange(side) + 0.5) / side * (high - low)[axis] + low[axis] for axis in (0, 1))
     positions = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     step = 1e-4
@@ -141,19 +129,12 @@ def _mean_exponential(mean: Array, jacobian: Array, log_det: Array, rows: NDArra
 
 @dataclass(frozen=True)
 class PublishedTerms:
-    """The published objective and its terms.
+    """The published objective and its terms."""
 
-    Attributes:
-        entropy: joint entropy of the horizontals' signals plus that of the verticals', bits.
-        sharpness: Z, sum of |second difference| of the converter levels along the press order.
-        disorder: C, sum over samples and over pairs i < j of a family of the negative parts of curve_j - curve_i.
-        objective: alpha / (1 + entropy) + beta Z + gamma C, to be minimised.
-    """
-
-    entropy: float
-    sharpness: float
-    disorder: float
-    objective: float
+    entropy: float  # joint entropy of the horizontals' signals plus that of the verticals', bits
+    sharpness: float  # Z, sum of |second difference| of the converter levels along the press order
+    disorder: float  # C, sum over samples and over pairs i < j of a family of the negative parts of curve_j - curve_i
+    objective: float  # alpha / (1 + entropy) + beta Z + gamma C, to be minimised
 
 
 @lru_cache(maxsize=16)
@@ -184,26 +165,21 @@ def published_terms(
         layout: of a population's fibres; as many horizontals as verticals, the default pitch apart, if None.
         levels: whole levels that signals are rounded up to, 1 to 2^24.
     """
-    if weights is not WEIGHTS:
-        checked = check_array("weights", weights, 1e12)
-        if checked.shape != (3,):
-            raise InputError(f"weights have shape {checked.shape}, expected three numbers: alpha, beta, gamma")
-        weights = tuple(checked.tolist())
-    alpha, beta, gamma = weights
+    factors = check_array("weights", weights, 1e12)
+    if factors.shape != (3,):
+        raise InputError(f"weights have shape {factors.shape}, expected three numbers: alpha, beta, gamma")
+    alpha, beta, gamma = factors.tolist()
     along, across, ends, _ = fibre_axes(pads, layout)
     samples, levels = check_samples(samples, along.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)
-    if presses is None:
+    if presses is None:  # a copy, for a read-only array has kernels compiled anew
         layout = pads.layout if isinstance(pads, Morphology) else layout
-        # a copy, for a read-only array has kernels compiled anew
-        positions = published_presses(layout or ends.horizontals).copy()
-    else:
-        positions = check_presses(presses)[0]
-    contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    shape = press_shape(contact, grid_unit_mm(pads, layout))
+        presses = published_presses(layout or ends.horizontals).copy()
+    positions = check_presses(presses)[0]
+    shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT), grid_unit_mm(pads, layout))
     terms = np.zeros((len(along), 3))
 
     def work(begin: int, end: int) -> None:
-        terms_kernel(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
+        kernels.published_terms(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
 
     map_chunks(work, len(along), min_chunk=8)
     return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in terms.tolist()]

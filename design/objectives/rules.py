@@ -4,6 +4,7 @@ To add a rule, add its limit to `RulesSettings` and its check to `check_rules`. 
 add its differentiable form to PENALTIES of `penalties`, under the same name.
 """
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,22 +14,8 @@ import shapely
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.curves import (
-    UNFOLDED,
-    Crossing,
-    bend_radius,
-    beziers,
-    common_stretches,
-    crossing_angles,
-    crossings,
-    extreme_headings,
-    flatten,
-    fold_gap,
-    lengths,
-    rolled_turns,
-    slope_beziers,
-    trace_curve,
-)
+from padforge.design.paths import curves
+from padforge.design.paths.curves import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, trace_curve
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
@@ -100,10 +87,10 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
         size: keep-outs and the radius the pad is worn on; its layout is the pad's.
     """
     pad, rules = check_type("pad", pad, Morphology), check_type("rules", rules, RulesSettings)
-    lines = [pad.to_mm(points) for points in flatten(pad, TOLERANCE_MM / pad.unit_mm)]
+    lines = [pad.to_mm(points) for points in curves.flatten(pad, TOLERANCE_MM / pad.unit_mm)]
     size = or_default("size", size, PadSettings).for_layout(pad.layout)
     return [
-        *check_bends(pad, rules.min_bend_radius_mm, size.bent_radius_mm),
+        *_check_bends(pad, rules.min_bend_radius_mm, size.bent_radius_mm),
         *_check_gaps(lines, pad.layout, rules.min_gap_mm),
         *_check_folds(pad, lines, rules.min_gap_mm),
         *_check_crossings(pad, rules),
@@ -114,28 +101,19 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
     ]
 
 
-def check_bends(pad: Morphology, limit: float, bent_radius_mm: float | None = None) -> list[Violation]:
-    """Return the tightest bend of every fibre that breaks `min_bend_radius_mm`.
-
-    Args:
-        pad: the fibres.
-        limit: least radius, mm.
-        bent_radius_mm: radius of the cylinder that the pad is worn on; None if flat.
-    """
+def _check_bends(pad: Morphology, limit: float, bent_radius_mm: float | None) -> Iterator[Violation]:
+    """Yield the tightest bend of every fibre that breaks `min_bend_radius_mm`."""
     if limit == 0:
-        return []
+        return
     window = min(limit / 2, *pad.layout.size_mm)  # no fibre is shorter than the pad
-    angle = window / limit
-    spans, slopes = beziers(pad), slope_beziers(pad)
+    spans, slopes = curves.beziers(pad), curves.slope_beziers(pad)
     turned = np.abs(np.diff(extreme_headings(slopes), prepend=0, append=0)).sum(axis=1)  # leads have heading 0
     max_rolled = 0.0 if bent_radius_mm is None else window / bent_radius_mm
-    violations = []
-    for fibre in map(int, np.flatnonzero(turned + max_rolled > angle)):
+    for fibre in map(int, np.flatnonzero(turned + max_rolled > window / limit)):
         path = spans[fibre].tobytes(), slopes[fibre].tobytes()
         radius, place = _min_bend(*path, pad.layout.family(fibre), pad.unit_mm, window, limit, bent_radius_mm)
         if radius < limit:
-            violations.append(Violation("min_bend_radius_mm", (fibre + 1,), radius, limit, _to_pair(pad.to_mm(place))))
-    return violations
+            yield _violation("min_bend_radius_mm", [fibre], radius, limit, pad.to_mm(place))
 
 
 @lru_cache(maxsize=CACHE_SIZE)
@@ -150,40 +128,33 @@ def _min_bend(
     points, lead = points * unit_mm, np.eye(2)[family] * window
     points = np.vstack([points[0] - lead, points[0], points, points[-1], points[-1] + lead])
     headings = np.pad(headings, 2)
-    rolled = 0.0
-    if bent_radius_mm is not None:
-        rolled = rolled_turns(points, headings - family * np.pi / 2, bent_radius_mm)
+    flat = bent_radius_mm is None
+    rolled = 0.0 if flat else rolled_turns(points, headings - family * np.pi / 2, bent_radius_mm)
     radius, place = bend_radius(points, headings, window, rolled)
     return radius, place / unit_mm
 
 
-def _check_gaps(lines: list[Array], layout: Layout, limit: float) -> list[Violation]:
+def _check_gaps(lines: list[Array], layout: Layout, limit: float) -> Iterator[Violation]:
     shapes = np.array([shapely.LineString(line) for line in lines])
     shapely.prepare(shapes)  # a tenth of the time where fibres are tangled
-    violations = []
     for rows in layout.families:
         family = shapes[rows]
         near = shapely.STRtree(family).query(family, predicate="dwithin", distance=limit).T
-        for first, second in sorted((int(i), int(j)) for i, j in near if i < j):
+        for first, second in sorted((i, j) for i, j in near if i < j):
             between = shapely.shortest_line(family[first], family[second])
             if between.length < limit:
-                fibres = rows.start + first + 1, rows.start + second + 1
-                middle = _to_pair(np.mean(between.coords, axis=0))
-                violations.append(Violation("min_gap_mm", fibres, float(between.length), limit, middle))
-    return violations
+                fibres, middle = (rows.start + first, rows.start + second), np.mean(between.coords, axis=0)
+                yield _violation("min_gap_mm", fibres, between.length, limit, middle)
 
 
-def _check_folds(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
+def _check_folds(pad: Morphology, lines: list[Array], limit: float) -> Iterator[Violation]:
     if limit == 0:
-        return []
+        return
     if FOLD_TOLERANCE * limit > TOLERANCE_MM:
-        lines = [pad.to_mm(points) for points in flatten(pad, FOLD_TOLERANCE * limit / pad.unit_mm)]
-    violations = []
-    for fibre in np.flatnonzero(np.ptp(extreme_headings(slope_beziers(pad)), axis=1) > UNFOLDED):
-        fold = _min_fold(lines[fibre].tobytes(), limit)
-        if fold is not None:
-            violations.append(Violation("min_gap_mm", (int(fibre) + 1,), fold[0], limit, _to_pair(fold[1])))
-    return violations
+        lines = [pad.to_mm(points) for points in curves.flatten(pad, FOLD_TOLERANCE * limit / pad.unit_mm)]
+    for fibre in np.flatnonzero(np.ptp(extreme_headings(curves.slope_beziers(pad)), axis=1) > UNFOLDED):
+        if fold := _min_fold(lines[fibre].tobytes(), limit):
+            yield _violation("min_gap_mm", [fibre], fold[0], limit, fold[1])
 
 
 @lru_cache(maxsize=CACHE_SIZE)
@@ -191,92 +162,78 @@ def _min_fold(line: bytes, limit: float) -> tuple[float, Array] | None:
     return fold_gap(np.frombuffer(line).reshape(-1, 2), limit)
 
 
-def _check_crossings(pad: Morphology, rules: RulesSettings) -> list[Violation]:
+def _check_crossings(pad: Morphology, rules: RulesSettings) -> Iterator[Violation]:
     limit, min_angle = rules.max_crossings, rules.min_crossing_angle_deg
-    points = crossings(pad, CROSSING_TOLERANCE, across=limit is not None or min_angle > 0)
+    points = curves.crossings(pad, CROSSING_TOLERANCE, across=limit is not None or min_angle > 0)
     horizontals = pad.layout.horizontals
     across = [c for c in points if c.first < horizontals <= c.second]
     same = [c for c in points if (c.first < horizontals) == (c.second < horizontals)]
-    violations = []
     if len(same) > rules.same_family_crossings:
-        amount = len(same), rules.same_family_crossings
-        violations += [
-            Violation("same_family_crossings", _fibre_numbers(c), *amount, _to_pair(pad.to_mm(c.position)))
-            for c in same
-        ]
+        for c in same:
+            pair, place = (c.first, c.second), pad.to_mm(c.position)
+            yield _violation("same_family_crossings", pair, len(same), rules.same_family_crossings, place)
     if limit is not None and len(across) > limit:
-        violations.append(Violation("max_crossings", (), len(across), limit))
-    return violations + (_check_angles(pad, across, min_angle) if min_angle > 0 else [])
+        yield Violation("max_crossings", (), len(across), limit)
+    if min_angle > 0:
+        angles = curves.crossing_angles(pad, across)
+        worst: dict[tuple[int, int], Violation] = {}
+        # a pair's least angle comes first
+        for i in np.argsort(angles, kind="stable")[: np.count_nonzero(angles < min_angle)]:
+            pair, place = (across[i].first, across[i].second), pad.to_mm(across[i].position)
+            worst.setdefault(pair, _violation("min_crossing_angle_deg", pair, float(angles[i]), min_angle, place))
+        yield from (worst[pair] for pair in sorted(worst))
 
 
-def _check_angles(pad: Morphology, across: list[Crossing], limit: float) -> list[Violation]:
-    angles = crossing_angles(pad, across)
-    worst: dict[tuple[int, int], Violation] = {}
-    for i in np.argsort(angles, kind="stable")[: np.count_nonzero(angles < limit)]:  # a pair's least angle comes first
-        pair, place = _fibre_numbers(across[i]), _to_pair(pad.to_mm(across[i].position))
-        worst.setdefault(pair, Violation("min_crossing_angle_deg", pair, float(angles[i]), limit, place))
-    return [worst[pair] for pair in sorted(worst)]
-
-
-def _check_common_tracks(lines: list[Array], layout: Layout, limit: float | None) -> list[Violation]:
-    """Return the longest common stretch of each pair of a horizontal and a vertical above the limit."""
+def _check_common_tracks(lines: list[Array], layout: Layout, limit: float | None) -> Iterator[Violation]:
+    """Yield the longest common stretch of each pair of a horizontal and a vertical above the limit."""
     if limit is None or not min(layout.counts):
-        return []
+        return
     longest: dict[tuple[int, int], Violation] = {}
     for one, other in (layout.families, layout.families[::-1]):
-        stretches = common_stretches(lines[one], lines[other], TRACK_WIDTH_MM)
+        stretches = curves.common_stretches(lines[one], lines[other], TRACK_WIDTH_MM)
         for i in np.flatnonzero(stretches.length > limit).tolist():
             fibre, length = one.start + int(stretches.line[i]), float(stretches.length[i])
-            first, second = sorted((fibre + 1, other.start + int(stretches.other[i]) + 1))
+            first, second = sorted((fibre, other.start + int(stretches.other[i])))
             if (first, second) not in longest or longest[first, second].measured < length:
-                middle = shapely.LineString(lines[fibre]).interpolate(stretches.begin[i] + length / 2)
-                violation = Violation("max_common_track_mm", (first, second), length, limit, (middle.x, middle.y))
-                longest[first, second] = violation
-    return [longest[pair] for pair in sorted(longest)]
+                middle = shapely.LineString(lines[fibre]).interpolate(stretches.begin[i] + length / 2).coords[0]
+                longest[first, second] = _violation("max_common_track_mm", (first, second), length, limit, middle)
+    yield from (longest[pair] for pair in sorted(longest))
 
 
-def _check_borders(pad: Morphology, lines: list[Array], limit: float) -> list[Violation]:
-    violations = []
+def _check_borders(pad: Morphology, lines: list[Array], limit: float) -> Iterator[Violation]:
     for fibre, line in enumerate(lines):
         across = 1 - pad.layout.family(fibre)
         distance = pad.layout.size_mm[across] / 2 - np.abs(line[:, across])
         worst = int(np.argmin(distance))
         if distance[worst] < limit:
-            violations.append(
-                Violation("border_mm", (fibre + 1,), float(distance[worst]), limit, _to_pair(line[worst]))
-            )
-    return violations
+            yield _violation("border_mm", [fibre], float(distance[worst]), limit, line[worst])
 
 
-def _check_keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, limit: float) -> list[Violation]:
-    """Return the point of every fibre nearest to each polygon, or the middle of the longest stretch through it."""
-    violations = []
+def _check_keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, limit: float) -> Iterator[Violation]:
+    """Yield the point of every fibre nearest to each polygon, or the middle of the longest stretch through it."""
     for polygon in shapely.transform(keep_outs(size), pad.to_mm):
         for fibre, line in enumerate(lines):
             curve = shapely.LineString(line)
-            between = shapely.shortest_line(curve, polygon)
-            inside = curve.intersection(polygon)
+            between, inside = shapely.shortest_line(curve, polygon), curve.intersection(polygon)
             if not inside.is_empty:
                 longest = max(shapely.get_parts(inside), key=lambda part: part.length)
-                middle = longest.interpolate(0.5, normalized=True)
-                violations.append(Violation("keep_out_mm", (fibre + 1,), 0.0, limit, (middle.x, middle.y)))
+                middle = longest.interpolate(0.5, normalized=True).coords[0]
+                yield _violation("keep_out_mm", [fibre], 0.0, limit, middle)
             elif between.length < limit:
-                place = _to_pair(np.array(between.coords[0]))
-                violations.append(Violation("keep_out_mm", (fibre + 1,), between.length, limit, place))
-    return violations
+                yield _violation("keep_out_mm", [fibre], between.length, limit, between.coords[0])
 
 
-def _check_lengths(pad: Morphology, limit: float) -> list[Violation]:
-    long = lengths(pad) * pad.unit_mm
-    return [Violation("max_length_mm", (int(f) + 1,), float(long[f]), limit) for f in np.flatnonzero(long > limit)]
+def _check_lengths(pad: Morphology, limit: float) -> Iterator[Violation]:
+    long = curves.lengths(pad) * pad.unit_mm
+    return (_violation("max_length_mm", [f], float(long[f]), limit) for f in np.flatnonzero(long > limit))
 
 
-def _fibre_numbers(crossing: Crossing) -> tuple[int, int]:
-    return crossing.first + 1, crossing.second + 1
-
-
-def _to_pair(point: Array) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
+def _violation(
+    rule: str, fibres: Iterable[int], measured: float, limit: float, place_mm: Sequence[float] | Array | None = None
+) -> Violation:
+    """Return the violation of fibres that are counted from 0."""
+    place = None if place_mm is None else (float(place_mm[0]), float(place_mm[1]))
+    return Violation(rule, tuple(int(fibre) + 1 for fibre in fibres), measured, limit, place)
 
 
 def _format_amount(value: float) -> str:

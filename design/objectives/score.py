@@ -19,57 +19,33 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.contact import fibre_axes, serpentine_presses, signals, signals_quantized
 from padforge.design.morphology import Array, Morphology
+from padforge.design.objectives import published as formula
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import SEARCH_SIDE, expected_errors
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
-from padforge.design.objectives.published import (
-    PublishedTerms,
-    idle_share,
-    information,
-    joint_entropy,
-    published_presses,
-    published_terms,
-    quantize,
-)
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
 
 
 @dataclass(frozen=True)
 class ScoredPad:
-    """A pad and what its terms depend on.
+    """A pad and what its terms depend on."""
 
-    Attributes:
-        pad: the fibres.
-        contact: what a press does to them.
-        search: says how many fibres may fail, and how responses scatter.
-        rules: limits of the penalties.
-        size: says what is pressed.
-        noise: of a signal in the ambiguity, share of full scale.
-    """
-
-    pad: Morphology
-    contact: Contact
-    search: SearchSettings
-    rules: RulesSettings
-    size: PadSettings
-    noise: float = AMBIGUITY_NOISE
+    pad: Morphology  # the fibres
+    contact: Contact  # what a press does to them
+    search: SearchSettings  # says how many fibres may fail, and how responses scatter
+    rules: RulesSettings  # limits of the penalties
+    size: PadSettings  # says what is pressed
+    noise: float = AMBIGUITY_NOISE  # of a signal in the ambiguity, share of full scale
 
     def terms(self, names: Collection[str] = ()) -> dict[str, float]:
-        """Compute terms by name.
-
-        Args:
-            names: of rows of TERMS; all if empty.
-        """
+        """Compute the terms by name: those of the rows of TERMS that are named, or all."""
         values: dict[str, float] = {}
         for term in TERMS:
-            if names and term.name not in names:
-                continue
-            value = term.compute(self)
-            if isinstance(value, Mapping):
-                values |= {f"{term.name}_{key}": part for key, part in value.items()}
-            else:
-                values[term.name] = value
+            if not names or term.name in names:
+                value = term.compute(self)
+                parts = value if isinstance(value, Mapping) else {"": value}
+                values |= {f"{term.name}_{key}".rstrip("_"): part for key, part in parts.items()}
         return values
 
     @property
@@ -77,9 +53,7 @@ class ScoredPad:
         """What a search minimises: the geometric mean of the expected errors over failures, and the weighted terms."""
         shares = failure_shares(self.search.max_failures)[: len(self.expected_errors)]
         total = float(np.exp(np.log(self.expected_errors) @ shares / sum(shares)))
-        for weight, term in weighted_terms(self.search):
-            total += weight * self.terms([term.name])[term.name]
-        return total
+        return sum((weight * self.terms([t.name])[t.name] for weight, t in weighted_terms(self.search)), start=total)
 
     @cached_property
     def expected_errors(self) -> list[float]:
@@ -97,9 +71,9 @@ class ScoredPad:
         return PUBLISHED_CONTACT if self.contact.sensitivity_profile else self.contact
 
     @cached_property
-    def published(self) -> PublishedTerms:
+    def published(self) -> formula.PublishedTerms:
         """The published objective and its parts."""
-        return published_terms(self.pad, self.published_contact)[0]
+        return formula.published_terms(self.pad, self.published_contact)[0]
 
 
 ComputeSignals = Callable[[Array], Tensor]
@@ -108,42 +82,26 @@ ComputeSignals = Callable[[Array], Tensor]
 
 @dataclass(frozen=True)
 class Term:
-    """A row of the table of terms.
+    """A row of the table of terms."""
 
-    Attributes:
-        name: of the value, or the beginning of the names of several.
-        description: for people; `{}` stands for the end of the name.
-        compute: its value, or several by the end of their name.
-        weight: key of `[search]` by which a search weighs it; None if it does not.
-        loss: its differentiable form.
-    """
-
-    name: str
-    description: str
-    compute: Callable[[ScoredPad], float | Mapping[object, float]]
-    weight: str | None = None
-    loss: Callable[[ComputeSignals, PadSettings], Tensor] | None = None
+    name: str  # of the value, or the beginning of the names of several
+    description: str  # for people; `{}` stands for the end of the name
+    compute: Callable[[ScoredPad], float | Mapping[object, float]]  # its value, or several by the end of their name
+    weight: str | None = None  # key of `[search]` by which a search weighs it; None if it does not
+    loss: Callable[[ComputeSignals, PadSettings], Tensor] | None = None  # its differentiable form
 
 
 def sharpness(signals: Tensor) -> Tensor:
-    """Return the mean |second difference| of signals (F, Q) along presses in an order of neighbours, grid units.
-
-    The published term Z without the quantisation, which has no gradient.
-    """
+    """Return Z of signals (F, Q), grid units, as published but for the quantisation, which has no gradient."""
     return signals.diff(n=2, dim=1).abs().mean()
 
 
-def _sharpness_loss(compute_signals: ComputeSignals, size: PadSettings) -> Tensor:
-    return sharpness(compute_signals(serpentine_presses(size.sensed, SEARCH_SIDE)))
-
-
-def _expected_errors_mm(scored: ScoredPad) -> dict[object, float]:
-    return {n_failed: scored.pad.unit_mm * error for n_failed, error in enumerate(scored.expected_errors)}
-
-
-def _ambiguities_mm(scored: ScoredPad) -> dict[object, float]:
-    values = ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.size)
+def _in_mm(scored: ScoredPad, values: list[float]) -> dict[object, float]:
     return {n_failed: scored.pad.unit_mm * value for n_failed, value in enumerate(values)}
+
+
+def _ambiguities(scored: ScoredPad) -> list[float]:
+    return ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.size)
 
 
 def _penalties(scored: ScoredPad) -> dict[object, float]:
@@ -153,20 +111,25 @@ def _penalties(scored: ScoredPad) -> dict[object, float]:
 
 def _joint_entropy(scored: ScoredPad) -> float:
     pad = scored.pad
-    return joint_entropy(quantize(signals_quantized(pad, published_presses(pad.layout), scored.published_contact)))
+    responses = signals_quantized(pad, formula.published_presses(pad.layout), scored.published_contact)
+    return formula.joint_entropy(formula.quantize(responses))
 
 
 TERMS = (
-    Term("expected_error_mm", "expected error with {} fibres failed, mm", _expected_errors_mm),
-    Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", _ambiguities_mm),
-    Term("information", "mutual information of positions and signals, bits", lambda s: information(s.pad, s.contact)),
-    Term("idle_share", "share of presses in which a fibre is idle", lambda s: idle_share(s.serpentine_signals)),
+    Term("expected_error_mm", "expected error with {} fibres failed, mm", lambda s: _in_mm(s, s.expected_errors)),
+    Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", lambda s: _in_mm(s, _ambiguities(s))),
+    Term(
+        "information",
+        "mutual information of positions and signals, bits",
+        lambda s: formula.information(s.pad, s.contact),
+    ),
+    Term("idle_share", "share of presses in which a fibre is idle", lambda s: formula.idle_share(s.serpentine_signals)),
     Term(
         "sharpness",
         "mean second difference of the signals along a serpentine, grid units",
         lambda s: sharpness(torch.tensor(s.serpentine_signals.T)).item(),
         weight="sharpness",
-        loss=_sharpness_loss,
+        loss=lambda compute, size: sharpness(compute(serpentine_presses(size.sensed, SEARCH_SIDE))),
     ),
     Term("penalty", "penalty of {} in the gradient search", _penalties),
     Term(
@@ -230,10 +193,9 @@ def score(
     """
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
     size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
-    noise = SearchSettings(noise=noise).noise
-    search = SearchSettings(max_failures=max_failures)
+    noise, stated = SearchSettings(noise=noise).noise, {"max_failures": max_failures}
     if scatter is not None:
-        stated = {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
-        search = SearchSettings(max_failures=max_failures, **stated)
+        stated |= {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
+    search = SearchSettings(**stated)
     check_comparisons(len(pad.knots), PER_SPAN * (pad.knots.shape[1] - 1) + 1)
     return ScoredPad(pad, contact, search, rules, size, noise).terms()

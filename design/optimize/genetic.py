@@ -28,15 +28,11 @@ class GeneticSearch:
     The same problem gives the same pads, whether or not the search was interrupted and resumed from its state. An
     origin and mutated copies of it make up half of the first generation; knots of it within MARGIN of the pad's edge
     are moved to MARGIN, the bound of the search.
-
-    Attributes:
-        step: generations done.
-        objective: the best so far.
     """
 
     def __init__(self, problem: SearchProblem, state: State | None = None) -> None:
         search, origin = problem.search, problem.origin
-        self.step, self.objective = 0, math.inf
+        self.step, self.objective = 0, math.inf  # generations done, and the best objective so far
         self._history: list[tuple[int, float]] = []
         self._generations = search.generations
         self._problem = _PublishedProblem(problem)
@@ -52,18 +48,17 @@ class GeneticSearch:
         """Whether all generations are done."""
         return self.step >= self._generations
 
-    def advance(self, generations: int) -> None:
-        """Breed up to `generations` generations, fewer if it is done before."""
-        for _ in range(min(generations, self._generations - self.step)):
-            self._algorithm.next()
-            self.step += 1
-            self.objective = float(self._algorithm.pop.get("F").min())
-            self._history.append((self.step, self.objective))
+    def advance(self) -> None:
+        """Breed one generation."""
+        self._algorithm.next()
+        self.step += 1
+        self.objective = float(self._algorithm.pop.get("F").min())
+        self._history.append((self.step, self.objective))
 
     def finish(self) -> None:
         """Skip the remaining generations, but for the first; there is no repair."""
         if self.step == 0:
-            self.advance(1)
+            self.advance()
         self._generations = self.step
 
     def morphology(self) -> Morphology:
@@ -73,13 +68,8 @@ class GeneticSearch:
         return Morphology.from_layout(self._problem.knots(x[objective.argmin()][None])[0], self._problem.layout)
 
     def state(self) -> State:
-        """Return everything that the next generations depend on, as arrays.
-
-        Returns:
-            "done": (); "history": (k, 2) generation and best objective; "population": (P, 2FN) coordinates of the pads
-            and "objectives": (P,) theirs, both empty before the first generation; "random": (), the generator's state.
-        """
-        x, objective = self._algorithm.pop.get("X", "F")
+        """Return everything that the next generations depend on, as arrays."""
+        x, objective = self._algorithm.pop.get("X", "F")  # both empty before the first generation
         return {
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
@@ -108,10 +98,8 @@ class _PublishedProblem(PymooProblem):
         self.shape = (self.layout.fibres, problem.search.knots, 2)
         self.contact, self.search = problem.contacts[0], problem.search
         self.presses = published_presses(self.layout, problem.search.presses)
-        low, high = (
-            np.broadcast_to(bound, self.shape).ravel() for bound in (MARGIN, np.array(self.layout.extent) - MARGIN)
-        )
-        self.limits = low, high
+        bounds = MARGIN, np.array(self.layout.extent) - MARGIN
+        self.limits = low, high = [np.broadcast_to(bound, self.shape).ravel() for bound in bounds]
         super().__init__(n_var=len(low), n_obj=1, xl=low, xu=high)
 
     def knots(self, x: Array) -> Array:
@@ -119,14 +107,8 @@ class _PublishedProblem(PymooProblem):
         return assemble_knots(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
-        terms = published_terms(
-            self.knots(x),
-            self.contact,
-            self.presses,
-            weights=self.search.weights,
-            layout=self.layout,
-            levels=self.search.levels,
-        )
+        how = {"weights": self.search.weights, "layout": self.layout, "levels": self.search.levels}
+        terms = published_terms(self.knots(x), self.contact, self.presses, **how)
         out["F"] = np.array([[pad.objective] for pad in terms])
 
 
@@ -134,11 +116,8 @@ class _FirstGeneration(FloatRandomSampling):
     """Half of the pads with knots anywhere, as in the published search, and half near an untangled pad.
 
     Where all knots lie anywhere, fibres of a family stand in the wrong order so often, the more the more knots they
-    have, that most generations go into setting that right (the C of formula (5)).
-
-    Args:
-        origin: inner knots about which those of the other half are scattered; None to scatter the coordinates across
-            the fibres about their levels; shape (F, N, 2).
+    have, that most generations go into setting that right (the C of formula (5)). The other half have knots scattered
+    about those of the origin (F, N, 2), or without one their coordinates across the fibres about their levels.
     """
 
     def __init__(self, origin: Array | None) -> None:

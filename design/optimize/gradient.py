@@ -15,16 +15,7 @@ from torch import Tensor
 
 from padforge.design.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
-from padforge.design.objectives.expected_error import (
-    SEARCH_SIDE,
-    aggregate_failures,
-    confusable,
-    expected_error,
-    kernel_weights,
-    sample_window,
-    straight_full_scale,
-    window_presses,
-)
+from padforge.design.objectives import expected_error as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.score import weighted_terms
@@ -63,31 +54,18 @@ class Parametrization:
     """Free variables of a pad's fibres, mapped so that knots stay ascending, separate and off the border.
 
     Coordinates along a fibre are running sums of a softmax with a floor under every span, those across it a sigmoid.
-
-    Attributes:
-        layout: where the fibres end.
-        spans: logits of the spans, with gradient; shape (F, N + 1).
-        across: logits of the coordinates across the fibres, with gradient; shape (F, N).
-        floor: least span, grid units.
-        border: least distance of a knot to the border, grid units.
-        ends: of the fibres, for kernels.
     """
 
     def __init__(self, layout: Layout, spans: Tensor, across: Tensor, floor: float, border: float) -> None:
-        self.layout, self.floor, self.border = layout, floor, border
+        self.layout, self.ends = layout, fibre_ends(layout)
+        self.floor, self.border = floor, border  # least span, and least distance of a knot to the border, grid units
+        # logits of the spans (F, N + 1), and of the coordinates across the fibres (F, N)
         self.spans, self.across = (x.detach().clone().requires_grad_() for x in (spans, across))
-        self.ends = fibre_ends(layout)
         self._length, self._width, self._level = (torch.tensor(x)[:, None] for x in (*_sides(layout), layout.levels))
 
     @classmethod
     def from_knots(cls, knots: Array, layout: Layout, border: float) -> "Parametrization":
-        """Return the variables of fibres through some knots.
-
-        Args:
-            knots: shape (F, N + 2, 2), grid units.
-            layout: where the fibres end.
-            border: knots nearer to the border are moved to it, grid units.
-        """
+        """Return the variables of fibres through knots (F, N + 2, 2); those nearer to the border are moved to it."""
         along, across = (axis[0] for axis in split_axes(knots[None], layout.horizontals))
         width = np.diff(along, axis=1)
         floor = min(0.1 * min(layout.extent) / (knots.shape[1] - 1), 0.5 * float(width.min()))
@@ -133,33 +111,21 @@ def initial_paths(
     rng: np.random.Generator,
     gentle: bool = True,
 ) -> Array:
-    """Draw the knots that a start of the search begins with; they pass keep-outs.
+    """Draw the knots (F, N + 2, 2) that a start of the search begins with; they pass keep-outs.
 
     Without an origin most starts have straight fibres with knots moved by a tenth of a grid unit or so: where slopes
-    are 0 to both sides of a knot, PCHIP keeps them there and has no gradient. ZIGZAG_START has a zigzag. With an
-    origin, start 0 has its very paths, later ones have them with knots moved.
-
-    Args:
-        pad: settings of the pad.
-        rules: limits of the paths.
-        knots: N, inside of each fibre.
-        origin: morphology to start from.
-        start: number of the start.
-        rng: of the start.
-        gentle: whether hardly curved fibres mostly lead to the better pad. Under a contact of constant weight up to its
-            edge they do not: then all starts but ZIGZAG_START are zigzags.
-
-    Returns:
-        (F, N + 2, 2) grid units.
+    are 0 to both sides of a knot, PCHIP keeps them there and has no gradient. ZIGZAG_START has a zigzag; but where the
+    contact has a constant weight up to its edge, for which hardly curved fibres do not lead to the better pad (not
+    `gentle`), all starts but that one are zigzags. With an origin, start 0 has its very paths, later ones have them
+    with knots moved.
     """
-    layout = pad.layout
     if origin is None and (start == ZIGZAG_START) == gentle:
-        return pass_keep_outs(_zigzag(layout, rules, knots, rng), pad, rules)
-    paths = straight_paths(pad, rules, knots) if origin is None else refine(origin.knots, knots, layout)
+        return pass_keep_outs(_zigzag(pad.layout, rules, knots, rng), pad, rules)
+    paths = straight_paths(pad, rules, knots) if origin is None else refine(origin.knots, knots, pad.layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
         return paths
     inner = paths[:, 1:-1] + KNOT_STD * rng.standard_normal(paths[:, 1:-1].shape)
-    return assemble_knots(np.clip(inner, MARGIN, np.array(layout.extent) - MARGIN), layout)
+    return assemble_knots(np.clip(inner, MARGIN, np.array(pad.layout.extent) - MARGIN), pad.layout)
 
 
 def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
@@ -170,9 +136,8 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
     """
     radius = rules.min_bend_radius_mm / layout.unit_mm if rules.enforce else 0.0
     per_turn = KNOTS_PER_TURN if radius > 0 and knots >= 2 * KNOTS_PER_TURN else 1
-    extents = [extent for extent, count in zip(layout.extent, layout.counts, strict=True) if count]
-    max_turns = max(1, int(min(extents) / (4 * radius))) if radius > 0 else knots
-    turns = max(1, min(knots // per_turn, max_turns))
+    extent = min(extent for extent, count in zip(layout.extent, layout.counts, strict=True) if count)
+    turns = max(1, min(knots // per_turn, int(extent / (4 * radius)) if radius > 0 else knots))
     fibres = []
     for axis, rows in enumerate(layout.families):
         width, pitch, level = layout.extent[1 - axis], layout.extent[axis] / (turns + 1), layout.levels[rows, None]
@@ -182,17 +147,16 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
         swing = 0.6 * side * rng.uniform(0.5, 1.2, turns)
         short = min(1.0, layout.extent[axis] / width)  # fibres shorter than the pad is wide have less room to turn
         centre = width / 2 + (1 - 0.3 * short) * (level - width / 2)
-        peak = centre + short * swing + 0.1 * rng.standard_normal((len(level), turns))
-        peak = np.sort(peak, axis=0)
+        peak = np.sort(centre + short * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
         turn = np.sort(position + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
         path = np.concatenate([level, peak, level], axis=1)
         drop = np.clip(0.12 * np.stack([peak - path[:, :-2], peak - path[:, 2:]]), -0.1, 0.1)
-        parts = [(turn - shoulder, peak - drop[0]), (turn, peak), (turn + shoulder, peak - drop[1])]
-        parts = parts if per_turn == KNOTS_PER_TURN else parts[1:2]
-        along, across = (
-            np.stack([part[i] for part in parts], axis=-1).reshape(len(level), turns * len(parts)) for i in (0, 1)
-        )
-        fibres.append(np.stack([along, across] if axis == 0 else [across, along], axis=-1))
+        parts = [(turn, peak)]
+        if per_turn == KNOTS_PER_TURN:
+            parts = [(turn - shoulder, peak - drop[0]), *parts, (turn + shoulder, peak - drop[1])]
+        points = np.moveaxis(np.array(parts), 1, -1)  # (parts, F, turns, 2), along and across
+        points = np.moveaxis(points, 0, 2).reshape(len(level), -1, 2)
+        fibres.append(points if axis == 0 else points[..., ::-1])
     inner = np.clip(np.concatenate(fibres), 0.02, np.array(layout.extent) - 0.02)
     return refine(assemble_knots(inner, layout), knots, layout)
 
@@ -201,38 +165,29 @@ class GradientSearch:
     """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of broken rules.
 
     The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
-
-    Attributes:
-        step: steps done.
-        objective: what is minimised, without penalties, at the last step.
-        done: whether it is finished.
-        scales: full scale of straight fibres under each contact.
     """
 
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
-        self.problem = problem
-        self.rng = np.random.default_rng([problem.search.seed, start])
-        self.step, self.objective, self.done = 0, math.inf, False
+        self.problem, self.rng = problem, np.random.default_rng([problem.search.seed, start])
+        self.step, self.objective, self.done = 0, math.inf, False  # objective of the last step, without penalties
         self._history: list[tuple[int, float]] = []
         if state is not None:
             self._restore(state)
             return
         pad, rules = problem.pad, problem.rules
-        self.scales = [straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts]
+        # full scale of straight fibres under each contact
+        self.scales = [objective.straight_full_scale(pad.layout, c, pad.sensed_mm) for c in problem.contacts]
         gentle = bool(problem.contacts[0].sensitivity_profile)
         paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng, gentle)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
         self._optimiser = self._adam()
 
-    def advance(self, steps: int) -> None:
-        """Take up to `steps` steps, fewer if it is done before."""
-        for _ in range(steps):
-            if self.done:
-                return
-            if self.step < self.problem.search.steps:
-                self._descend()
-            else:
-                self._repair()
+    def advance(self) -> None:
+        """Take one step of the search, or of the repair after it."""
+        if self.step < self.problem.search.steps:
+            self._descend()
+        else:
+            self._repair()
 
     def finish(self) -> None:
         """Skip the remaining steps of the search, so that the next ones are repair."""
@@ -245,7 +200,6 @@ class GradientSearch:
 
     def state(self) -> State:
         """Return everything that the remaining search depends on, as arrays."""
-        adam = self._optimiser.state_dict()["state"]
         generator = json.dumps(self.rng.bit_generator.state).encode()
         state = {
             "spans": self.fibres.spans.detach().numpy().copy(),
@@ -257,25 +211,24 @@ class GradientSearch:
             "history": np.array(self._history).reshape(-1, 2),
             "generator": np.frombuffer(generator, np.uint8).copy(),
         }
-        for variable, moments in adam.items():
+        for variable, moments in self._optimiser.state_dict()["state"].items():
             state |= {f"adam_{variable}_{name}": value.numpy().copy() for name, value in moments.items()}
         return state
 
     def _restore(self, state: State) -> None:
-        floor, border = state["fixed"].tolist()
         logits = torch.tensor(state["spans"]), torch.tensor(state["across"])
         self.scales = state["scales"].tolist()
-        self.fibres = Parametrization(self.problem.pad.layout, *logits, floor, border)
+        self.fibres = Parametrization(self.problem.pad.layout, *logits, *state["fixed"].tolist())
         step, self.objective = state["progress"].tolist()
         self.step, self.done = int(step), bool(state["done"])
         self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
         self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
         self._optimiser = self._adam()
-        moments: dict[int, dict[str, Any]] = {}
-        for name, value in state.items():
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name in state:
             if name.startswith("adam_"):
                 _, variable, moment = name.split("_", 2)
-                moments.setdefault(int(variable), {})[moment] = torch.tensor(value)
+                moments.setdefault(int(variable), {})[moment] = torch.tensor(state[name])
         self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
 
     def _descend(self) -> None:
@@ -330,34 +283,24 @@ class GradientSearch:
         return torch.optim.Adam([self.fibres.spans, self.fibres.across], lr=LEARNING_RATE)
 
     def _objective(self, along: Tensor, across: Tensor, noise_factor: float) -> Tensor:
-        """Return the expected error on random presses and failures, and the weighted terms, averaged over the contacts.
-
-        Args:
-            along: coordinates of the knots along the fibres; shape (F, N + 2).
-            across: those at right angles to them.
-            noise_factor: on the scatter of responses.
-        """
+        """Return the expected error on random presses and failures, and the weighted terms; means over the contacts."""
         search, pad = self.problem.search, self.problem.pad
         slope = pchip_slopes(along, across)
         length = arc_lengths(along, across, slope)[:, None]
         # 1. a random window, another one if it lies in a keep-out, and random failures
-        presses = window_presses(pad, sample_window(pad.sensed, self.rng), SEARCH_SIDE, self.rng)
-        while not presses.free.any():
-            presses = window_presses(pad, sample_window(pad.sensed, self.rng), SEARCH_SIDE, self.rng)
+        presses = None
+        while presses is None or not presses.free.any():
+            window = objective.sample_window(pad.sensed, self.rng)
+            presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
         shares = failure_shares(search.max_failures)
-        masks, _ = sample_failures(pad.layout.fibres, shares, self.rng)
-        step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, masks))
+        failures = sample_failures(pad.layout.fibres, shares, self.rng)
+        step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, failures))
         masks, scatter = masks.float(), search.response_scatter.scaled(noise_factor)
-        weights = kernel_weights(pad.layout).float().to(search.device)
+        weights = objective.kernel_weights(pad.layout).float().to(search.device)
         total = torch.zeros((), device=search.device)
         for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
-            compute_signals = partial(
-                press_signals,
-                *(along, across, slope),
-                contact=contact,
-                ends=self.fibres.ends,
-                unit_mm=pad.layout.unit_mm,
-            )
+            model = {"contact": contact, "ends": self.fibres.ends, "unit_mm": pad.layout.unit_mm}
+            compute_signals = partial(press_signals, along, across, slope, **model)
 
             def respond(positions: Array, compute: Any = compute_signals, scale: float = scale) -> Tensor:
                 return (compute(positions) / (scale * length)).float().to(search.device)
@@ -367,11 +310,11 @@ class GradientSearch:
             if len(presses.far):
                 with torch.no_grad():
                     near, far = (weights[:, None] * respond(x) for x in (presses.positions, presses.far))
-                    positions = presses.with_partners(confusable(near, far, masks))
+                    positions = presses.with_partners(objective.confusable(near, far, masks))
             # 3. expected error, and the terms that `[search]` weighs
-            responses = respond(positions.numpy())
-            errors = expected_error(responses, positions.to(search.device), step, free, masks, scatter, weights)
-            total = total + aggregate_failures(errors, masks, shares)
+            responses, positions = respond(positions.numpy()), positions.to(search.device)
+            errors = objective.expected_error(responses, positions, step, free, masks, scatter, weights)
+            total = total + objective.aggregate_failures(errors, masks, shares)
             for weight, term in weighted_terms(search):
                 if term.loss is not None:
                     on_device = lambda x, compute=compute_signals: compute(x).float().to(search.device)  # noqa: E731

@@ -14,21 +14,13 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """A pad to be found that serves all contacts within the rules.
+    """A pad to be found that serves all contacts within the rules."""
 
-    Attributes:
-        pad: settings of the pad.
-        contacts: what presses do to a fibre, the main one first.
-        search: how to search.
-        rules: the limits.
-        origin: morphology to start from; None for random starts.
-    """
-
-    pad: PadSettings
-    contacts: tuple[Contact, ...]
-    search: SearchSettings
-    rules: RulesSettings
-    origin: Morphology | None = None
+    pad: PadSettings  # settings of the pad
+    contacts: tuple[Contact, ...]  # what presses do to a fibre, the main one first
+    search: SearchSettings  # how to search
+    rules: RulesSettings  # the limits
+    origin: Morphology | None = None  # morphology to start from; None for random starts
 
     @property
     def starts(self) -> range:
@@ -46,21 +38,13 @@ class SearchProblem:
 
     def settings(self) -> dict[str, Any]:
         """Return everything a result depends on, as JSON, by section."""
-        return {
-            "pad": self.pad.model_dump(mode="json"),
-            "contact": self.contacts[0].model_dump(mode="json"),
-            "search": self.search.model_dump(mode="json"),
-            "rules": self.rules.model_dump(mode="json"),
-            "origin": {"knots": None if self.origin is None else self.origin.knots.tolist()},
-        }
+        sections = {"pad": self.pad, "contact": self.contacts[0], "search": self.search, "rules": self.rules}
+        origin = {"knots": None if self.origin is None else self.origin.knots.tolist()}
+        return {name: section.model_dump(mode="json") for name, section in sections.items()} | {"origin": origin}
 
 
 def build_problem(
-    pad: PadSettings,
-    contact: Contact,
-    settings: SearchSettings,
-    rules: RulesSettings,
-    origin: Morphology | None = None,
+    pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None = None
 ) -> SearchProblem:
     """Build the problem of some settings.
 
@@ -99,8 +83,7 @@ def build_problem(
     if not any(failure_shares(settings.max_failures)[:fibres]):
         raise InputError(f"max_failures is {settings.max_failures}, allowed is what leaves some of the {fibres} fibres")
     if origin is not None:
-        check_type("origin", origin, Morphology)
-        knots = origin.knots.shape[1] - 2
+        knots = check_type("origin", origin, Morphology).knots.shape[1] - 2
         if origin.layout.counts != pad.layout.counts or origin.layout.spacing != pad.layout.spacing:
             raise InputError(f"the morphology to start from has {origin.layout}, allowed is the pad's, {pad.layout}")
         if knots > settings.knots:

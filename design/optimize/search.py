@@ -9,7 +9,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -17,20 +17,26 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from padforge.design.common import profiling
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_float, check_path, check_type, short_repr
-from padforge.design.morphology import Morphology
+from padforge.design.contact_comparison import errors_by_contact
+from padforge.design.morphology import Array, Morphology
+from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import ScoredPad
+from padforge.design.optimize.gradient import GradientSearch
 from padforge.design.optimize.problem import SearchProblem, build_problem
 from padforge.design.paths.keep_outs import straight_paths
-from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
+from padforge.design.twin import Twin
 
 if TYPE_CHECKING:
+    from padforge.design.common.settings import Spec
     from padforge.design.optimize.genetic import GeneticSearch
-    from padforge.design.optimize.gradient import GradientSearch
 
 SLICE = {"descent": 20, "genetic": 2}
 """Steps or generations of a slice: about a third of a second."""
@@ -44,6 +50,15 @@ GRACE_S = 10.0
 """After a deadline, for running slices: one takes a second or so, but an executor may hang."""
 MAX_SECONDS = 1e9
 """Longest time budget: some thirty years."""
+LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
+"""Keys of `[pad]` that say where fibres end."""
+TOLERANCE = 1.03
+"""Ratio of errors, to the better of the default pad and straight fibres, that counts as equal: that of trained networks
+is no more certain."""
+SUBSETS = 8
+"""Sets of failed fibres of a size by which pads are compared."""
+BUDGET_SHARES = {"default": 0.35, "twin": 0.4, "from default": 0.2}
+"""Of a time budget, by search for the next pad of a twin."""
 
 OnProgress = Callable[[str, int, int, float], None]
 """Callback of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
@@ -152,7 +167,9 @@ def search(
             candidates.append(Candidate("origin", origin, problem))
         if problem.search.method != "genetic":  # the published method is left as it was published
             candidates.append(straight)
-        result = _to_result(min(candidates, key=lambda candidate: candidate.rank), straight)
+        # fewest broken rules first, then the least objective, summed over the contacts
+        best = min(candidates, key=lambda c: (len(c.violations), sum(scored.objective for scored in c.scored)))
+        result = best.to_result(straight)
     history = [
         {"run": _name(problem, start), "step": int(step), "objective": value}
         for start, state in sorted(states.items())
@@ -161,27 +178,9 @@ def search(
     return replace(result, history=history, seconds=time.perf_counter() - begin, stopped=stop.reason)
 
 
-def score_result(morphology: Morphology, name: str, problem: SearchProblem) -> SearchResult:
-    """Return a pad as the result of a search.
-
-    Args:
-        morphology: the pad.
-        name: of the candidate.
-        problem: that it is a solution of.
-    """
-    straight = Candidate("straight fibres", _straight_pad(problem, Stop(time.perf_counter(), None)), problem)
-    return _to_result(Candidate(name, morphology, problem), straight)
-
-
 @dataclass(frozen=True)
 class Candidate:
-    """A pad that a search may return.
-
-    Attributes:
-        name: its origin, as in `SearchResult.candidate`.
-        pad: the fibres.
-        problem: that it is a solution of.
-    """
+    """A pad that a search may return as a solution of `problem`; its name is that of `SearchResult.candidate`."""
 
     name: str
     pad: Morphology
@@ -198,25 +197,19 @@ class Candidate:
         p = self.problem
         return [ScoredPad(self.pad, contact, p.search, p.rules, p.pad) for contact in p.contacts]
 
-    @property
-    def rank(self) -> tuple[int, float]:
-        """Least for the best pad: fewest broken rules first, then the least objective, summed over the contacts."""
-        return len(self.violations), sum(scored.objective for scored in self.scored)
-
-
-def _to_result(best: Candidate, straight: Candidate) -> SearchResult:
-    terms, beside = best.scored[0].terms(), straight.scored[0].terms(("expected_error_mm", "ambiguity_mm"))
-    return SearchResult(best.pad, terms, best.violations, best.name, beside, best.problem.rules.enforce)
+    def to_result(self, straight: "Candidate") -> SearchResult:
+        """Return the result of a search that ends with it."""
+        terms, beside = self.scored[0].terms(), straight.scored[0].terms(("expected_error_mm", "ambiguity_mm"))
+        return SearchResult(self.pad, terms, self.violations, self.name, beside, self.problem.rules.enforce)
 
 
 class Stop:
     """Whether to stop: after Ctrl-C, or a deadline of `time.perf_counter`."""
 
     def __init__(self, begin: float, time_budget: float | None) -> None:
-        self.deadline = None if time_budget is None else begin + (1 - REPAIR_SHARE) * time_budget
-        self.end = None if time_budget is None else begin + time_budget
-        self.reason = ""
-        self._is_repeated = False
+        budget = math.inf if time_budget is None else time_budget
+        self.deadline, self.end = begin + (1 - REPAIR_SHARE) * budget, begin + budget
+        self.reason, self._is_repeated = "", False
 
     def interrupt(self) -> None:
         """Stop because of Ctrl-C."""
@@ -224,20 +217,15 @@ class Stop:
         self.reason = "interrupted"
 
     def abandoned(self, is_remote: bool) -> bool:
-        """Return whether running slices are abandoned: after a second Ctrl-C, or long after the deadline.
-
-        Args:
-            is_remote: whether they are on an executor, which may hang; here, they do end.
-        """
-        late = self.deadline is not None and time.perf_counter() > self.deadline + GRACE_S
-        return self._is_repeated or (is_remote and bool(self) and late)
+        """Return whether running slices are abandoned: after a second Ctrl-C, or on an executor, which may hang."""
+        return self._is_repeated or (is_remote and bool(self) and time.perf_counter() > self.deadline + GRACE_S)
 
     def repair_until(self) -> float:
         """Return when to end the repair of the best so far."""
-        return self.end if self.reason == "out of time" and self.end else time.perf_counter() + REPAIR_S
+        return self.end if self.reason == "out of time" else time.perf_counter() + REPAIR_S
 
     def __bool__(self) -> bool:
-        if not self.reason and self.deadline is not None and time.perf_counter() > self.deadline:
+        if not self.reason and time.perf_counter() > self.deadline:
             self.reason = "out of time"
         return bool(self.reason)
 
@@ -255,52 +243,32 @@ def stop_on_interrupt(stop: Stop) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-@dataclass(frozen=True)
-class StartSlice:
-    """A start after a slice.
-
-    Attributes:
-        state: from which it goes on.
-        step: steps done.
-        objective: of the last step.
-        done: whether it is finished.
-    """
-
-    state: State
-    step: int
-    objective: float
-    done: bool
-
-
 @one_torch_thread()
-def advance_start(problem: SearchProblem, start: int, state: State | None) -> StartSlice:
-    """Run the next slice of a start, from its beginning if `state` is None."""
+def _advance_start(problem: SearchProblem, start: int, state: State | None) -> tuple[State, int, float]:
+    """Run the next slice of a start, from its beginning if `state` is None; return its state, step and objective."""
     run, until = _open_start(problem, start, state), time.perf_counter() + SLICE_S
     for _ in range(SLICE[problem.search.method]):
-        run.advance(1)
+        run.advance()
         if run.done or time.perf_counter() > until:
             break
-    return StartSlice(run.state(), run.step, run.objective, run.done)
+    return run.state(), run.step, run.objective
 
 
 @one_torch_thread()
-def finish_start(problem: SearchProblem, start: int, state: State | None, until: float = 0.0) -> Morphology:
+def _finish_start(problem: SearchProblem, start: int, state: State | None, until: float = 0.0) -> Morphology:
     """Return the fibres of a start, with broken rules repaired until a time of `time.perf_counter`."""
     run = _open_start(problem, start, state)
     run.finish()
     while not run.done and time.perf_counter() < until:
-        run.advance(1)
+        run.advance()
     return run.morphology()
 
 
 def _open_start(problem: SearchProblem, start: int, state: State | None) -> "GradientSearch | GeneticSearch":
-    # each method needs a library that takes a while to import
     if problem.search.method == "genetic":
-        from .genetic import GeneticSearch
+        from .genetic import GeneticSearch  # pymoo takes a while to import
 
         return GeneticSearch(problem, state)
-    from .gradient import GradientSearch
-
     return GradientSearch(problem, start, state)
 
 
@@ -309,32 +277,36 @@ def _advance(
 ) -> None:
     """Advance every start, slice by slice, until all are done or it is time to stop; `states` is updated."""
 
-    def first_slices() -> Iterator[tuple[int, Callable[[], StartSlice]]]:
-        for start in problem.starts:
-            if not stop and (start not in states or not states[start]["done"]):
-                yield start, partial(advance_start, problem, start, states.get(start))
+    def next_slice(start: int, last: tuple[State, int, float]) -> Callable[[], tuple[State, int, float]] | None:
+        return None if last[0]["done"] or stop else partial(_advance_start, problem, start, last[0])
 
-    def next_slice(start: int, last: StartSlice) -> Callable[[], StartSlice] | None:
-        return None if last.done or stop else partial(advance_start, problem, start, last.state)
-
+    slices = (
+        (start, partial(_advance_start, problem, start, states.get(start)))
+        for start in problem.starts
+        if not stop and (start not in states or not states[start]["done"])
+    )
     abandoned = partial(stop.abandoned, is_remote=run.executor is not None)
-    for start, last in run_tasks(first_slices(), run.executor, follow_up=next_slice, is_abandoned=abandoned):
-        states[start] = last.state
+    for start, (state, step, objective) in run_tasks(
+        slices, run.executor, follow_up=next_slice, is_abandoned=abandoned
+    ):
+        states[start] = state
         if checkpoints:
-            checkpoints.save(start, last.state)
-        run.on_progress(_name(problem, start), min(last.step, problem.steps), problem.steps, last.objective)
+            checkpoints.save(start, state)
+        run.on_progress(_name(problem, start), min(step, problem.steps), problem.steps, objective)
 
 
 def _finish_starts(problem: SearchProblem, states: dict[int, State], stop: Stop) -> list[tuple[str, Morphology]]:
     """Return the fibres of every start; after a stop, the best start's, repaired within the remaining time."""
     if not states:
-        return [(_name(problem, 0), finish_start(problem, 0, None))]
+        return [(_name(problem, 0), _finish_start(problem, 0, None))]
     if not stop:
-        return [(_name(problem, start), finish_start(problem, start, state)) for start, state in sorted(states.items())]
+        return [
+            (_name(problem, start), _finish_start(problem, start, state)) for start, state in sorted(states.items())
+        ]
     # a start without history has only just begun
     last = {start: state["history"][-1, 1] if len(state["history"]) else math.inf for start, state in states.items()}
     best = min(last, key=lambda start: last[start])
-    return [(_name(problem, best), finish_start(problem, best, states[best], stop.repair_until()))]
+    return [(_name(problem, best), _finish_start(problem, best, states[best], stop.repair_until()))]
 
 
 def _straight_pad(problem: SearchProblem, stop: Stop) -> Morphology:
@@ -344,8 +316,123 @@ def _straight_pad(problem: SearchProblem, stop: Stop) -> Morphology:
     if not size.keep_out_mm or not problem.violations(pad):
         return pad
     repair = replace(problem, search=search.model_copy(update={"method": "descent"}), origin=pad)
-    return finish_start(repair, 0, None, stop.repair_until() if stop else math.inf)
+    return _finish_start(repair, 0, None, stop.repair_until() if stop else math.inf)
 
 
 def _name(problem: SearchProblem, start: int) -> str:
     return "genetic" if problem.search.method == "genetic" else f"start {start + 1}"
+
+
+def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
+    """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
+
+    Profile and rectangle stay as they are in mm on a pad of another pitch; the rectangle is cut to the pad.
+
+    Args:
+        spec: settings; where it states no fibres or pitch, those of the twin count.
+        path: of the `twin.json`.
+        pad: whose fibres and pitch count instead.
+
+    Raises:
+        InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
+    """
+    twin, stated = Twin.load(path), spec.stated(PadSettings)
+    if spec.stated(Contact) and spec.section(Contact) != Contact():
+        raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
+    layout = twin.morphology.layout
+    keys = {**layout.settings, **{key: stated[key] for key in LAYOUT_KEYS if key in stated}}
+    if pad is not None:
+        keys = {**pad.layout.settings}
+    size = spec.section(PadSettings, **keys, sensed_mm="beyond").layout
+    if pad is None and size.counts != layout.counts:
+        raise InputError(f"{spec.source}: [pad] asks for {size}, but {path} is of a pad of {layout}")
+    sensed_mm = [min(pair) for pair in zip(twin.sensed_mm, size.size_mm, strict=True)]
+    scatter = {**spec.stated(SearchSettings), **_scatter_settings(twin, size)}
+    contact = twin.contact().model_dump()
+    return spec.replaced({"pad": keys | {"sensed_mm": sensed_mm}, "contact": contact, "search": scatter})
+
+
+def _scatter_settings(twin: Twin, layout: Layout) -> dict[str, float]:
+    """Return how the responses of a held press scatter, in `[search]`'s shares of the full scale of straight fibres."""
+    gains_v, noises_v = np.array([(abs(fibre.gain_v), fibre.noise_v) for fibre in twin.channels if fibre.gain_v]).T
+    scale = straight_full_scale(layout, twin.contact(), "beyond")
+    noise = float(np.clip(twin.scatter.floor * np.median(noises_v) / (np.median(gains_v) * scale), 1e-3, 10))
+    return {"noise": noise, "scatter": twin.scatter.share, "scatter_common": twin.scatter.common}
+
+
+def search_for_twin(
+    pad: PadSettings,
+    contact: Contact,
+    settings: SearchSettings,
+    rules: RulesSettings,
+    default_settings: SearchSettings,
+    *,
+    origin: Morphology | None = None,
+    run: SearchOptions | None = None,
+) -> SearchResult:
+    """Find the next pad of a printed one, for its measured contact and scatter.
+
+    It searches from random starts, and from the default pad, which needs no measurement. Of these pads, the default pad
+    and straight fibres it returns the one with the least error of networks trained under the contact, and never one
+    that locates less well than plain ones do. `candidate` is "twin", "from default", "default" or "straight fibres". A
+    search that is stopped ends with the best so far.
+
+    Args:
+        pad: settings of the pad.
+        contact: as measured.
+        settings: of the search, with the scatter as measured.
+        rules: the limits.
+        default_settings: settings of the search for the default pad, which is for the default contact.
+        origin: the morphology to start from; random if None.
+        run: callbacks, checkpoints, time budget and executor.
+    """
+    run = run or SearchOptions()
+    plain = search(pad, None, default_settings, rules, run=_part_options(run, "default"))
+    if plain.stopped == "interrupted":
+        return plain
+    afresh = search(pad, contact, settings, rules, origin=origin, run=_part_options(run, "twin"))
+    from_plain = settings.model_copy(update={"starts": 1, "knots": max(settings.knots, default_settings.knots)})
+    further = search(pad, contact, from_plain, rules, origin=plain.morphology, run=_part_options(run, "from default"))
+    problem = build_problem(pad, contact, settings, rules)
+    results = {"default": plain, "twin": afresh, "from default": further}
+    pads = {"default": plain.morphology, "straight fibres": Morphology.straight(pad.layout)}
+    pads |= {name: result.morphology for name, result in results.items()}
+    # a pad that cannot be built is no use, unless none can
+    sound = {name: fibres for name, fibres in pads.items() if not problem.violations(fibres)}
+    pads = sound or {"twin": afresh.morphology}
+    with profiling.stage("judge"):
+        rows = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
+    name = choose({row.pad: np.array(row.errors_mm) for row in rows})
+    straight = Candidate("straight fibres", _straight_pad(problem, Stop(time.perf_counter(), None)), problem)
+    return replace(
+        Candidate(name, pads[name], problem).to_result(straight),
+        history=[row | {"run": f"{part}, {row['run']}"} for part, result in results.items() for row in result.history],
+        seconds=sum(result.seconds for result in results.values()),
+        stopped=next((result.stopped for result in results.values() if result.stopped), ""),
+    )
+
+
+def choose(errors: Mapping[str, Array]) -> str:
+    """Return the pad of least mean error, among those that are worse than the plain ones with no number of failures.
+
+    Args:
+        errors: with 0, 1, ... fibres failed, by pad; "default" and "straight fibres" are the plain ones, if present.
+    """
+    plain = [errors[name] for name in ("default", "straight fibres") if name in errors]
+    ratios = {name: error / np.min(plain or list(errors.values()), axis=0) for name, error in errors.items()}
+    limit = max(TOLERANCE, min(float(ratio.max()) for ratio in ratios.values()))
+    fair = [name for name, ratio in ratios.items() if ratio.max() <= limit]
+    return min(fair, key=lambda name: float(np.log(ratios[name]).mean()))
+
+
+def state_folders(keep_in: Path) -> dict[str, Path]:
+    """Return the folder of states of each search: beside each other, as none may lie in another's."""
+    return {name: keep_in.with_name(f"{keep_in.name}-{name}".replace(" ", "-")) for name in BUDGET_SHARES}
+
+
+def _part_options(run: SearchOptions, name: str) -> SearchOptions:
+    """Return the options of one of the searches for a twin."""
+    keep_in = None if run.keep_in is None else state_folders(run.keep_in)[name]
+    budget = None if run.time_budget is None else BUDGET_SHARES[name] * run.time_budget
+    report = lambda start, *progress: run.on_progress(f"{name}, {start}", *progress)  # noqa: E731
+    return replace(run, keep_in=keep_in, time_budget=budget, on_progress=report)

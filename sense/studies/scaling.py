@@ -21,7 +21,7 @@ from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
-from padforge.design.networks import fit, fresh_presses, training_presses
+from padforge.design.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from padforge.sense.recordings.processing.limits import Array
 
@@ -132,7 +132,8 @@ def _found(tile: Morphology, grid: int, way: str, side: int, seed: int) -> State
     if way == SHARED and grid > tile.grid:
         # Where a family is silent the tile is unknown; there is nothing to learn from where in a wrong one a press is.
         told = np.all([part.any(axis=1) for part in np.split(inputs, 2, axis=1)], axis=0)
-    network = fit(inputs[told], (learned - origins)[told], np.random.default_rng([8, seed]), HIDDEN, EPOCHS)
+    rng = np.random.default_rng([8, seed])
+    network = fit_batch(inputs[told], (learned - origins)[told], [rng], HIDDEN, EPOCHS)[0]
     seconds = time.perf_counter() - begin
     inputs, origins = given(judged)
     errors = np.linalg.norm(origins + network(inputs) - judged, axis=1)

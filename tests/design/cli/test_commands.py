@@ -16,7 +16,7 @@ from padforge.design.common.settings import commented_toml
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
-from padforge.design.optimize.twin_search import settings_for_twin, state_folders
+from padforge.design.optimize.search import settings_for_twin, state_folders
 from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 

@@ -124,12 +124,6 @@ def test_idle_share_of_the_published_pads(published, name, share):
     assert idle_share(changes) == pytest.approx(share, abs=0.01)
 
 
-def test_idle_share_counts_changes_within_the_threshold():
-    changes = np.array([[0.0, 0.0], [0.01, 1.0], [1.0, 0.0]])
-    assert idle_share(changes) == pytest.approx(0.5)
-    assert idle_share(changes, threshold=0.02) == pytest.approx(4 / 6)
-
-
 def test_information_does_not_stop_at_the_number_of_presses():
     """Each tenfold drop in noise adds log2 10 bits along both axes, where the pad tells all places apart."""
     pad = Morphology.random(4, 20, seed=0)

@@ -42,7 +42,9 @@ SILENT = Scatter(1e-9)
 
 def errors(signals: np.ndarray, masks, scatter=SILENT, free=FREE) -> list[float]:
     presses = torch.tensor(PLACES), STEP, torch.tensor(free)
-    return expected_error(torch.tensor(signals), *presses, torch.tensor(masks), scatter).tolist()
+    return expected_error(
+        torch.tensor(signals), *presses, torch.tensor(masks), scatter, torch.ones(len(signals))
+    ).tolist()
 
 
 def error(signals: np.ndarray, scatter=SILENT) -> float:
@@ -184,7 +186,7 @@ def test_its_gradient_is_that_of_differences(scatter):
 
     def joint(signals):
         return aggregate_failures(
-            expected_error(signals, places, STEP, torch.tensor(FREE), kept, scatter), kept, shares
+            expected_error(signals, places, STEP, torch.tensor(FREE), kept, scatter, torch.ones(3)), kept, shares
         )
 
     joint(signals).backward()
@@ -197,7 +199,7 @@ def test_its_gradient_is_that_of_differences(scatter):
 
 def test_single_precision_serves():
     signals = random_responses(8)
-    given = torch.tensor(PLACES), STEP, torch.tensor(FREE), torch.ones(1, 8), Scatter(0.01, 0.18, 0.36)
+    given = torch.tensor(PLACES), STEP, torch.tensor(FREE), torch.ones(1, 8), Scatter(0.01, 0.18, 0.36), torch.ones(8)
     fine, coarse = (expected_error(torch.tensor(each), *given).item() for each in (signals, signals.astype(np.float32)))
     assert coarse == pytest.approx(fine, rel=1e-3)
 
@@ -206,7 +208,7 @@ def test_a_press_far_off_that_answers_alike_makes_an_error_and_others_do_not():
     signals, kept = PLACES.T / 4, torch.ones(1, 2)
     alike, other = signals[:, 90:91], signals[:, 90:91] + 3.0
     places = torch.tensor(np.vstack([PLACES, [[30.0, 30.0]]]))
-    given = places, STEP, torch.tensor(FREE), kept, SILENT
+    given = places, STEP, torch.tensor(FREE), kept, SILENT, torch.ones(2)
     confused = expected_error(torch.tensor(np.hstack([signals, alike])), *given).item()
     apart = expected_error(torch.tensor(np.hstack([signals, other])), *given).item()
     assert apart == pytest.approx(error(signals), rel=0.2)

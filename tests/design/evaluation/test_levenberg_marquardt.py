@@ -15,13 +15,19 @@ from padforge.design.levenberg_marquardt import (
     gauss_newton_matrix,
     jacobian_product,
 )
-from padforge.design.networks import Network, RangeScaler, fit, fit_batch, initial_weights
+from padforge.design.networks import Network, RangeScaler, fit_batch, initial_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def rms(difference):
     return float(np.sqrt((difference**2).mean()))
+
+
+def fit(inputs, targets, rng, hidden=50, epochs=1000, validation=None):
+    """One network, by a batch of one."""
+    checked = None if validation is None else (validation[0][None], validation[1])
+    return fit_batch(inputs, targets, [rng], hidden, epochs, checked)[0]
 
 
 def waves(presses):

@@ -107,7 +107,7 @@ def test_presses_may_lie_beyond_the_fibres_and_answer_with_noise():
     def answer(places):
         return signals(pad, places) + 0.02 * rng.standard_normal((len(places), 4))
 
-    trial = SimulatedPresses.simulate(pad, 12, 300, 0, answer, sensed_mm="beyond")
+    trial = SimulatedPresses.simulate(pad, 12, 300, 0, answer, PadSettings(grid=2, sensed_mm="beyond"))
     for places, jitter in ((trial.train_positions, 5 / 49), (trial.test_positions, 0)):
         assert (places >= 0.5).all()
         assert (places <= 2.5 + jitter).all()

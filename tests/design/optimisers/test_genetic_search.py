@@ -17,7 +17,7 @@ def bred(generations, search=SMALL, origin=None, state=None, pad=PAD):
     breeding = GeneticSearch(SearchProblem(pad, (CONTACT,), search, RulesSettings(), origin), state)
     objectives = []
     for _ in range(generations):
-        breeding.advance(1)
+        breeding.advance()
         objectives.append(breeding.objective)
     return breeding, objectives
 
@@ -47,7 +47,7 @@ def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit(broken_at, tmp_path):
     broken = bred(broken_at)[0]
     state = broken.state()
     np.savez(tmp_path / "state.npz", allow_pickle=False, **state)
-    broken.advance(1)
+    broken.advance()
     with np.load(tmp_path / "state.npz", allow_pickle=False) as saved:
         assert all(np.array_equal(saved[name], state[name]) for name in state)  # what follows does not touch it
         resumed, further = bred(4 - broken_at, state=saved)

@@ -5,9 +5,8 @@ import pytest
 
 from padforge.design.contact_comparison import ContactErrors
 from padforge.design.morphology import Morphology
-from padforge.design.optimize import twin_search
-from padforge.design.optimize.search import SearchOptions
-from padforge.design.optimize.twin_search import choose, search_for_twin
+from padforge.design.optimize import search
+from padforge.design.optimize.search import SearchOptions, choose, search_for_twin
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 PLAIN = {"default": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
@@ -46,7 +45,7 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
             errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)
             yield ContactErrors("", name, errors)
 
-    monkeypatch.setattr(twin_search, "errors_by_contact", lambda *asked: list(judged(*asked)))
+    monkeypatch.setattr(search, "errors_by_contact", lambda *asked: list(judged(*asked)))
     quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
     pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []

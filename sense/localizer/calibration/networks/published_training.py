@@ -6,7 +6,7 @@ torch to one thread: see `padforge.design.networks`.
 
 import numpy as np
 
-from padforge.design.networks import fit
+from padforge.design.networks import fit_batch
 from padforge.sense.localizer.network import Weights
 
 from .training_presses import TrainingPresses
@@ -26,7 +26,7 @@ def train_published(learn: TrainingPresses, check: TrainingPresses, rng: np.rand
         Weights as `network.forward` takes them, the scales of the published network folded in.
     """
     x, y, *checks = (_flat(part) for part in (learn.inputs, learn.targets, check.inputs, check.targets))
-    network = fit(x, y, rng, HIDDEN, validation=(checks[0], checks[1]))
+    network = fit_batch(x[None], y, [rng], HIDDEN, validation=(checks[0][None], checks[1]))[0]
     into, onto = network.inputs, network.targets
     plain = network.hidden[:, :-1]
     slope = np.divide(plain, into.half, out=np.zeros_like(plain), where=into.half > 0)
